@@ -1,0 +1,55 @@
+"""Bearings, rigid motion, projection and angles. Pure functions, any leading axes; camera = R p + t."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:
+    """Unit viewing rays f = (x, y, 1) / |(x, y, 1)| of normalised image points."""
+    homogeneous = torch.cat([points2d, torch.ones_like(points2d[..., :1])], -1)
+    return torch.nn.functional.normalize(homogeneous, dim=-1)
+
+
+def transform(
+    rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"], points3d: Float[Tensor, "*b n 3"]
+) -> Float[Tensor, "*b n 3"]:
+    """Camera coordinates R p + t."""
+    return points3d @ rotation.mT + translation.unsqueeze(-2)
+
+
+def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
+    """Normalised image coordinates (x/z, y/z) of points in camera coordinates; infinite at z = 0."""
+    return points[..., :2] / points[..., 2:]
+
+
+def camera_centre(
+    rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
+) -> Float[Tensor, "*b 3"]:  # fmt: skip
+    """Centre of the camera in scene coordinates, -R^T t."""
+    return -(rotation.mT @ translation.unsqueeze(-1)).squeeze(-1)
+
+
+def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Skew matrix [v]x with [v]x w = v x w."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def angle_between(a: Float[Tensor, "*b 3"], b: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b"]:
+    """Angle in radians, atan2(|a x b|, a.b): exact near 0 and pi, where arccos loses half the digits."""
+    a, b = torch.broadcast_tensors(a, b)
+    return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), (a * b).sum(-1))
+
+
+def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """Angle of a^T b in radians, in [0, pi] (paper Eq. 11), by atan2 of twice its sine and twice its cosine.
+
+    The gradient is undefined at 0 and pi; zero is returned there.
+    """
+    relative = a.mT @ b
+    skew = relative - relative.mT
+    sine = torch.linalg.vector_norm(torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1), dim=-1)
+    cosine = relative.diagonal(dim1=-2, dim2=-1).sum(-1) - 1
+    return torch.atan2(sine, cosine)

@@ -1,0 +1,199 @@
+"""What flows through bpnp: a `Batch` goes into a solver, a `Prediction` comes out.
+
+Axes: b batch, m 2D points, n 3D points (m and n padded to the largest set of the batch).
+Conventions: camera = R p + t (world to camera, COLMAP's ``cam_from_world``); `points2d` are normalised image
+coordinates x/z, y/z (intrinsics applied, distortion removed); 3D points and translations are in scene units.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
+
+
+@dataclass(frozen=True)
+class SolveStats:
+    """How an iterative solver ended, per sample."""
+
+    iterations: Int[Tensor, " b"]
+    residual: Float[Tensor, " b"]
+    converged: Bool[Tensor, " b"]
+
+
+@dataclass(frozen=True)
+class Pose:
+    """World-to-camera poses. A sample without a pose holds NaN and `stats.converged` False."""
+
+    rotation: Float[Tensor, "b 3 3"]
+    translation: Float[Tensor, "b 3"]
+    stats: SolveStats
+
+    @property
+    def found(self) -> Bool[Tensor, " b"]:
+        """Samples that have a finite pose."""
+        return self.rotation.isfinite().all((-2, -1)) & self.translation.isfinite().all(-1)
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A solver's answer: the joint probability of every pair, and each pose estimate by name."""
+
+    assignment: Float[Tensor, "b m n"] | None = None
+    assignment_stats: SolveStats | None = None
+    poses: dict[str, Pose] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Pairs of point sets, padded and masked.
+
+    points2d: (b, m, 2) normalised image coordinates.
+    points3d: (b, n, 3) scene units.
+    mask2d, mask3d: True at real points.
+    rotation, translation: true pose, if known.
+    match3d: (b, n) index of the 2D point that 3D point j was seen as, -1 for none; if known.
+    focal: (b,) pixels per unit of normalised coordinates, to report errors in pixels.
+    index: (b,) position of each pair in its data set; a pair that appears twice (a padded distributed epoch) is
+        counted once.
+    ids: a name for each pair.
+    """
+
+    points2d: Float[Tensor, "b m 2"]
+    points3d: Float[Tensor, "b n 3"]
+    mask2d: Bool[Tensor, "b m"]
+    mask3d: Bool[Tensor, "b n"]
+    focal: Float[Tensor, " b"]
+    index: Int[Tensor, " b"]
+    ids: tuple[str, ...]
+    rotation: Float[Tensor, "b 3 3"] | None = None
+    translation: Float[Tensor, "b 3"] | None = None
+    match3d: Int[Tensor, "b n"] | None = None
+
+    def __len__(self) -> int:
+        return self.points2d.shape[0]
+
+    @property
+    def count2d(self) -> Int[Tensor, " b"]:
+        return self.mask2d.sum(-1)
+
+    @property
+    def count3d(self) -> Int[Tensor, " b"]:
+        return self.mask3d.sum(-1)
+
+    def to(self, *args: Any, **kwargs: Any) -> "Batch":
+        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
+        return self._map(lambda x: x.to(*args, **kwargs))
+
+    def pin_memory(self) -> "Batch":
+        return self._map(lambda x: x.pin_memory())
+
+    def _map(self, function: Any) -> "Batch":
+        values = {f.name: getattr(self, f.name) for f in fields(self)}
+        is_float = {k: isinstance(v, Tensor) and v.is_floating_point() for k, v in values.items()}
+        moved = {k: function(v) if isinstance(v, Tensor) else v for k, v in values.items()}
+        # Tensor.to(float64) would turn masks and indices into numbers.
+        restored = {
+            k: v.to(values[k].dtype) if isinstance(v, Tensor) and not is_float[k] else v for k, v in moved.items()
+        }
+        return Batch(**restored)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        points2d: Arrays,
+        points3d: Arrays,
+        rotation: Arrays | None = None,
+        translation: Arrays | None = None,
+        match3d: Arrays | None = None,
+        *,
+        focal: Arrays | None = None,
+        index: Sequence[int] | None = None,
+        ids: Sequence[str] | None = None,
+    ) -> "Batch":
+        """Pad and mask one pair, or lists of pairs of different sizes.
+
+        points2d (m, 2) and points3d (n, 3) for one pair, or sequences of such arrays; rotation (3, 3), translation
+        (3,), match3d (n,) and focal () likewise. Padding is zero. The dtype is float64 if any 2D array is, else float32.
+
+        Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
+        or a match3d index that is no 2D point.
+        """
+        sets2d, sets3d = _as_list(points2d, 2), _as_list(points3d, 2)
+        size = len(sets2d)
+        dtype = torch.float64 if any(x.dtype == torch.float64 for x in sets2d) else torch.float32
+        sets2d = [_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
+        sets3d = [_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
+        rotations = None if rotation is None else _as_list(rotation, 2)
+        translations = None if translation is None else _as_list(translation, 1)
+        matches = None if match3d is None else _as_list(match3d, 1)
+        for name, values in (("points3d", sets3d), ("rotation", rotations), ("translation", translations),
+                             ("match3d", matches)):  # fmt: skip
+            if values is not None and len(values) != size:
+                raise ValueError(f"expected `{name}` for {size} pairs as in `points2d`, got {len(values)}")
+        m, n = max(len(x) for x in sets2d), max(len(x) for x in sets3d)
+        padded_match = None
+        if matches is not None:
+            padded_match = torch.full((size, n), -1, dtype=torch.long)
+            for i, match in enumerate(matches):
+                padded_match[i, : len(sets3d[i])] = _match(i, match, len(sets2d[i]), len(sets3d[i]))
+        focals = torch.ones(size) if focal is None else torch.as_tensor(np.asarray(focal)).reshape(-1).expand(size)
+        return cls(
+            points2d=_pad(sets2d, m),
+            points3d=_pad(sets3d, n),
+            mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
+            mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
+            focal=focals.to(dtype).clone(),
+            index=torch.arange(size) if index is None else torch.as_tensor(index, dtype=torch.long),
+            ids=tuple(str(i) for i in range(size)) if ids is None else tuple(ids),
+            rotation=None if rotations is None else _stack("rotation", rotations, (3, 3), dtype),
+            translation=None if translations is None else _stack("translation", translations, (3,), dtype),
+            match3d=padded_match,
+        )
+
+
+def _as_list(values: Arrays, ndim: int) -> list[Tensor]:
+    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of tensors."""
+    if isinstance(values, (list, tuple)) and values and not np.isscalar(values[0]) and np.ndim(values[0]) == ndim:
+        return [torch.as_tensor(v) for v in values]
+    array = torch.as_tensor(values) if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+    return list(array) if array.ndim == ndim + 1 else [array]
+
+
+def _points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
+    if points.ndim != 2 or points.shape[1] != dim:
+        hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
+        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in pair {i}{hint}")
+    if len(points) == 0:
+        raise ValueError(f"expected at least one point in `{name}`, got none in pair {i}")
+    if not points.isfinite().all():
+        bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
+        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of pair {i}")
+    return points
+
+
+def _match(i: int, match: Tensor, m: int, n: int) -> Tensor:
+    if match.shape != (n,):
+        raise ValueError(f"expected `match3d` of shape ({n},), one entry a 3D point, got {tuple(match.shape)} in pair {i}")
+    if int(match.min()) < -1 or int(match.max()) >= m:
+        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
+    return match.long()
+
+
+def _stack(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    for i, value in enumerate(values):
+        if value.shape != shape:
+            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in pair {i}")
+    return torch.stack([v.to(dtype) for v in values])
+
+
+def _pad(sets: list[Tensor], size: int) -> Tensor:
+    padded = sets[0].new_zeros(len(sets), size, sets[0].shape[1])
+    for i, points in enumerate(sets):
+        padded[i, : len(points)] = points
+    return padded
