@@ -1,0 +1,338 @@
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torchmetrics import MetricCollection
+
+from bpnp.metrics import (
+    PoseErrors,
+    PoseQuartiles,
+    PoseRecall,
+    RecallThresholds,
+    centre_error,
+    pose_errors,
+    quartiles,
+    recalls,
+    reprojection_error,
+    rotation_error,
+)
+from bpnp.types import Batch, Pose, SolveStats
+
+
+def random_rotations(seed: int, size: int) -> Tensor:
+    return torch.from_numpy(Rotation.random(size, rng=np.random.default_rng(seed)).as_matrix())
+
+
+def planted_batch(seed: int, size: int, points: int = 12) -> Batch:
+    """Exact pairs: 3D point j is seen as 2D point (j + 1) mod points."""
+    rng = np.random.default_rng(seed)
+    rotation = Rotation.random(size, rng=rng).as_matrix()
+    translation = rng.normal(size=(size, 3)) * 0.3 + [0, 0, 5]
+    points3d = rng.uniform(-1, 1, (size, points, 3))
+    camera = points3d @ rotation.swapaxes(1, 2) + translation[:, None]
+    points2d = np.roll(camera[..., :2] / camera[..., 2:], 1, axis=1)
+    match3d = np.tile((np.arange(points) + 1) % points, (size, 1))
+    return Batch.from_arrays(points2d, points3d, rotation, translation, match3d)
+
+
+def as_pose(rotation: Tensor, translation: Tensor) -> Pose:
+    size = len(rotation)
+    ones = torch.ones(size, dtype=torch.long)
+    return Pose(rotation, translation, SolveStats(ones, torch.zeros(size), torch.ones(size, dtype=torch.bool)))
+
+
+def true_pose(batch: Batch) -> Pose:
+    assert batch.rotation is not None
+    assert batch.translation is not None
+    return as_pose(batch.rotation.clone(), batch.translation.clone())
+
+
+def random_errors(seed: int, size: int, first_index: int = 0) -> PoseErrors:
+    values = torch.from_numpy(np.random.default_rng(seed).gamma(1.0, 10.0, (4, size)))
+    return PoseErrors(*values, index=torch.arange(first_index, first_index + size))
+
+
+def select(errors: PoseErrors, rows: list[int]) -> PoseErrors:
+    columns = (errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg, errors.index)
+    return PoseErrors(*(column[rows] for column in columns if column is not None))
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e-6, 1e-2, 1.0, math.pi - 1e-6, math.pi])
+def test_rotation_error_is_the_angle_scipy_planted(scale: float) -> None:
+    axes = np.random.default_rng(0).normal(size=(20, 3))
+    planted = Rotation.from_rotvec(scale * axes / np.linalg.norm(axes, axis=1, keepdims=True))
+    rotation = random_rotations(1, 20)
+    error = rotation_error(rotation @ torch.from_numpy(planted.as_matrix()), rotation)
+    torch.testing.assert_close(
+        torch.deg2rad(error), torch.from_numpy(planted.magnitude()), rtol=1e-6, atol=3e-8 * scale
+    )
+
+
+def test_rotation_and_centre_errors_do_not_change_when_the_scene_moves() -> None:
+    rotation, rotation_gt, motion = (random_rotations(seed, 10) for seed in range(3))
+    translation, translation_gt, shift = torch.randn(3, 10, 3, dtype=torch.float64)
+
+    def moved(r: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """The same camera once the scene is moved by p -> motion p + shift."""
+        r = r @ motion.mT
+        return r, t - (r @ shift.unsqueeze(-1)).squeeze(-1)
+
+    rotation_2, translation_2 = moved(rotation, translation)
+    rotation_gt_2, translation_gt_2 = moved(rotation_gt, translation_gt)
+    torch.testing.assert_close(rotation_error(rotation_2, rotation_gt_2), rotation_error(rotation, rotation_gt))
+    torch.testing.assert_close(
+        centre_error(rotation_2, translation_2, rotation_gt_2, translation_gt_2),
+        centre_error(rotation, translation, rotation_gt, translation_gt),
+    )
+
+
+def test_centre_error_is_how_far_the_camera_was_moved() -> None:
+    rotation, rotation_gt = random_rotations(0, 5), random_rotations(1, 5)
+    centre, step = torch.randn(2, 5, 3, 1, dtype=torch.float64)
+    error = centre_error(rotation, -(rotation @ (centre + step))[..., 0], rotation_gt, -(rotation_gt @ centre)[..., 0])
+    torch.testing.assert_close(error, step[..., 0].norm(dim=-1))
+
+
+def test_errors_of_planted_poses() -> None:
+    batch = planted_batch(0, 4)
+    pose = true_pose(batch)
+    perfect = pose_errors(pose, batch)
+    for error in (perfect.rotation_deg, perfect.translation, perfect.centre, perfect.reprojection_deg):
+        assert error.max() < 1e-6
+    # The camera turns about its own centre: the translation changes, the centre does not.
+    turn = torch.from_numpy(Rotation.from_euler("z", 3.0, degrees=True).as_matrix())
+    turned = pose_errors(as_pose(turn @ pose.rotation, pose.translation @ turn.mT), batch)
+    torch.testing.assert_close(turned.rotation_deg, torch.full((4,), 3.0, dtype=torch.float64))
+    assert turned.centre.max() < 1e-12 < turned.translation.min()
+    shifted = pose_errors(as_pose(pose.rotation, pose.translation + torch.tensor([0.0, 0.3, 0.4])), batch)
+    torch.testing.assert_close(shifted.translation, torch.full((4,), 0.5, dtype=torch.float64))
+    torch.testing.assert_close(shifted.centre, torch.full((4,), 0.5, dtype=torch.float64))
+
+
+def test_reprojection_error_is_the_mean_angle_over_true_pairs_and_ignores_padding() -> None:
+    batch = planted_batch(1, 3)
+    rotation, translation = random_rotations(5, 3), torch.randn(3, 3, dtype=torch.float64)
+    match3d = batch.match3d
+    assert match3d is not None
+    match3d = match3d.clone()
+    match3d[0, 4:] = -1
+    expected = []
+    for i in range(3):
+        angles = []
+        for j in range(12):
+            if match3d[i, j] >= 0:
+                ray = np.append(batch.points2d[i, match3d[i, j]].numpy(), 1)
+                point = rotation[i].numpy() @ batch.points3d[i, j].numpy() + translation[i].numpy()
+                angles.append(np.degrees(np.arccos(ray @ point / np.linalg.norm(ray) / np.linalg.norm(point))))
+        expected.append(np.mean(angles))
+    error = reprojection_error(rotation, translation, batch.points2d, batch.points3d, match3d)
+    np.testing.assert_allclose(error, expected, rtol=1e-9)
+
+    padded3d = torch.cat([batch.points3d, torch.full((3, 2, 3), 7.0, dtype=torch.float64)], 1)
+    padded_match = torch.cat([match3d, torch.zeros(3, 2, dtype=torch.long)], 1)
+    mask3d = torch.arange(14).expand(3, 14) < 12
+    again = reprojection_error(rotation, translation, batch.points2d, padded3d, padded_match, mask3d)
+    torch.testing.assert_close(again, error, rtol=0, atol=0)
+
+
+def test_a_point_at_the_camera_centre_is_not_scored_as_perfect() -> None:
+    pose = (torch.eye(3)[None], torch.zeros(1, 3))
+    error = reprojection_error(*pose, torch.zeros(1, 1, 2), torch.zeros(1, 1, 3), torch.zeros(1, 1, dtype=torch.long))
+    assert error.item() == 180
+
+
+@pytest.mark.parametrize(
+    ("broken", "value"), [("rotation", math.nan), ("translation", math.nan), ("translation", math.inf)]
+)
+def test_a_pair_without_a_pose_counts_as_the_worst(broken: str, value: float) -> None:
+    batch = planted_batch(2, 4)
+    pose = true_pose(batch)
+    getattr(pose, broken)[1, 0] = value
+    errors = pose_errors(pose, batch)
+    assert errors.rotation_deg[1] == errors.reprojection_deg[1] == 180
+    assert errors.translation[1] == errors.centre[1] == math.inf
+    assert errors.rotation_deg[[0, 2, 3]].max() < 1e-6
+    values = quartiles(errors)
+    assert values["found"] == 0.75
+    assert not any(value.isnan() for value in values.values())
+    # The third quartile of 4 lies a quarter of the way from the third to the fourth.
+    assert values["translation_q3"] == math.inf
+    assert values["translation_q2"] < 1e-6
+    assert values["rotation_q3_deg"] == pytest.approx(45, abs=1e-6)
+    assert recalls(errors)["recall_joint_15deg_0.5"] == 0.75
+
+
+def test_pairs_without_a_true_match_are_left_out_of_the_reprojection_figures_only_and_counted() -> None:
+    batch = planted_batch(3, 4)
+    match3d = batch.match3d
+    assert match3d is not None
+    match3d[:2] = -1
+    pose = true_pose(batch)
+    pose.rotation[1] = math.nan
+    errors = pose_errors(pose, batch)
+    assert errors.reprojection_deg.isnan().tolist() == [True, False, False, False]
+    values = quartiles(errors)
+    assert values["without_true_pairs"] == 1
+    assert values["reprojection_q3_deg"] == pytest.approx(90, abs=1e-6)  # of 0, 0, 180
+    assert recalls(errors)["recall_reprojection_1deg"].item() == pytest.approx(2 / 3)
+    assert recalls(errors)["recall_rotation_1deg"] == 0.75
+
+
+def test_without_matches_there_are_no_reprojection_figures() -> None:
+    full = planted_batch(3, 2)
+    batch = Batch.from_arrays(full.points2d, full.points3d, full.rotation, full.translation)
+    values = quartiles(pose_errors(true_pose(batch), batch)) | recalls(pose_errors(true_pose(batch), batch))
+    assert not any("reprojection" in key for key in values)
+    assert values["without_true_pairs"] == 2
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 17, 100])
+def test_quartiles_are_those_of_numpy(size: int) -> None:
+    errors = random_errors(size, size)
+    values = quartiles(errors)
+    for name, error in (("rotation_q{}_deg", errors.rotation_deg), ("translation_q{}", errors.translation),
+                        ("centre_q{}", errors.centre), ("reprojection_q{}_deg", errors.reprojection_deg)):  # fmt: skip
+        ours = [values[name.format(number)].item() for number in (1, 2, 3)]
+        np.testing.assert_allclose(ours, np.quantile(error.numpy(), [0.25, 0.5, 0.75]), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([math.inf], [math.inf] * 3),
+        ([1, 2, 3, 4, math.inf], [2, 3, 4]),
+        ([1, 2, 3, math.inf, math.inf], [2, 3, math.inf]),
+        ([1, 2, math.inf, math.inf], [1.75, math.inf, math.inf]),
+    ],
+)
+def test_quartiles_next_to_infinity(values: list[float], expected: list[float]) -> None:
+    column = torch.tensor(values, dtype=torch.float64)
+    result = quartiles(PoseErrors(column, column, column, column))
+    assert [result[f"centre_q{number}"].item() for number in (1, 2, 3)] == expected
+
+
+def test_recall_counts_errors_up_to_and_including_the_threshold() -> None:
+    rotation = torch.tensor([1.0, 5.0, 9.0, 15.0, 180.0], dtype=torch.float64)
+    translation = torch.tensor([0.4, 0.5, 0.9, 0.6, math.inf], dtype=torch.float64)
+    errors = PoseErrors(rotation, translation, translation, rotation)
+    assert {key: value.item() for key, value in recalls(errors).items() if "joint" in key or "5deg" in key} == {
+        "recall_rotation_5deg": 0.4,
+        "recall_rotation_15deg": 0.8,
+        "recall_reprojection_0.25deg": 0,
+        "recall_reprojection_0.5deg": 0,
+        "recall_joint_15deg_0.5": 0.4,
+        "recall_joint_10deg_1": 0.6,
+    }
+    chosen = recalls(errors, RecallThresholds((7,), (), (0.45,), (), ((1, 0.4),)))
+    assert {key: value.item() for key, value in chosen.items()} == {
+        "recall_rotation_7deg": 0.4,
+        "recall_centre_0.45": 0.2,
+        "recall_joint_1deg_0.4": 0.2,
+    }
+
+
+def test_metrics_over_batches_are_the_functions_over_everything() -> None:
+    errors = random_errors(0, 23)
+    metrics = MetricCollection([PoseQuartiles(), PoseRecall(rotation_deg=(4, 8), joint=[(15, 5)])])
+    for rows in (range(0, 10), range(10, 20), range(20, 23)):
+        metrics.update(select(errors, list(rows)))
+    values = metrics.compute()
+    thresholds = RecallThresholds(rotation_deg=(4, 8), joint=[(15, 5)])
+    expected = quartiles(errors) | recalls(errors, thresholds)
+    assert values.keys() == expected.keys()
+    for key in values:
+        torch.testing.assert_close(values[key], expected[key], rtol=0, atol=0)
+    metrics.reset()
+    metrics.update(select(errors, [3]))
+    assert metrics.compute()["rotation_q1_deg"] == errors.rotation_deg[3]
+
+
+def test_a_metric_takes_poses_without_keeping_their_graph() -> None:
+    batch = planted_batch(4, 3)
+    pose = true_pose(batch)
+    pose.translation.requires_grad_()
+    metric = PoseQuartiles()
+    metric.update(pose, batch)
+    assert not metric.records[0].requires_grad
+    torch.testing.assert_close(metric.compute()["centre_q3"], quartiles(pose_errors(pose, batch))["centre_q3"])
+
+
+def test_a_repeated_pair_is_counted_once_only_if_it_has_an_index() -> None:
+    errors = random_errors(0, 5)
+    metric = PoseQuartiles()
+    for rows in ([0, 1, 2], [3, 4, 1], [4]):
+        metric.update(select(errors, rows))
+    expected = np.quantile(errors.rotation_deg.numpy(), 0.75)
+    assert metric.compute()["rotation_q3_deg"].item() == pytest.approx(expected, rel=1e-14)
+    metric.reset()
+    for _ in range(3):
+        metric.update(PoseErrors(*(torch.tensor([value], dtype=torch.float64) for value in (1, 2, 3, 4))))
+    assert len(metric.errors().rotation_deg) == 3
+
+
+def test_two_data_sets_in_one_metric_are_noticed() -> None:
+    metric = PoseQuartiles()
+    metric.update(random_errors(0, 5))
+    metric.update(random_errors(1, 5))
+    with pytest.warns(UserWarning, match="one pair per `Batch.index`"):
+        values = metric.compute()
+    assert values == quartiles(random_errors(0, 5))
+
+
+def test_bad_input_raises_one_clear_error() -> None:
+    batch = planted_batch(0, 2)
+    pose = true_pose(batch)
+    unknown = Batch.from_arrays(batch.points2d, batch.points3d)
+    with pytest.raises(ValueError, match="expected a batch with its true `rotation`"):
+        pose_errors(pose, unknown)
+    with pytest.raises(ValueError, match="expected the `batch`"):
+        PoseQuartiles().update(pose)
+    assert batch.rotation is not None
+    batch.rotation[1, 0, 0] = math.nan
+    with pytest.raises(ValueError, match="expected a finite true pose, got NaN or infinity in 1"):
+        pose_errors(pose, batch)
+    with pytest.raises(ValueError, match="expected finite thresholds >= 0"):
+        PoseRecall(translation=(0.1, -1))
+    with pytest.raises(ValueError, match="expected finite thresholds >= 0"):
+        PoseRecall(joint=[(1, math.inf)])
+    nan = torch.full((1,), math.nan, dtype=torch.float64)
+    with pytest.raises(ValueError, match="expected a rotation error for each pair, got NaN"):
+        quartiles(PoseErrors(nan, nan, nan, nan))
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
+@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall()])
+def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall) -> None:
+    with pytest.raises(ValueError, match=r"expected at least one pair, got none; try update\(\)"):
+        metric.compute()
+
+
+def _process(rank: int, folder: Path, shards: list[list[list[list[int]]]]) -> None:
+    torch.distributed.init_process_group("gloo", init_method=f"file://{folder}/rendezvous", rank=rank, world_size=2)
+    results = []
+    for processes in shards:
+        metrics = MetricCollection([PoseQuartiles(), PoseRecall()]).to(torch.device("cpu"))
+        for rows in processes[rank]:
+            metrics.update(select(random_errors(0, 7), rows))
+        results.append({key: value.item() for key, value in metrics.compute().items()})
+    (folder / f"{rank}.json").write_text(json.dumps(results))
+    torch.distributed.destroy_process_group()
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_two_processes_give_the_metrics_of_one(tmp_path: Path) -> None:
+    shards = [
+        [[[0, 2], [4, 6]], [[1, 3], [5, 0]]],  # the sampler repeats pair 0 so that 7 pairs make 2 x 4
+        [[[0, 1], [2, 3, 4]], [[5, 6]]],  # uneven
+        [[[0, 1, 2, 3, 4, 5, 6]], []],  # nothing for one process
+    ]
+    torch.multiprocessing.spawn(_process, (tmp_path, shards), nprocs=2)
+    errors = random_errors(0, 7)
+    expected = {key: value.item() for key, value in (quartiles(errors) | recalls(errors)).items()}
+    for rank in range(2):
+        assert json.loads((tmp_path / f"{rank}.json").read_text()) == [expected] * 3
