@@ -1,10 +1,20 @@
 """From pairs of point sets to padded batches: what a source must offer, and how its pairs are put together."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import distributed
+from torch.utils.data import DataLoader, Dataset, DistributedSampler
+
+from bpnp.types import Batch
+
+Key = tuple[int, int]  # (epoch, index): with the source's seed, all that a pair depends on
+
+POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 
 @dataclass(frozen=True)
@@ -24,6 +34,7 @@ class Pair:
     focal: float
 
 
+@runtime_checkable
 class PairSource(Protocol):
     """An indexed set of pairs. `pair` is a pure function of its arguments and the source's seed."""
 
@@ -32,3 +43,202 @@ class PairSource(Protocol):
         """Points of the larger side of each pair, one entry a pair: what padding costs."""
 
     def pair(self, index: int, epoch: int) -> Pair: ...
+
+
+def collate(pairs: Sequence[Pair], index: Sequence[int]) -> Batch:
+    """Pad and mask pairs into one float32 batch; `index` is the position of each in its data set."""
+    return Batch.from_arrays(
+        [pair.points2d for pair in pairs],
+        [pair.points3d for pair in pairs],
+        [pair.rotation for pair in pairs],
+        [pair.translation for pair in pairs],
+        [pair.match3d for pair in pairs],
+        focal=[pair.focal for pair in pairs],
+        index=index,
+        ids=[pair.name for pair in pairs],
+    )
+
+
+class PairDataset(Dataset[Batch]):
+    """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing."""
+
+    def __init__(self, source: PairSource) -> None:
+        self.source = source
+
+    def __len__(self) -> int:
+        return len(self.source.sizes)
+
+    def __getitem__(self, keys: Sequence[Key]) -> Batch:
+        return collate([self.source.pair(index, epoch) for epoch, index in keys], [index for _, index in keys])
+
+
+def training_batches(
+    sizes: NDArray[np.int64], *, batch_size: int, replicas: int, rng: np.random.Generator
+) -> list[NDArray[np.int64]]:
+    """One epoch of batches of similar sizes, in random order; the pairs left over by `batch_size` sit out the epoch.
+
+    The shuffled set is cut into pools of 50 batches, each pool is sorted by size and cut into batches. A set smaller
+    than one batch is one batch, a few of its pairs repeated where `replicas` does not divide it.
+    """
+    order = rng.permutation(len(sizes))
+    whole = len(order) - len(order) % batch_size
+    if whole == 0:
+        return [_fill(order, replicas)]
+    span = POOL_BATCHES * batch_size
+    pools = np.split(order[:whole], range(span, whole, span))
+    by_size = np.concatenate([_largest_first(pool, sizes) for pool in pools])
+    return list(rng.permutation(by_size.reshape(-1, batch_size)))
+
+
+def evaluation_batches(
+    sizes: NDArray[np.int64], *, batch_size: int, replicas: int, rng: np.random.Generator, max_cells: int | None
+) -> list[NDArray[np.int64]]:
+    """Every pair, sorted by size and cut into batches; then the batches are shuffled, so that the first few of them,
+    all that a limited run sees, are a fair sample.
+
+    A batch has at most `batch_size` pairs, as few as b * size^2 <= `max_cells` asks for (size: the larger side of its
+    largest pair), at least one for each replica. Pairs are repeated where `replicas` does not divide the last batch.
+    """
+    order = _largest_first(rng.permutation(len(sizes)), sizes)
+    batches = []
+    start = 0
+    while start < len(order):
+        fitting = batch_size if max_cells is None else min(batch_size, max_cells // int(sizes[order[start]]) ** 2)
+        stop = start + max(replicas, fitting - fitting % replicas)
+        batches.append(_fill(order[start:stop], replicas))
+        start = stop
+    return [batches[i] for i in rng.permutation(len(batches))]
+
+
+def _largest_first(order: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
+    return order[np.argsort(-sizes[order], kind="stable")]
+
+
+def _fill(batch: NDArray[np.int64], replicas: int) -> NDArray[np.int64]:
+    """The batch, repeated from its start up to a multiple of `replicas`."""
+    return np.resize(batch, -(-len(batch) // replicas) * replicas)
+
+
+class BucketSampler(DistributedSampler[list[Key]]):
+    """Yields the keys of one batch after the other, this process's share of it.
+
+    `batch_size` counts the pairs of one step over all processes: any number of processes sees the same pairs in a
+    step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch) and
+    gives the epoch in the keys; evaluation always visits every pair, in the same batches, as epoch 0.
+    As a `DistributedSampler` it is left alone by Lightning, which calls `set_epoch`.
+
+    Raises ValueError for an empty set, a `batch_size` that the processes do not divide, or `max_cells` in training
+    (a step keeps its number of pairs; a source bounds the size of its training pairs instead).
+    """
+
+    def __init__(
+        self,
+        dataset: PairDataset,
+        *,
+        batch_size: int,
+        shuffle: bool,
+        seed: int,
+        num_replicas: int = 1,
+        rank: int = 0,
+        max_cells: int | None = None,
+    ) -> None:
+        if len(dataset) == 0:
+            raise ValueError("expected a source of at least one pair, got an empty one")
+        if batch_size < 1 or batch_size % num_replicas:
+            raise ValueError(
+                f"expected a `batch_size` (pairs of one step over all processes) that {num_replicas} processes divide, "
+                f"got {batch_size}; try {max(1, round(batch_size / num_replicas)) * num_replicas}"
+            )
+        if shuffle and max_cells is not None:
+            raise ValueError("expected `max_cells` with `shuffle=False` only, got both; try a smaller `batch_size`")
+        super().__init__(dataset, num_replicas=num_replicas, rank=rank, shuffle=shuffle, seed=seed)
+        self.sizes = np.asarray(dataset.source.sizes)
+        self.batch_size = batch_size
+        self.first_batch = 0  # the next pass starts here: an epoch that is resumed
+        self.max_cells = max_cells
+        self._length = max(1, len(self.sizes) // batch_size) if shuffle else len(self.batches(0))
+
+    def batches(self, epoch: int) -> list[NDArray[np.int64]]:
+        """The batches of an epoch over all processes, as indices."""
+        rng = np.random.default_rng([self.seed, epoch])
+        size, replicas = self.batch_size, self.num_replicas
+        if self.shuffle:
+            return training_batches(self.sizes, batch_size=size, replicas=replicas, rng=rng)
+        return evaluation_batches(self.sizes, batch_size=size, replicas=replicas, rng=rng, max_cells=self.max_cells)
+
+    def __len__(self) -> int:
+        return self._length
+
+    def __iter__(self) -> Iterator[list[Key]]:
+        epoch = self.epoch if self.shuffle else 0
+        for batch in self.batches(epoch)[self.first_batch :]:
+            share = len(batch) // self.num_replicas
+            yield [(epoch, int(i)) for i in batch[self.rank * share : (self.rank + 1) * share]]
+
+
+class PairLoader(DataLoader[Batch]):
+    """A DataLoader of whole batches that resumes exactly, also inside an epoch.
+
+    Its workers start at the first `next`, not at `iter`: Lightning calls `set_epoch` in between when it resumes.
+    The state is (epoch, batches served); it applies to that epoch only.
+    """
+
+    served = 0
+    resumed: dict[str, int] | None = None
+
+    def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
+        sampler = self.sampler
+        if not isinstance(sampler, BucketSampler):
+            raise ValueError(
+                f"expected the loader's BucketSampler, got {type(sampler).__name__}; Trainer(overfit_batches) replaces "
+                "it: try a small number of pairs instead"
+            )
+        resumed, self.resumed = self.resumed, None
+        self.served = resumed["served"] if resumed is not None and resumed["epoch"] == sampler.epoch else 0
+        sampler.first_batch = self.served
+        for batch in super().__iter__():
+            self.served += 1
+            yield batch
+
+    def state_dict(self) -> dict[str, int]:
+        return {"epoch": getattr(self.sampler, "epoch", 0), "served": self.served}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.resumed = dict(state_dict)
+
+
+def pair_loader(
+    source: PairSource,
+    *,
+    batch_size: int,
+    shuffle: bool,
+    seed: int,
+    num_workers: int = 0,
+    max_cells: int | None = None,
+) -> DataLoader[Batch]:
+    """A loader of padded batches, buckets by size, for this process of the process group if there is one.
+
+    batch_size: pairs of one step over all processes.
+    shuffle: True for training, False for evaluation; see `BucketSampler`, also for the errors.
+    max_cells: evaluation only; bounds b * m * n of the padded batch over all processes, and so the memory.
+    """
+    group = distributed.is_available() and distributed.is_initialized()
+    dataset = PairDataset(source)
+    sampler = BucketSampler(
+        dataset,
+        batch_size=batch_size,
+        shuffle=shuffle,
+        seed=seed,
+        num_replicas=distributed.get_world_size() if group else 1,
+        rank=distributed.get_rank() if group else 0,
+        max_cells=max_cells,
+    )
+    return PairLoader(
+        dataset,
+        sampler=sampler,
+        batch_size=None,
+        num_workers=num_workers,
+        persistent_workers=num_workers > 0,
+        pin_memory=torch.cuda.is_available(),
+        generator=torch.Generator().manual_seed(seed),  # else every epoch draws from the global generator
+    )

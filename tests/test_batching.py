@@ -1,0 +1,200 @@
+"""Batches: the sampler's laws for any length and number of processes, and exact resuming under Lightning."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import lightning
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch.callbacks import ModelCheckpoint
+from torch.utils.data import DataLoader, SequentialSampler
+
+from bpnp.datamodules.batching import BucketSampler, Pair, PairDataset, PairLoader, collate, pair_loader
+
+
+class Numbered:
+    """Pair i at epoch e is named "e:i", so that a batch tells which keys it was made of."""
+
+    def __init__(self, sizes: Sequence[int]) -> None:
+        self._sizes = np.asarray(sizes, dtype=np.int64)
+
+    @property
+    def sizes(self) -> np.ndarray:
+        return self._sizes
+
+    def pair(self, index: int, epoch: int) -> Pair:
+        rng = np.random.default_rng([epoch, index])
+        n = int(self._sizes[index])
+        points2d, points3d = rng.random((n, 2), dtype=np.float32), rng.random((n, 3), dtype=np.float32)
+        return Pair(f"{epoch}:{index}", points2d, points3d, np.eye(3), np.ones(3), rng.permutation(n), 800.0)
+
+
+def random_sizes(count: int, *, largest: int = 400) -> list[int]:
+    """Log-uniform from 4 to `largest`."""
+    return np.exp(np.random.default_rng(0).uniform(np.log(4), np.log(largest), count)).astype(int).tolist()
+
+
+def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options) -> BucketSampler:
+    return BucketSampler(PairDataset(Numbered(sizes)), rank=rank, num_replicas=replicas, seed=3, **options)
+
+
+def test_collate_pads_and_masks() -> None:
+    source = Numbered([2, 5, 3])
+    pairs = [source.pair(i, 0) for i in (1, 2)]
+    batch = collate(pairs, [1, 2])
+    assert batch.points2d.dtype == batch.rotation.dtype == batch.focal.dtype == torch.float32
+    assert batch.index.tolist() == [1, 2]
+    assert batch.ids == ("0:1", "0:2")
+    assert batch.focal.tolist() == [800.0, 800.0]
+    for row, pair in enumerate(pairs):
+        n = len(pair.points3d)
+        assert batch.mask3d[row].tolist() == [True] * n + [False] * (5 - n)
+        np.testing.assert_array_equal(batch.points3d[row, :n], pair.points3d)
+        np.testing.assert_array_equal(batch.points2d[row, :n], pair.points2d)
+        assert batch.match3d[row].tolist() == pair.match3d.tolist() + [-1] * (5 - n)
+
+
+@pytest.mark.parametrize("count", [1, 7, 24, 1003])
+@pytest.mark.parametrize("replicas", [1, 2, 4])
+def test_training_visits_each_pair_at_most_once_an_epoch(count: int, replicas: int) -> None:
+    sizes = random_sizes(count)
+    ranks = [sampler(sizes, batch_size=8, shuffle=True, rank=r, replicas=replicas) for r in range(replicas)]
+    alone = sampler(sizes, batch_size=8, shuffle=True)
+    previous: list = []
+    for epoch in (0, 1):
+        for one in (alone, *ranks):
+            one.set_epoch(epoch)
+        steps = list(alone)
+        assert steps == list(alone) != previous
+        previous = steps
+        keys = [key for step in steps for key in step]
+        assert {e for e, _ in keys} == {epoch}
+        assert len(set(keys)) == len(keys) == (count if count < 8 else count - count % 8)
+        shares = [list(one) for one in ranks]
+        assert {len(one) for one in shares} == {len(one) for one in ranks} == {len(steps)}
+        for step, *parts in zip(steps, *shares, strict=True):
+            assert len({len(part) for part in parts}) == 1
+            assert {key for part in parts for key in part} == set(step)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 250])
+@pytest.mark.parametrize("replicas", [1, 2, 4])
+@pytest.mark.parametrize("max_cells", [None, 40_000])
+def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int | None) -> None:
+    sizes = random_sizes(count)
+    options = {"batch_size": 8, "shuffle": False, "max_cells": max_cells}
+    ranks = [sampler(sizes, rank=r, replicas=replicas, **options) for r in range(replicas)]
+    before = [list(one) for one in ranks]
+    for one in ranks:
+        one.set_epoch(5)
+    shares = [list(one) for one in ranks]
+    assert shares == before
+    assert {len(one) for one in shares} == {len(one) for one in ranks}
+    assert all(step for share in shares for step in share)
+    keys = [key for share in shares for step in share for key in step]
+    assert set(keys) == {(0, i) for i in range(count)}
+    if max_cells is None:
+        alone = [set(step) for step in sampler(sizes, **options)]
+        assert [{k for part in parts for k in part} for parts in zip(*shares, strict=True)] == alone
+
+
+def test_max_cells_bounds_padding_and_buckets_waste_little() -> None:
+    sizes = np.array(random_sizes(3000, largest=14_742))
+
+    def cells(batches: list[list[tuple[int, int]]]) -> list[tuple[int, int]]:
+        return [(len(b), len(b) * int(sizes[[i for _, i in b]].max()) ** 2) for b in batches]
+
+    bounded = cells(list(sampler(sizes.tolist(), batch_size=16, shuffle=False, max_cells=10_000_000)))
+    assert all(cost <= 10_000_000 or count == 1 for count, cost in bounded)
+    needed = int((sizes.astype(float) ** 2).sum())
+    assert sum(cost for _, cost in bounded) < 1.05 * needed
+    training = sum(cost for _, cost in cells(list(sampler(sizes.tolist(), batch_size=16, shuffle=True))))
+    shuffled = np.random.default_rng(1).permutation(sizes)[:2992].reshape(-1, 16)
+    assert training < 1.4 * needed
+    assert training < 0.25 * (16 * shuffled.max(1).astype(float) ** 2).sum()
+
+
+def test_workers_change_nothing() -> None:
+    source = Numbered(random_sizes(20))
+    loaders = [pair_loader(source, batch_size=4, shuffle=True, seed=1, num_workers=w) for w in (0, 1)]
+    state = torch.get_rng_state()
+    for one, other in zip(*loaders, strict=True):
+        assert one.ids == other.ids
+        assert torch.equal(one.points2d, other.points2d)
+        assert torch.equal(one.match3d, other.match3d)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    source = Numbered(random_sizes(20))
+    whole = [batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)]
+    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
+    halves = []
+    for rank in (0, 1):
+        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
+        halves.append([batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)])
+    assert [a + b for a, b in zip(*halves, strict=True)] == whole
+
+
+def test_errors_name_what_is_wrong() -> None:
+    with pytest.raises(ValueError, match=r"2 processes divide, got 15; try 16"):
+        sampler([4] * 20, batch_size=15, shuffle=True, replicas=2)
+    with pytest.raises(ValueError, match="at least one pair"):
+        sampler([], batch_size=4, shuffle=False)
+    with pytest.raises(ValueError, match=r"max_cells.*shuffle=False"):
+        sampler([4], batch_size=4, shuffle=True, max_cells=100)
+    dataset = PairDataset(Numbered([4, 4]))
+    with pytest.raises(ValueError, match="overfit_batches"):
+        next(iter(PairLoader(dataset, sampler=SequentialSampler(dataset), batch_size=None)))
+
+
+class Recorder(lightning.LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.layer = torch.nn.Linear(2, 1)
+        self.seen: list[tuple[str, ...]] = []
+
+    def training_step(self, batch, _) -> torch.Tensor:
+        self.seen.append(batch.ids)
+        return self.layer(batch.points2d).mean()
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+class Pairs(lightning.LightningDataModule):
+    def __init__(self, workers: int) -> None:
+        super().__init__()
+        self.workers = workers
+
+    def train_dataloader(self) -> DataLoader:
+        return pair_loader(Numbered(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=self.workers)
+
+
+@pytest.mark.parametrize("workers", [0, 1])
+@pytest.mark.filterwarnings("ignore")
+def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers: int) -> None:
+    def fit(*callbacks: ModelCheckpoint, checkpoint: Path | None = None) -> list[tuple[str, ...]]:
+        module = Recorder()
+        trainer = lightning.Trainer(
+            max_epochs=2,
+            accelerator="cpu",
+            logger=False,
+            enable_progress_bar=False,
+            enable_model_summary=False,
+            enable_checkpointing=bool(callbacks),
+            callbacks=list(callbacks),
+        )
+        trainer.fit(module, Pairs(workers), ckpt_path=checkpoint)
+        return module.seen
+
+    whole = fit(ModelCheckpoint(tmp_path, filename="{step}", save_top_k=-1, every_n_train_steps=1))
+    expected = sampler(random_sizes(14), batch_size=4, shuffle=True)
+    planned = list(expected)
+    expected.set_epoch(1)
+    planned += list(expected)
+    assert whole == [tuple(f"{epoch}:{i}" for epoch, i in step) for step in planned]
+    for step in (2, 3, 5):  # inside the first epoch, at its end, inside the second
+        assert fit(checkpoint=tmp_path / f"step={step}.ckpt") == whole[step:]
