@@ -247,3 +247,24 @@ class PoseRecall(_PoseMetric):
 
     def compute(self) -> dict[str, Tensor]:
         return recalls(self.errors(), self.thresholds)
+
+
+class MeanOverPairs(Metric):
+    """Mean of one value per pair over batches and processes, each pair counted once by its `Batch.index`."""
+
+    full_state_update = False
+    records: list[Tensor]
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.add_state("records", default=[], dist_reduce_fx="cat")
+
+    def update(self, values: Float[Tensor, " b"], index: Int[Tensor, " b"]) -> None:
+        self.records.append(torch.stack([index.double(), values.detach().double()], -1))
+
+    def compute(self) -> Float[Tensor, ""]:
+        records = dim_zero_cat(self.records)
+        order = torch.argsort(records[:, 0], stable=True)
+        first = torch.ones_like(order, dtype=torch.bool)
+        first[1:] = records[order, 0].diff() != 0
+        return records[order, 1][first].mean()

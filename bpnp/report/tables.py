@@ -1,0 +1,221 @@
+"""Tables of test results for the terminal: the paper's quartiles, recall at standard points, untrained against trained.
+
+Every table fits in `WIDTH` columns without breaking a number.
+"""
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bpnp.metrics import RecallThresholds, recalls
+from bpnp.report.results import Results, read_results
+
+WIDTH = 100
+Paper = Literal["modelnet40", "megadepth"]
+Values = Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a column's number is found, what is written above it, and whether it is a share (shown in %, more is
+    better) or an error or a time (less is better)."""
+
+    key: str
+    header: str
+    share: bool = False
+
+
+QUARTILES = tuple(
+    Column(f"{error}_q{number}{unit}", f"{short}\nQ{number}")
+    for error, unit, short in (
+        ("rotation", "_deg", "rot"),
+        ("translation", "", "trans"),
+        ("reprojection", "_deg", "repr"),
+    )
+    for number in (1, 2, 3)
+)
+RESULT_COLUMNS = (
+    *QUARTILES,
+    Column("recall_joint_15deg_0.5", "15deg\n0.5", share=True),
+    Column("recall_joint_10deg_1", "10deg\n1.0", share=True),
+    Column("found", "found\n%", share=True),
+    Column("seconds_mean", "sec"),
+)
+STANDARD_POINTS = RecallThresholds((1, 2, 5, 10, 20), (0.05, 0.1, 0.2, 0.5, 1), (), (0.25, 0.5, 1, 2))
+RECALL_COLUMNS = (
+    *(Column(f"recall_rotation_{limit:g}deg", f"rot\n{limit:g}", share=True) for limit in STANDARD_POINTS.rotation_deg),
+    *(
+        Column(f"recall_translation_{limit:g}", f"trans\n{limit:g}", share=True)
+        for limit in STANDARD_POINTS.translation
+    ),
+    *(
+        Column(f"recall_reprojection_{limit:g}deg", f"repr\n{limit:g}", share=True)
+        for limit in STANDARD_POINTS.reprojection_deg
+    ),
+)
+
+
+def _published(errors: str, seconds: str, **recall: str) -> dict[str, str]:
+    keys = (column.key for column in QUARTILES)
+    return dict(zip(keys, errors.split(), strict=True)) | {"seconds_mean": seconds} | recall
+
+
+# Campbell, Liu, Gould, ECCV 2020, as printed: tables 1 and 2, and the recalls in its text. R is the RANSAC estimate.
+PAPER: Mapping[Paper, tuple[str, Mapping[str, Mapping[str, str]]]] = {
+    "modelnet40": (
+        "paper, ModelNet40",
+        {
+            "Lc Lp R": _published("3.33 8.09 15.8 0.04 0.08 0.16 0.28 0.52 1.01", "0.1"),
+            "Lc Lp": _published(
+                "4.88 9.66 16.0 0.04 0.08 0.15 0.36 0.61 1.03", "0.1", **{"recall_joint_15deg_0.5": "72"}
+            ),
+        },
+    ),
+    "megadepth": (
+        "paper, MegaDepth",
+        {
+            "Lc Lp R": _published("0.34 1.00 4.88 0.04 0.12 0.53 0.06 0.12 0.74", "0.2", recall_joint_10deg_1="82"),
+            "Lc Lp": _published("1.32 3.31 8.84 0.21 0.46 1.08 0.21 0.53 1.64", "0.2", recall_joint_10deg_1="73"),
+        },
+    ),
+}
+
+
+def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> Table:
+    """Quartiles, joint recalls, share of pairs with a pose and seconds per pair, a row per run and estimate.
+
+    The best number of each column is bold. `paper` adds the published rows of that data set, for orientation only: they
+    are of other data and take no part in the comparison.
+    """
+    name, estimates = PAPER[paper] if paper is not None else ("", {})
+    published = {f"{name}: {estimate}": shown for estimate, shown in estimates.items()}
+    caption = (
+        "rot, repr: errors in degrees; trans: in scene units; 15deg 0.5, 10deg 1.0: % of pairs with both rotation and "
+        "translation error within; sec: seconds per pair. A pair without a pose counts as 180 deg and inf."
+    )
+    return _table(_title("Pose errors", runs), RESULT_COLUMNS, _rows(runs), published, caption)
+
+
+def recall_table(runs: Mapping[str, Results]) -> Table:
+    """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
+    caption = "% of pairs with an error up to the number in the head: rot, repr in degrees; trans in scene units."
+    return _table(_title("Recall", runs), RECALL_COLUMNS, _rows(runs), {}, caption)
+
+
+def learning_table(before: Results, after: Results) -> Table:
+    """Correspondence loss and median rotation error of each estimate, untrained and trained, side by side.
+
+    Raises ValueError if the two are not of the same pairs.
+    """
+    ids = [sorted({(row.index, row.id) for row in results.rows}) for results in (before, after)]
+    if ids[0] != ids[1]:
+        raise ValueError(f"expected the same pairs untrained and trained, got {len(ids[0])} and {len(ids[1])} pairs")
+    table = Table(title=_title("Learning", {"": after}), box=box.SIMPLE_HEAD)
+    table.add_column("")
+    for header in ("untrained", "trained"):
+        table.add_column(header, justify="right", no_wrap=True)
+    table.add_row("correspondence loss", *(number(results.correspondence_loss) for results in (before, after)))
+    for estimate in dict.fromkeys([*before.estimates, *after.estimates]):
+        medians = (results.estimates.get(estimate, {}).get("rotation_q2_deg") for results in (before, after))
+        table.add_row(Text(f"median rotation error, deg: {estimate}"), *map(number, medians))
+    return table
+
+
+def report(
+    paths: Sequence[Path],
+    console: Console | None = None,
+    *,
+    paper: Paper | None = None,
+    untrained: Path | None = None,
+) -> None:
+    """Print the tables of one or several results folders, named by what their paths do not share.
+
+    `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
+    columns wide. Raises ValueError if a folder cannot be read.
+    """
+    if not paths:
+        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
+    shared = os.path.commonpath([Path(path).absolute().parent for path in paths])
+    runs = {os.path.relpath(Path(path).absolute(), shared): read_results(path) for path in paths}
+    if console is None:
+        console = Console()
+        console.width = max(console.width, WIDTH)
+    console.print(results_table(runs, paper=paper))
+    console.print(recall_table(runs))
+    if untrained is not None:
+        console.print(learning_table(read_results(untrained), list(runs.values())[-1]))
+
+
+def number(value: float | None) -> str:
+    """Three significant digits in at most six characters: two digits below 0.01; "-" for none."""
+    if value is None:
+        return "-"
+    size = abs(value)
+    if size == 0 or not math.isfinite(value):
+        return f"{value:g}"
+    if 0.01 <= size < 999.5:
+        return f"{value:#.3g}".rstrip(".")
+    if 0.001 <= size < 0.01:
+        return f"{value:.4f}"
+    if 999.5 <= size < 99_999.5:
+        return f"{value:.0f}"
+    mantissa, exponent = f"{value:.{0 if size < 1e-9 else 1}e}".split("e")
+    return f"{mantissa}e{int(exponent)}"
+
+
+def _rows(runs: Mapping[str, Results]) -> dict[str, Values]:
+    rows: dict[str, Values] = {}
+    for name, results in runs.items():
+        for estimate, values in results.estimates.items():
+            standard = recalls(results.errors(estimate), STANDARD_POINTS)
+            label = estimate if len(runs) == 1 else f"{name}: {estimate}"
+            rows[label] = values | {key: float(value) for key, value in standard.items()}
+    return rows
+
+
+def _title(what: str, runs: Mapping[str, Results]) -> str:
+    sizes = sorted({len({row.index for row in results.rows}) for results in runs.values()})
+    return f"{what}, {' or '.join(map(str, sizes))} pairs"
+
+
+def _table(
+    title: str,
+    columns: Sequence[Column],
+    rows: Mapping[str, Values],
+    published: Mapping[str, Mapping[str, str]],
+    caption: str,
+) -> Table:
+    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, caption_justify="left")
+    table.add_column("", overflow="fold", min_width=9)
+    for column in columns:
+        table.add_column(column.header, justify="right", no_wrap=True)
+    best = {column.key: _best(column, list(rows.values())) for column in columns}
+    for label, values in rows.items():
+        shown = {column.key: _cell(column, values) for column in columns}
+        cells = (Text(text, "bold" if text == best[key] else "") for key, text in shown.items())
+        table.add_row(Text(label), *cells)
+    table.add_section()
+    for label, printed in published.items():
+        table.add_row(Text(label, "dim"), *(Text(printed.get(column.key, "-"), "dim") for column in columns))
+    return table
+
+
+def _cell(column: Column, values: Values) -> str:
+    value = values.get(column.key)
+    return f"{100 * value:.1f}" if column.share and value is not None else number(value)
+
+
+def _best(column: Column, rows: Sequence[Values]) -> str | None:
+    """The best number as it is shown, so that what reads the same is marked the same; nothing to mark in one row."""
+    known = [row for row in rows if math.isfinite(row.get(column.key, math.nan))]
+    if len(rows) < 2 or not known:
+        return None
+    return _cell(column, (max if column.share else min)(known, key=lambda row: row[column.key]))

@@ -1,0 +1,236 @@
+import csv
+import dataclasses
+import json
+import math
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from bpnp.metrics import PoseErrors, RecallThresholds
+from bpnp.report import (
+    PairRow,
+    count_inliers,
+    read_results,
+    rows_from,
+    summarise,
+    write_results,
+)
+from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+HOSTILE = [
+    'a,b"c',
+    "two\nlines",
+    "cr\rhere",
+    "crlf\r\n",
+    "<script>alert(1)</script>",
+    "[bold]x[/",
+    "=1+1",
+    "",
+    " é\udcff ",
+]
+
+
+def planted(sizes: tuple[int, ...] = (6, 4)) -> Batch:
+    """Exact pairs of different sizes; the last 3D point of each has no match, and lies behind the camera."""
+    rng = np.random.default_rng(0)
+    rotation = Rotation.random(len(sizes), rng=rng).as_matrix()
+    translation = np.tile([0.0, 0.0, 5.0], (len(sizes), 1))
+    sets2d, sets3d, matches = [], [], []
+    for i, size in enumerate(sizes):
+        camera = np.c_[np.arange(size) * 0.3, np.zeros(size), np.full(size, 4.0)]
+        camera[-1] *= -1
+        sets3d.append((camera - translation[i]) @ rotation[i])
+        sets2d.append(camera[:-1, :2] / camera[:-1, 2:])
+        matches.append(np.r_[np.arange(size - 1), -1])
+    return Batch.from_arrays(
+        sets2d, sets3d, list(rotation), list(translation), matches, index=[7, 3], ids=["seven", "three"]
+    )
+
+
+def pose_of(batch: Batch) -> Pose:
+    assert batch.rotation is not None
+    assert batch.translation is not None
+    stats = SolveStats(torch.tensor([5, 9]), torch.tensor([1e-9, 0.5]), torch.tensor([True, False]))
+    return Pose(batch.rotation.clone(), batch.translation.clone(), stats)
+
+
+def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
+    values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
+    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
+    return dataclasses.replace(first, **changes)  # type: ignore[arg-type]
+
+
+def test_rows_of_a_planted_batch() -> None:
+    batch = planted()
+    refined = pose_of(batch)
+    refined.rotation[1] = math.nan
+    rows = rows_from(Prediction(poses={"pnp": pose_of(batch), "refined": refined}), batch, 3.0)
+    assert [(r.index, r.id, r.estimate) for r in rows] == [
+        (7, "seven", "pnp"), (3, "three", "pnp"), (7, "seven", "refined"), (3, "three", "refined")]  # fmt: skip
+    assert [(r.m, r.n, r.true_pairs, r.inliers, r.seconds) for r in rows[:2]] == [(5, 6, 5, 5, 1.5), (3, 4, 3, 3, 1.5)]
+    assert [(r.iterations, r.residual, r.converged) for r in rows[:2]] == [
+        (5, pytest.approx(1e-9), True),
+        (9, 0.5, False),
+    ]
+    assert max(max(r.rotation_error_deg, r.translation_error, r.reprojection_error_deg) for r in rows[:3]) < 1e-6
+    lost = rows[3]
+    assert not lost.found
+    assert (lost.rotation_error_deg, lost.reprojection_error_deg, lost.inliers) == (180, 180, 0)
+    assert lost.translation_error == lost.centre_error == math.inf
+    for r in rows:
+        for field in dataclasses.fields(r):
+            assert type(getattr(r, field.name)) is field.type
+
+
+def test_inliers_are_those_of_a_brute_force_count() -> None:
+    rng = np.random.default_rng(1)
+    points2d, points3d = rng.uniform(-0.5, 0.5, (200, 2)), rng.uniform(-1, 1, (150, 3)) + [0, 0, 0.5]
+    batch = Batch.from_arrays(points2d, points3d, np.eye(3), np.zeros(3))
+    rotation = torch.from_numpy(Rotation.from_rotvec([[0.1, 0.2, 0.3]]).as_matrix())
+    stats = SolveStats(torch.ones(1, dtype=torch.long), torch.zeros(1), torch.ones(1, dtype=torch.bool))
+    pose = Pose(rotation, torch.tensor([[0.1, 0.0, 0.2]], dtype=torch.float64), stats)
+    camera = points3d @ rotation[0].numpy().T + [0.1, 0, 0.2]
+    front = camera[camera[:, 2] > 0]
+    distance = np.linalg.norm(points2d[:, None] - (front[:, :2] / front[:, 2:])[None], axis=-1)
+    assert 0 < len(front) < 150
+    for threshold in (0.01, 0.1):
+        assert count_inliers(pose, batch, threshold=threshold) == [(distance.min(1) < threshold).sum()]
+    behind = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, -9.0]]).double(), stats)
+    assert count_inliers(behind, batch) == [0]
+
+
+def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
+    rows = [row(i, id=name) for i, name in enumerate(HOSTILE)]
+    lost = {"rotation_error_deg": 180.0, "translation_error": math.inf, "centre_error": math.inf}
+    rows[1] = dataclasses.replace(rows[1], **lost, found=False, converged=False, residual=math.inf)
+    settings = {"command": ["bpnp", "test"], "limit": math.inf, "path": Path("a/b"), "seed": 0, "nested": {"x": None}}
+    written = write_results(tmp_path / "new" / "run", rows, correspondence_loss=-0.25, settings=settings)
+    again = read_results(tmp_path / "new" / "run")
+    assert again == written
+    assert again.rows == tuple(rows)
+    assert again.correspondence_loss == -0.25
+    assert again.settings == settings | {"limit": "inf", "path": "a/b"}
+    assert again.estimates["pnp"]["found"] == pytest.approx(8 / 9)
+    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["pairs.csv", "summary.json"]
+
+
+def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
+    rows = [row(0, id=HOSTILE[0]), row(1, translation_error=math.inf, reprojection_error_deg=math.nan)]
+    write_results(tmp_path, rows)
+    with (tmp_path / "pairs.csv").open(newline="", encoding="utf-8") as file:
+        table = list(csv.DictReader(file))
+    assert table[0]["id"] == HOSTILE[0]
+    assert float(table[0]["rotation_error_deg"]) == rows[0].rotation_error_deg
+    assert (table[1]["translation_error"], table[1]["reprojection_error_deg"]) == ("inf", "nan")
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    summary = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
+    assert (summary["format"], summary["pairs"], summary["correspondence_loss"]) == (1, 2, None)
+    assert summary["estimates"]["pnp"]["translation_q3"] == "inf"
+    assert summary["estimates"]["pnp"]["without_true_pairs"] == 1
+    assert read_results(tmp_path).estimates["pnp"]["translation_q3"] == math.inf
+
+
+def test_the_files_do_not_depend_on_the_order_of_rows_and_count_a_repeated_pair_once(tmp_path: Path) -> None:
+    rows = [row(i, estimate) for i in range(20) for estimate in ("refined", "own", "ransac", "pnp")]
+    write_results(tmp_path / "a", rows)
+    shuffled = rows + rows[:12]
+    random.Random(0).shuffle(shuffled)
+    write_results(tmp_path / "b", shuffled)
+    assert (tmp_path / "a" / "pairs.csv").read_bytes() == (tmp_path / "b" / "pairs.csv").read_bytes()
+    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
+    assert [summary.pop("written") != "" for summary in summaries] == [True, True]
+    assert summaries[0] == summaries[1]
+    assert list(summaries[0]["estimates"]) == ["ransac", "pnp", "refined", "own"]
+    assert [(r.index, r.estimate) for r in read_results(tmp_path / "a").rows[:5]] == [
+        (0, "ransac"), (0, "pnp"), (0, "refined"), (0, "own"), (1, "ransac")]  # fmt: skip
+
+
+def test_a_summary_is_numpys_quantiles_and_counts_of_its_rows() -> None:
+    rows = [row(i, seconds=0.1 * i, converged=i % 2 == 0) for i in range(11)]
+    summary = summarise(rows, thresholds=RecallThresholds((5,), (), (), (), ((4, 6),)))["pnp"]
+    degrees, lengths = (np.array([getattr(r, n) for r in rows]) for n in ("rotation_error_deg", "translation_error"))
+    for i, quantile in enumerate(np.quantile(degrees, [0.25, 0.5, 0.75]), start=1):
+        assert summary[f"rotation_q{i}_deg"] == pytest.approx(quantile, rel=1e-14)
+    assert summary["recall_rotation_5deg"] == (degrees <= 5).mean()
+    assert summary["recall_joint_4deg_6"] == ((degrees <= 4) & (lengths <= 6)).mean()
+    assert summary["seconds_mean"] == pytest.approx(0.5)
+    assert summary["converged"] == 6 / 11
+
+
+def test_a_failed_write_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_results(tmp_path, [row(0)])
+
+    def fail(*_: object) -> None:
+        raise OSError("disk full")
+
+    monkeypatch.setattr("bpnp.report.results.os.replace", fail)
+    with pytest.raises(OSError, match="disk full"):
+        write_results(tmp_path, [row(0), row(1)])
+    assert [path.name for path in tmp_path.iterdir()] == ["pairs.csv"]
+    with pytest.raises(ValueError, match=r"expected a results folder with summary\.json, got no .*summary\.json"):
+        read_results(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ([], "expected at least one row, got none"),
+        ([row(0), row(0, "ransac", id="other")], "expected one id for index 0, got 'pair 0', 'other'"),
+        ([row(0), row(1), row(1, "ransac")], "expected each estimate for all 2 pairs, got"),
+    ],
+)
+def test_rows_that_cannot_be_a_test_are_refused(tmp_path: Path, rows: list[PairRow], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        write_results(tmp_path, rows)
+    assert list(tmp_path.iterdir()) == []
+
+
+def _edit(name: str, old: str, new: str) -> Callable[[Path], object]:
+    def edit(folder: Path) -> None:
+        text = (folder / name).read_bytes()
+        assert old.encode() in text
+        (folder / name).write_bytes(text.replace(old.encode(), new.encode(), 1))
+
+    return edit
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda folder: (folder / "pairs.csv").unlink(), r"expected a results folder with pairs\.csv, got no"),
+        (_edit("summary.json", '"format": 1', '"format": 2'), "expected results of format 1 in .*, got 2"),
+        (_edit("summary.json", '"pairs": 3', '"pairs": 4'), "expected 4 x 1 rows in pairs.csv"),
+        (_edit("summary.json", '"settings"', '"things"'), "expected what `bpnp test` writes in .*KeyError: 'settings'"),
+        (lambda folder: (folder / "summary.json").write_text('{"format": 1, '), r"expected JSON in .*summary\.json"),
+        (lambda folder: (folder / "summary.json").write_text("[]"), "expected results of format 1 in .*, got None"),
+        (_edit("pairs.csv", "inliers", "inlyers"), r"expected column 'inliers' in .*pairs\.csv"),
+        (_edit("pairs.csv", "True", "maybe"), r"expected numbers in .*pairs\.csv, line 2, got 'maybe'"),
+        (_edit("pairs.csv", ",10,12,", ",10,x,"), r"expected numbers in .*pairs\.csv, line 2, got .*'x'"),
+        (_edit("pairs.csv", ",10,12,", ",10,"), r"expected 16 columns in .*pairs\.csv, line 2, got 15"),
+        (lambda folder: (folder / "pairs.csv").write_text(""), r"expected column 'index' in .*pairs\.csv"),
+        (
+            lambda folder: (folder / "pairs.csv").write_bytes((folder / "pairs.csv").read_bytes().split(b"\r\n")[0]),
+            r"expected at least one row in .*pairs\.csv, got none",
+        ),
+    ],
+)
+def test_damaged_results_raise_one_clear_error(tmp_path: Path, damage: Callable[[Path], object], message: str) -> None:
+    write_results(tmp_path, [row(i) for i in range(3)])
+    damage(tmp_path)
+    with pytest.raises(ValueError, match=message):
+        read_results(tmp_path)
+
+
+def test_results_give_their_errors_back(tmp_path: Path) -> None:
+    results = write_results(tmp_path, [row(2), row(1), row(1, "ransac"), row(2, "ransac")])
+    errors = results.errors("ransac")
+    assert isinstance(errors, PoseErrors)
+    assert errors.rotation_deg.tolist() == [row(1).rotation_error_deg, row(2).rotation_error_deg]

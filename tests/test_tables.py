@@ -1,0 +1,114 @@
+import dataclasses
+import io
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from bpnp.report import PairRow, learning_table, recall_table, report, results_table, write_results
+from bpnp.report.tables import number
+
+
+def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
+    values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
+    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
+    return dataclasses.replace(first, **changes)  # type: ignore[arg-type]
+
+
+def rendered(table: Table, width: int = 100) -> list[str]:
+    console = Console(width=width, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        console.print(table)
+    return capture.get().splitlines()
+
+
+def bold(table: Table) -> list[list[str]]:
+    """The bold numbers of each row."""
+    columns = [list(column.cells) for column in table.columns[1:]]
+    return [[cell.plain for cell in cells if cell.style == "bold"] for cells in zip(*columns, strict=True)]  # type: ignore[union-attr]
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "-"), (0.0, "0"), (math.inf, "inf"), (math.nan, "nan"), (180.0, "180"), (12.34, "12.3"), (1.0, "1.00"),
+     (9.996, "10.0"), (0.5, "0.500"), (0.01234, "0.0123"), (0.00126, "0.0013"), (1.26e-4, "1.3e-4"), (1e-16, "1e-16"),
+     (999.7, "1000"), (12345.6, "12346"), (1.26e5, "1.3e5"), (-0.25, "-0.250")],
+)  # fmt: skip
+def test_numbers_are_compact(value: float | None, text: str) -> None:
+    assert number(value) == text
+
+
+@pytest.mark.parametrize("scale", [1e-12, 1e-5, 1e-3, 1.0, 1e4])
+def test_tables_fit_in_100_columns_with_every_number_whole(tmp_path: Path, scale: float) -> None:
+    runs = {}
+    for name in ("a-run-with-a-rather-long-name/version_0", "[red]b[/red]"):
+        rows = [row(i, estimate) for i in range(9) for estimate in ("ransac", "pnp")]
+        rows = [
+            dataclasses.replace(r, rotation_error_deg=min(180.0, r.rotation_error_deg * scale), seconds=0.0123,
+                                translation_error=r.translation_error * scale,
+                                reprojection_error_deg=min(180.0, r.reprojection_error_deg * scale))
+            for r in rows
+        ]  # fmt: skip
+        runs[name] = write_results(tmp_path / name, rows)
+    for table, columns in ((results_table(runs, paper="megadepth"), 13), (recall_table(runs), 14)):
+        lines = rendered(table)
+        assert max(map(len, lines)) <= 100
+        assert "…" not in "".join(lines)
+        numbers = [cell.plain for column in table.columns[1:] for cell in column.cells]  # type: ignore[union-attr]
+        words = " ".join(lines).split()
+        assert len(numbers) == columns * len(table.rows)
+        assert all(words.count(cell) >= numbers.count(cell) for cell in numbers)
+    assert "[red]b[/red]: pnp" in " ".join(" ".join(rendered(results_table(runs), width=140)).split())
+
+
+def test_the_best_of_each_column_is_bold(tmp_path: Path) -> None:
+    good = {"rotation_error_deg": 1.0, "translation_error": 0.1, "reprojection_error_deg": 0.5, "seconds": 2.0}
+    bad = {"rotation_error_deg": 180.0, "translation_error": math.inf, "reprojection_error_deg": 180.0, "seconds": 1.0}
+    results = write_results(tmp_path, [row(0, "ransac", **good), row(0, "pnp", **bad, found=False)])
+    table = results_table({"run": results}, paper="modelnet40")
+    best = ["1.00"] * 3 + ["0.100"] * 3 + ["0.500"] * 3 + ["100.0"] * 3
+    assert bold(table) == [best, ["1.00"], [], []]
+    alone = write_results(tmp_path, [row(0, **good)])
+    assert bold(results_table({"run": alone})) == [[]]
+
+
+def test_the_learning_table_sets_untrained_beside_trained(tmp_path: Path) -> None:
+    before = write_results(tmp_path, [row(0, rotation_error_deg=40.0)], correspondence_loss=0.5)
+    after = write_results(tmp_path, [row(0, rotation_error_deg=2.5)], correspondence_loss=-0.75)
+    words = [line.split() for line in rendered(learning_table(before, after))]
+    assert ["correspondence", "loss", "0.500", "-0.750"] in words
+    assert ["median", "rotation", "error,", "deg:", "pnp", "40.0", "2.50"] in words
+    other = write_results(tmp_path, [row(0), row(1)])
+    with pytest.raises(ValueError, match="expected the same pairs untrained and trained, got 1 and 2"):
+        learning_table(before, other)
+
+
+def test_a_report_names_runs_by_what_their_paths_do_not_share(tmp_path: Path) -> None:
+    for name in ("first", "second"):
+        write_results(tmp_path / name / "test", [row(i) for i in range(4)], correspondence_loss=0.5)
+    console = Console(width=140, file=io.StringIO(), color_system=None)
+    with console.capture() as capture:
+        report(
+            [tmp_path / name / "test" for name in ("first", "second")], console, untrained=tmp_path / "first" / "test"
+        )
+    text = capture.get()
+    assert text.count("first/test: pnp") == text.count("second/test: pnp") == 2
+    assert str(tmp_path) not in text
+    assert "untrained" in text
+    assert "paper" not in text
+    with console.capture() as capture:
+        report([tmp_path / "first" / "test"], console, paper="modelnet40")
+    text = capture.get()
+    assert "first" not in text
+    assert "paper, ModelNet40: Lc Lp R" in text
+    with pytest.raises(ValueError, match="expected at least one results folder"):
+        report([], console)
+
+
+def test_a_report_into_a_pipe_is_wide_enough(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_results(tmp_path, [row(i) for i in range(4)])
+    report([tmp_path])
+    assert "…" not in capsys.readouterr().out
