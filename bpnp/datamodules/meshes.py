@@ -1,0 +1,232 @@
+"""Meshes seen by virtual cameras: ModelNet40, any folder in its layout, or procedural shapes."""
+
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from lightning import LightningDataModule
+from numpy.typing import NDArray
+from torch.utils.data import DataLoader
+
+from bpnp.datamodules.batching import Pair, pair_loader
+from bpnp.datamodules.mesh_folder import folder_pools
+from bpnp.datamodules.pools import SurfacePools
+from bpnp.datamodules.procedural import SPLITS, procedural_pools
+from bpnp.datamodules.surfaces import Normalisation
+from bpnp.datamodules.views import MIN_SEEN, Views, draw_pair
+from bpnp.types import Batch
+
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
+
+
+def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Split range(count) at random into training rows and validation rows, at least one of each, both sorted.
+
+    Raises ValueError for a fraction outside (0, 1) or fewer than two rows.
+    """
+    if not 0 < fraction < 1:
+        raise ValueError(f"expected `val_fraction` between 0 and 1, got {fraction}")
+    if count < 2:
+        raise ValueError(f"expected at least 2 training meshes, to hold one out for validation, got {count}")
+    held = min(count - 1, max(1, round(fraction * count)))
+    order = np.random.default_rng(seed).permutation(count)
+    return np.sort(order[held:]), np.sort(order[:held])
+
+
+class MeshSource:
+    """A `PairSource`: pair i is view i // k of mesh rows[i % k], k meshes in all.
+
+    A pair is a function of (seed, split, index), and of the epoch too with `fresh_views`.
+    Warns if the views may lose points behind the camera. Raises ValueError for no pairs.
+    """
+
+    def __init__(
+        self,
+        pools: SurfacePools,
+        rows: NDArray[np.int64],
+        *,
+        num_pairs: int,
+        num_points: int,
+        views: Views,
+        seed: int,
+        split: str,
+        fresh_views: bool = False,
+    ) -> None:
+        if num_pairs < 1:
+            raise ValueError(f"expected at least one {split} pair, got {num_pairs}")
+        if not views.sees_all(pools.radius):
+            warnings.warn(
+                f"the {split} meshes reach {pools.radius:.3g} from their origin: points that fall behind a camera at "
+                f"`distance` {views.distance} get no 2D point; try normalisation unit_sphere or a larger distance",
+                stacklevel=2,
+            )
+        # fewer pairs than meshes: a fair sample of them, the first ones would be all of one class
+        rng = np.random.default_rng(seed)
+        self.rows = np.sort(rng.choice(rows, num_pairs, replace=False)) if num_pairs < len(rows) else rows
+        self.pools, self.num_pairs, self.num_points, self.views = pools, num_pairs, num_points, views
+        self.seed, self.split, self.fresh_views = seed, split, fresh_views
+
+    @property
+    def sizes(self) -> NDArray[np.int64]:
+        return np.full(self.num_pairs, self.num_points)
+
+    def pair(self, index: int, epoch: int) -> Pair:
+        view, mesh = divmod(index, len(self.rows))
+        row = self.rows[mesh]
+        rng = np.random.default_rng([self.seed, SPLITS.index(self.split), epoch if self.fresh_views else 0, index])
+        name = f"{self.pools.names[row]}#{view}"
+        return draw_pair(name, self.pools.points[row], num_points=self.num_points, views=self.views, rng=rng)
+
+
+class MeshDataModule(LightningDataModule):
+    """Virtual cameras around meshes, by default as in Campbell et al. (ECCV 2020), or around procedural shapes.
+
+    Every pair is a subset of a mesh's cached surface samples, seen by a random camera. Validation meshes are held out
+    of the training split; test meshes serve testing and prediction only. Works without a Trainer: `setup()`, then the
+    loaders.
+
+    Args:
+        root: folder of meshes in ModelNet40's layout, <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural
+            shapes.
+        train_pairs: training pairs; pair i shows training mesh i modulo their number.
+        fresh_views: draw new cameras, points and noise every epoch; false for the fixed pairs of the paper.
+        val_fraction: share of the training meshes that is held out for validation.
+        val_pairs: validation pairs, fixed; none for one per held-out mesh.
+        test_pairs: test pairs, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
+            further views.
+        num_points: 3D points of a pair.
+        pool_size: surface samples kept of each mesh, at least num_points; every pair draws its own num_points of them
+            (pool_size equal to num_points: all pairs of a mesh have the same points, as in the paper).
+        normalisation: of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance 1;
+            unit_cube: bounding box centred, longest side 1; none: units of the file.
+        rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
+        euler_range: lowest and highest Euler angle, degrees.
+        translation_range: each coordinate of the translation is uniform within plus and minus this, scene units.
+        distance: added to the translation along the optical axis, scene units.
+        focal: focal length, pixels.
+        noise_px: standard deviation of the noise on 2D points, pixels.
+        train_shapes: procedural training shapes; like val_shapes and test_shapes only used without root.
+        val_shapes: procedural validation shapes; with root val_fraction counts.
+        test_shapes: procedural test shapes.
+        batch_size: training pairs per step, over all processes.
+        eval_batch_size: pairs per step in validation, testing and prediction; none for batch_size.
+        num_workers: loader processes.
+        seed: of shapes, held-out meshes, cameras and order.
+        cache_dir: where the surface samples are kept.
+    """
+
+    def __init__(
+        self,
+        root: str | None = None,
+        *,
+        train_pairs: int = 40_000,
+        fresh_views: bool = False,
+        val_fraction: float = 0.05,
+        val_pairs: int | None = None,
+        test_pairs: int | None = None,
+        num_points: int = 1000,
+        pool_size: int = 2048,
+        normalisation: Normalisation = "unit_sphere",
+        rotation: Literal["euler", "so3"] = "euler",
+        euler_range: tuple[float, float] = (0.0, 45.0),
+        translation_range: float = 0.5,
+        distance: float = 4.5,
+        focal: float = 800.0,
+        noise_px: float = 2.0,
+        train_shapes: int = 1000,
+        val_shapes: int = 100,
+        test_shapes: int = 200,
+        batch_size: int = 16,
+        eval_batch_size: int | None = None,
+        num_workers: int = 0,
+        seed: int = 0,
+        cache_dir: str = ".cache/bpnp",
+    ) -> None:
+        super().__init__()
+        if not MIN_SEEN <= num_points <= pool_size:
+            raise ValueError(
+                f"expected `num_points` from {MIN_SEEN} to `pool_size`, got {num_points} and {pool_size}; "
+                "try a larger `pool_size`"
+            )
+        self.root, self.cache_dir = None if root is None else Path(root), Path(cache_dir)
+        self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
+        self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
+        self.views = Views(rotation, euler_range, translation_range, distance, focal, noise_px)
+        self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
+        self.fresh_views, self.val_fraction, self.seed = fresh_views, val_fraction, seed
+        self.batch_size = batch_size
+        self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
+        self.num_workers = num_workers
+        self.sources: dict[str, MeshSource] = {}
+
+    def prepare_data(self) -> None:
+        """Build the caches in one process, for `setup` to open in all."""
+        self._open(None if self.trainer is None or self.trainer.state.fn is None else self.trainer.state.fn.value)
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open the meshes of a stage (fit, validate, test, predict; none for all). Raises ValueError for bad data."""
+        self.sources |= self._open(stage)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("train", batch_size=self.batch_size)
+
+    def val_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("val", batch_size=self.eval_batch_size)
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("test", batch_size=self.eval_batch_size)
+
+    def predict_dataloader(self) -> DataLoader[Batch]:
+        return self.test_dataloader()
+
+    def _loader(self, split: str, *, batch_size: int) -> DataLoader[Batch]:
+        if split not in self.sources:
+            raise ValueError(f"expected `setup` before the {split} loader, got no call; try `setup()`")
+        return pair_loader(
+            self.sources[split],
+            batch_size=batch_size,
+            shuffle=split == "train",
+            seed=self.seed,
+            num_workers=self.num_workers,
+        )
+
+    def _open(self, stage: str | None) -> dict[str, MeshSource]:
+        return {split: self._source(split) for split in (SPLITS if stage is None else STAGES[stage])}
+
+    def _source(self, split: str) -> MeshSource:
+        pools, rows = self._meshes(split)
+        return MeshSource(
+            pools,
+            rows,
+            num_pairs=len(rows) if (pairs := self.num_pairs[split]) is None else pairs,
+            num_points=self.num_points,
+            views=self.views,
+            seed=self.seed,
+            split=split,
+            fresh_views=self.fresh_views and split == "train",
+        )
+
+    def _meshes(self, split: str) -> tuple[SurfacePools, NDArray[np.int64]]:
+        """Surface samples, and which of their rows belong to a split."""
+        if self.root is None:
+            pools = procedural_pools(
+                split,
+                self.num_shapes[split],
+                seed=self.seed,
+                pool_size=self.pool_size,
+                normalisation=self.normalisation,
+                cache_dir=self.cache_dir,
+            )
+            return pools, np.arange(len(pools))
+        pools = folder_pools(
+            self.root,
+            "test" if split == "test" else "train",
+            pool_size=self.pool_size,
+            normalisation=self.normalisation,
+            cache_dir=self.cache_dir,
+        )
+        if split == "test":
+            return pools, np.arange(len(pools))
+        training, held_out = hold_out(len(pools), self.val_fraction, seed=self.seed)
+        return pools, training if split == "train" else held_out

@@ -1,0 +1,163 @@
+"""Triangle meshes: reading them, the primitives procedural shapes are made of, and uniform samples of their surface."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
+
+Normalisation = Literal["unit_sphere", "unit_cube", "none"]
+
+
+class MeshError(ValueError):
+    """A file that is no usable mesh. The message names the file."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles: vertices (v, 3) and the vertex indices (f, 3) of the faces. MeshError if they are no surface."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        if len(self.faces) == 0:
+            raise MeshError("expected a mesh with faces, got none")
+        if not np.isfinite(self.vertices).all():
+            raise MeshError("expected finite vertices, got NaN or infinity")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            used = f"{self.faces.min()} to {self.faces.max()}"
+            raise MeshError(f"expected faces of the vertices 0 to {len(self.vertices) - 1}, got {used}")
+        area = self.areas.sum()
+        if not 0 < area < np.inf:
+            raise MeshError(f"expected a surface of positive area, got {area}")
+
+    @property
+    def areas(self) -> NDArray[np.float64]:
+        """Area of each face (f,)."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read an .off, .ply, .obj, .stl or .glb file; the parts of a scene become one mesh. Polygons become fans.
+
+    Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
+    vertices.
+    """
+    try:
+        return _read_off(path) if path.suffix.lower() == ".off" else _read_other(path)
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def _read_off(path: Path) -> Mesh:
+    """The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
+
+    trimesh reads OFF too, but five times slower, and takes a file that ends early for one with fewer faces.
+    """
+    text = path.read_text(encoding="utf-8-sig", errors="replace")
+    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip())]
+    header = re.match(r"(?:ST)?C?N?OFF\b|OFF(?=\d)", lines[0]) if lines else None
+    if header is None:
+        raise MeshError(f"expected `OFF` in the first line, got {text[:20]!r}")
+    rest = lines[0][header.end() :].split()
+    counts, body = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
+    if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
+        raise MeshError(f"expected the numbers of vertices and faces after `OFF`, got {' '.join(counts)[:40]!r}")
+    num_vertices, num_faces = int(counts[0]), int(counts[1])
+    if len(body) < num_vertices + num_faces:
+        raise MeshError(
+            f"expected {num_vertices} vertices and {num_faces} faces, got {len(body)} lines: the file is truncated"
+        )
+    try:
+        vertices = np.loadtxt(body[:num_vertices], usecols=(0, 1, 2), ndmin=2) if num_vertices else np.empty((0, 3))
+        faces = _triangles(body[num_vertices : num_vertices + num_faces])
+    except (ValueError, IndexError) as error:
+        raise MeshError(f"expected vertices and faces as numbers, got something else ({error})") from error
+    return Mesh(vertices, faces)
+
+
+def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
+    """Fans of the polygons in rows ``k i_1 ... i_k [colour]``; points and edges (k < 3) have no surface."""
+    corners = np.array([int(row.split(None, 1)[0]) for row in rows])
+    fans = [np.empty((0, 3), np.int64)]
+    for count in np.unique(corners[corners >= 3]):
+        same = [row for row, k in zip(rows, corners, strict=True) if k == count]
+        polygons = np.loadtxt(same, usecols=range(1, count + 1), dtype=np.int64, ndmin=2)
+        middle, last = polygons[:, 1:-1], polygons[:, 2:]
+        fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
+    return np.concatenate(fans)
+
+
+def _read_other(path: Path) -> Mesh:
+    if path.stat().st_size == 0:
+        raise MeshError("expected a mesh, got an empty file")
+    try:
+        # force: one mesh of all parts, each where the scene puts it; process: no search for equal vertices
+        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+    except Exception as error:
+        raise MeshError(f"expected a {path.suffix} mesh, got a file that trimesh cannot read ({error})") from error
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
+
+
+@cache
+def primitives() -> tuple[Mesh, ...]:
+    """Solids of about unit radius: box, wedge, cylinder, cone, capsule, two tori, ball, tube, vase."""
+    create = trimesh.creation
+    profile = np.array([[0.0, -1.0], [0.7, -1.0], [0.3, -0.2], [0.9, 0.5], [0.5, 1.0], [0.0, 1.0]])
+    solids = [
+        create.box(extents=(2, 2, 2)),
+        create.extrude_triangulation(np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]), np.array([[0, 1, 2]]), 1.5),
+        create.cylinder(radius=1, height=2, sections=24),
+        create.cone(radius=1, height=2, sections=24),
+        create.capsule(radius=0.6, height=1, count=(12, 12)),
+        create.torus(0.75, 0.25, 24, 10),
+        create.torus(0.9, 0.1, 24, 8),
+        create.icosphere(subdivisions=2),
+        create.annulus(r_min=0.7, r_max=1, height=1.5, sections=24),
+        create.revolve(profile, sections=24),
+    ]
+    return tuple(Mesh(np.asarray(s.vertices, np.float64), np.asarray(s.faces, np.int64)) for s in solids)
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """`count` points (count, 3) drawn uniformly by area from the triangles of a mesh.
+
+    A triangle is drawn with probability proportional to its area, a point in it as a + u (b - a) + v (c - a) with
+    (u, v) uniform in the unit square, folded over its diagonal.
+    """
+    cumulative = mesh.areas.cumsum()
+    # side="right": a triangle without area is never drawn
+    face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
+    a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
+    u, v = rng.random((2, count, 1))
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    return a + u * (b - a) + v * (c - a)
+
+
+def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.float64]:
+    """Put the surface samples (k, 3) of a mesh into a frame that does not depend on its units.
+
+    unit_sphere: their mean at the origin, the farthest at distance 1. unit_cube: their bounding box centred, its
+    longest side 1. none: as in the file.
+    """
+    if mode == "none":
+        return points
+    if mode == "unit_sphere":
+        centred = points - points.mean(0)
+        return centred / np.linalg.norm(centred, axis=-1).max()
+    if mode == "unit_cube":
+        low, high = points.min(0), points.max(0)
+        return (points - (low + high) / 2) / (high - low).max()
+    raise ValueError(f"expected `normalisation` unit_sphere, unit_cube or none, got {mode!r}")

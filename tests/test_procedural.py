@@ -1,0 +1,61 @@
+"""Procedural shapes: reproducible, disjoint between splits, varied, and without a symmetry that would hide the pose."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import pdist, squareform
+from scipy.spatial.transform import Rotation
+
+from bpnp.datamodules.pools import SurfacePools
+from bpnp.datamodules.procedural import procedural_pools, procedural_shape
+from bpnp.datamodules.surfaces import normalise, sample_surface
+
+
+def pools(folder: Path, split: str, count: int, *, seed: int = 0) -> SurfacePools:
+    return procedural_pools(split, count, seed=seed, pool_size=64, normalisation="unit_sphere", cache_dir=folder)
+
+
+def test_a_shape_depends_on_seed_split_and_number_alone(tmp_path: Path) -> None:
+    few, many = pools(tmp_path / "0", "train", 3), pools(tmp_path / "1", "train", 6)
+    np.testing.assert_array_equal(few.points, many.points[:3])
+    assert few.names == ("procedural/train/000000", "procedural/train/000001", "procedural/train/000002")
+    others = [pools(tmp_path, "test", 3), pools(tmp_path, "val", 3), pools(tmp_path, "train", 3, seed=1)]
+    shapes = np.concatenate([many.points, *(other.points for other in others)]).reshape(15, -1)
+    assert len(np.unique(shapes, axis=0)) == 15
+
+
+def test_shapes_are_connected_and_varied() -> None:
+    """Samples of a shape are linked by short steps; elongations (ratios of principal deviations) spread widely."""
+    ratios = []
+    for i in range(30):
+        rng = np.random.default_rng(i)
+        points = normalise(sample_surface(procedural_shape(rng), 600, rng), "unit_sphere")
+        near = squareform(pdist(points)) < 0.3
+        assert connected_components(near)[0] == 1
+        deviations = np.sqrt(np.linalg.eigvalsh(np.cov(points.T)))
+        ratios.append(deviations[:2] / deviations[2])
+    low, high = np.quantile(ratios, [0.1, 0.9], axis=0)
+    assert (high - low > 0.2).all()
+
+
+def test_shapes_are_not_symmetric() -> None:
+    """A half turn about a principal axis moves the surface by several times the distance between two samplings."""
+    moved = []
+    for i in range(30):
+        rng = np.random.default_rng(i)
+        shape = procedural_shape(rng)
+        points, again = (normalise(sample_surface(shape, 1500, rng), "unit_sphere") for _ in range(2))
+        tree = cKDTree(points)
+        axes = np.linalg.eigh(np.cov(points.T))[1].T
+        turned = [tree.query(Rotation.from_rotvec(np.pi * axis).apply(again))[0].mean() for axis in axes]
+        moved.append(min(turned) / tree.query(again)[0].mean())
+    assert np.median(moved) > 2
+    assert min(moved) > 1.15
+
+
+def test_no_shapes_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="at least one procedural val shape, got 0"):
+        pools(tmp_path, "val", 0)

@@ -1,0 +1,129 @@
+"""Meshes: reading every format, refusing what is broken, sampling by area."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from scipy import stats
+
+from bpnp.datamodules.surfaces import Mesh, MeshError, normalise, primitives, read_mesh, sample_surface
+
+VERTICES = "0 0 0\n2 0 0\n2 1 0\n0 1 0\n0 0 3\n"
+FACES = "4 0 1 2 3\n3 0 1 4\n"  # a rectangle of area 2 and a triangle of area 3
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"OFF\n5 2 0\n{VERTICES}{FACES}",
+        f"OFF5 2 0\n{VERTICES}{FACES}",
+        f"OFF 5 2 0\n{VERTICES}{FACES}",
+        f"\ufeffOFF\r\n# a comment\r\n5 2\r\n\r\n{VERTICES}{FACES}",
+        f"OFF\n5 4 0\n{VERTICES}4 0 1 2 3 255 0 0\n2 0 1\n3 0 1 4 0.5 0.5 0.5  # colours\n1 2\n",
+        "COFF\n5 2 0\n" + VERTICES.replace("\n", " 255 0 0 255\n") + FACES,
+    ],
+)
+def test_off_headers_polygons_and_colours(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "mesh.off"
+    path.write_text(text, encoding="utf-8")
+    mesh = read_mesh(path)
+    assert mesh.faces.tolist() == [[0, 1, 4], [0, 1, 2], [0, 2, 3]]
+    assert mesh.areas.tolist() == [3.0, 1.0, 1.0]
+
+
+BROKEN = {
+    "empty": ("", "OFF` in the first line"),
+    "foreign": ("\x89PNG\r\n\x1a\n\x00", "OFF` in the first line"),
+    "no counts": ("OFF\n", "numbers of vertices and faces"),
+    "binary": ("OFF BINARY\n\x00\x01", "numbers of vertices and faces"),
+    "truncated vertices": ("OFF\n5 2 0\n0 0 0\n2 0 0\n", "truncated"),
+    "truncated faces": (f"OFF\n5 2 0\n{VERTICES}4 0 1 2 3\n", "truncated"),
+    "truncated line": (f"OFF\n5 2 0\n{VERTICES}4 0 1 2 3\n3 0 1", "numbers"),
+    "words": (f"OFF\n5 2 0\n{VERTICES.replace('2', 'two')}{FACES}", "numbers"),
+    "no faces": (f"OFF\n5 0 0\n{VERTICES}", "faces, got none"),
+    "nan": (f"OFF\n5 2 0\n{VERTICES.replace('3', 'nan')}{FACES}", "finite"),
+    "missing vertex": (f"OFF\n5 2 0\n{VERTICES}4 0 1 2 3\n3 0 1 5\n", "0 to 4, got 0 to 5"),
+    "no area": ("OFF\n3 1 0\n0 0 0\n1 1 1\n2 2 2\n3 0 1 2\n", "positive area"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
+def test_broken_off_is_one_error_that_names_the_file(tmp_path: Path, kind: str) -> None:
+    text, reason = BROKEN[kind]
+    path = tmp_path / "chair_0001.off"
+    path.write_bytes(text.encode())
+    with pytest.raises(MeshError, match=rf"^{re.escape(str(path))}: expected .*{reason}"):
+        read_mesh(path)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj", ".stl", ".glb"])
+def test_other_formats(tmp_path: Path, suffix: str) -> None:
+    """Two boxes of a scene become one mesh, each where the scene puts it."""
+    moved = trimesh.creation.box(transform=trimesh.transformations.translation_matrix([5, 0, 0]))
+    path = tmp_path / f"boxes{suffix}"
+    if suffix == ".glb":
+        trimesh.Scene([trimesh.creation.box(), moved]).export(path)
+    else:
+        trimesh.util.concatenate([trimesh.creation.box(), moved]).export(path)
+    mesh = read_mesh(path)
+    assert mesh.areas.sum() == pytest.approx(12)
+    assert (mesh.vertices.min(0).tolist(), mesh.vertices.max(0).tolist()) == ([-0.5] * 3, [5.5, 0.5, 0.5])
+    path.write_bytes(path.read_bytes()[:60])
+    with pytest.raises(MeshError, match=re.escape(str(path))):
+        read_mesh(path)
+    path.write_bytes(b"")
+    with pytest.raises(MeshError, match="empty"):
+        read_mesh(path)
+
+
+def test_point_cloud_is_no_mesh(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.ply"
+    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(path)
+    with pytest.raises(MeshError, match="faces, got none"):
+        read_mesh(path)
+
+
+def test_real_meshes_as_trimesh_reads_them(shared_data: Path) -> None:
+    files = sorted((shared_data / "psb").glob("*/test/*.off"))[::60]
+    assert files
+    for path in files:
+        mesh, other = read_mesh(path), trimesh.load(path, force="mesh", process=False)
+        np.testing.assert_array_equal(mesh.vertices, other.vertices)
+        assert mesh.areas.sum() == pytest.approx(other.area)
+
+
+def test_samples_are_uniform_by_area() -> None:
+    """A rectangle of area 2, a triangle of area 3 and one of no area: counts, and uniform within the rectangle."""
+    vertices = np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0], [0, 0, 3.0]])
+    mesh = Mesh(vertices, np.array([[1, 1, 2], [0, 1, 4], [0, 1, 2], [0, 2, 3], [4, 4, 4]]))
+    points = sample_surface(mesh, 20_000, np.random.default_rng(0))
+    flat = points[:, 2] == 0
+    assert ((points[:, 1] == 0) | flat).all()
+    assert stats.binomtest(int(flat.sum()), len(points), 2 / 5).pvalue > 1e-3
+    assert stats.kstest(points[flat, 0], stats.uniform(0, 2).cdf).pvalue > 1e-3
+    assert stats.kstest(points[flat, 1], stats.uniform(0, 1).cdf).pvalue > 1e-3
+    np.testing.assert_allclose(points[~flat].mean(0), [2 / 3, 0, 1], atol=0.03)  # centroid of the triangle
+
+
+def test_normalisation() -> None:
+    points = np.random.default_rng(0).normal([100, -3, 7], [4, 1, 0.1], (500, 3))
+    sphere = normalise(points, "unit_sphere")
+    np.testing.assert_allclose(sphere.mean(0), 0, atol=1e-12)
+    assert np.linalg.norm(sphere, axis=1).max() == pytest.approx(1)
+    cube = normalise(points, "unit_cube")
+    np.testing.assert_allclose(cube.min(0), -cube.max(0))
+    assert np.ptp(cube, axis=0).max() == pytest.approx(1)
+    np.testing.assert_array_equal(normalise(points, "none"), points)
+
+
+def test_primitives_have_the_areas_of_their_formulas() -> None:
+    """Box, wedge exactly; the round ones from below, by the polygons inscribed in their circles."""
+    pi = np.pi
+    tori = [4 * pi**2 * 0.75 * 0.25, 4 * pi**2 * 0.9 * 0.1]
+    round_ones = [4 * pi + 2 * pi, pi * (1 + 5**0.5), 2 * pi * 0.6 * (2 * 0.6 + 1), *tori, 4 * pi]
+    areas = [mesh.areas.sum() for mesh in primitives()]
+    assert areas[:2] == pytest.approx([24, 2 * 2 + 1.5 * (4 + 8**0.5)])
+    for area, formula in zip(areas[2:8], round_ones, strict=True):
+        assert 0.9 * formula < area < formula
