@@ -7,7 +7,7 @@ import pytest
 import torch
 from torchmetrics import MetricCollection
 
-from bpnp.metrics import PoseErrors, PoseQuartiles, PoseRecall, RecallThresholds, quartiles, recalls
+from bpnp.metrics import MeanOverPairs, PoseErrors, PoseQuartiles, PoseRecall, RecallThresholds, quartiles, recalls
 from bpnp.types import Batch, Pose, SolveStats
 
 
@@ -73,8 +73,8 @@ def test_two_data_sets_in_one_metric_are_noticed() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
-@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall()])
-def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall) -> None:
+@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall(), MeanOverPairs()])
+def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall | MeanOverPairs) -> None:
     with pytest.raises(ValueError, match=r"expected at least one pair, got none; try update\(\)"):
         metric.compute()
 
@@ -84,9 +84,12 @@ def _process(rank: int, folder: Path, shards: list[list[list[list[int]]]]) -> No
     results = []
     for processes in shards:
         metrics = MetricCollection([PoseQuartiles(), PoseRecall()]).to(torch.device("cpu"))
+        mean = MeanOverPairs()
         for rows in processes[rank]:
             metrics.update(select(random_errors(0, 7), rows))
-        results.append({key: value.item() for key, value in metrics.compute().items()})
+            mean.update(torch.tensor(rows) ** 2.0, torch.tensor(rows))
+        values = metrics.compute() | {"mean": mean.compute()}
+        results.append({key: value.item() for key, value in values.items()})
     (folder / f"{rank}.json").write_text(json.dumps(results))
     torch.distributed.destroy_process_group()
 
@@ -101,5 +104,6 @@ def test_two_processes_give_the_metrics_of_one(tmp_path: Path) -> None:
     torch.multiprocessing.spawn(_process, (tmp_path, shards), nprocs=2)
     errors = random_errors(0, 7)
     expected = {key: value.item() for key, value in (quartiles(errors) | recalls(errors)).items()}
+    expected["mean"] = (0 + 1 + 4 + 9 + 16 + 25 + 36) / 7
     for rank in range(2):
         assert json.loads((tmp_path / f"{rank}.json").read_text()) == [expected] * 3
