@@ -5,7 +5,7 @@ Conventions: camera = R p + t (world to camera, COLMAP's ``cam_from_world``); `p
 coordinates x/z, y/z (intrinsics applied, distortion removed); 3D points and translations are in scene units.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -93,15 +93,16 @@ class Batch:
     def pin_memory(self) -> "Batch":
         return self._map(lambda x: x.pin_memory())
 
-    def _map(self, function: Any) -> "Batch":
-        values = {f.name: getattr(self, f.name) for f in fields(self)}
-        is_float = {k: isinstance(v, Tensor) and v.is_floating_point() for k, v in values.items()}
-        moved = {k: function(v) if isinstance(v, Tensor) else v for k, v in values.items()}
-        # Tensor.to(float64) would turn masks and indices into numbers.
-        restored = {
-            k: v.to(values[k].dtype) if isinstance(v, Tensor) and not is_float[k] else v for k, v in moved.items()
-        }
-        return Batch(**restored)
+    def _map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
+        moved: dict[str, Any] = {}
+        for f in fields(self):
+            value = getattr(self, f.name)
+            if isinstance(value, Tensor):
+                # Tensor.to(float64) would turn masks and indices into numbers.
+                result = function(value)
+                value = result if value.is_floating_point() else result.to(value.dtype)
+            moved[f.name] = value
+        return Batch(**moved)
 
     @classmethod
     def from_arrays(
@@ -119,7 +120,7 @@ class Batch:
         """Pad and mask one pair, or lists of pairs of different sizes.
 
         points2d (m, 2) and points3d (n, 3) for one pair, or sequences of such arrays; rotation (3, 3), translation
-        (3,), match3d (n,) and focal () likewise. Padding is zero. The dtype is float64 if any 2D array is, else float32.
+        (3,), match3d (n,) and focal () likewise. Padding is zero. The dtype is float64 if a 2D array is, else float32.
 
         Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
         or a match3d index that is no 2D point.
@@ -179,7 +180,9 @@ def _points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
 
 def _match(i: int, match: Tensor, m: int, n: int) -> Tensor:
     if match.shape != (n,):
-        raise ValueError(f"expected `match3d` of shape ({n},), one entry a 3D point, got {tuple(match.shape)} in pair {i}")
+        raise ValueError(
+            f"expected `match3d` of shape ({n},), one entry a 3D point, got {tuple(match.shape)} in pair {i}"
+        )
     if int(match.min()) < -1 or int(match.max()) >= m:
         raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
     return match.long()

@@ -1,7 +1,7 @@
-"""Forward solver of the entropic transport problem: scalings, Newton steps where they are slow, annealing for small mu.
+"""Forward solver of the entropic transport problem: scalings, Newton steps, and annealing for small mu.
 
-The plan is P = exp((u + v - M) / mu). Rescaling rows and columns in turn converges linearly, and slowly once P is nearly
-a permutation; Newton's method on the two sets of multipliers (the system of `bpnp.layers.laplacian`) is quadratic there.
+The plan is P = exp((u + v - M) / mu). Rescaling rows and columns in turn converges linearly, and slowly once P is
+nearly a permutation; Newton's method on the multipliers (the system of `bpnp.layers.laplacian`) is quadratic there.
 """
 
 import math
@@ -32,7 +32,7 @@ def solve_plan(
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
     """Plan with column sums `cols` and row sums `rows` to an L1 error of `tolerance`, sample by sample.
 
-    A point with zero marginal takes no part. Iterations count pairs of scalings, with a Newton step before each late one.
+    A point with zero marginal takes no part. Iterations count pairs of scalings; a late one follows a Newton step.
     """
     u, v = _anneal(cost, rows, cols, mu)
     plan = ((u.unsqueeze(-1) + v.unsqueeze(-2) - cost) / mu).exp_()

@@ -1,0 +1,3 @@
+from bpnp.cli import main
+
+main()

@@ -1,0 +1,146 @@
+"""What happens around training and testing: the switch to the pose loss, and the files that a run leaves."""
+
+import csv
+import io
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import roma
+import torch
+import torch.distributed as dist
+from lightning import LightningModule, Trainer
+from lightning.pytorch import Callback
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
+
+from bpnp.report.results import PairRow, write_results
+from bpnp.report.rows import rows_from
+from bpnp.types import Batch, Prediction
+
+
+class PoseLossWarmup(Callback):
+    """From the correspondence loss alone to L_c + weight * L_p (paper section 3.4).
+
+    Before `start_epoch` no pose is solved in training. Once switched, a resumed run stays switched.
+
+    Args:
+        start_epoch: first epoch with the pose loss; the paper has 120.
+        weight: gamma_p of Eq. 13.
+    """
+
+    def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:
+        if start_epoch < 0 or weight < 0:
+            raise ValueError(f"expected start_epoch >= 0 and weight >= 0, got {start_epoch} and {weight}")
+        self.start_epoch = start_epoch
+        self.weight = weight
+        self.switched_at: int | None = None
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.switched_at is None and trainer.current_epoch >= self.start_epoch:
+            self.switched_at = trainer.current_epoch
+            rank_zero_info(f"epoch {trainer.current_epoch}: the pose loss joins with weight {self.weight}")
+        pl_module.pose_weight = 0.0 if self.switched_at is None else self.weight
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"switched_at": self.switched_at}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        self.switched_at = state_dict["switched_at"]
+
+
+class ResultsWriter(Callback):
+    """Writes `pairs.csv` and `summary.json` after a test, and `poses.csv` after a prediction.
+
+    Args:
+        folder: where; null for `test` and `predict` in the trainer's default_root_dir.
+        inlier_threshold: of the counted inliers, normalised image coordinates.
+    """
+
+    def __init__(self, folder: str | None = None, inlier_threshold: float = 0.01) -> None:
+        self.folder = folder
+        self.inlier_threshold = inlier_threshold
+        self.rows: list[PairRow] = []
+        self.losses: dict[int, float] = {}
+        self.poses: dict[tuple[int, str], list[Any]] = {}
+
+    def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.rows, self.losses = [], {}
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        prediction, seconds, losses = outputs
+        self.rows += rows_from(prediction, batch, seconds, inlier_threshold=self.inlier_threshold)
+        if losses is not None:
+            self.losses |= dict(zip(batch.index.tolist(), losses.tolist(), strict=True))
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        gathered = _gather((self.rows, self.losses))
+        if trainer.is_global_zero:
+            rows = [row for part, _ in gathered for row in part]
+            losses = {index: loss for _, part in gathered for index, loss in part.items()}
+            mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
+            folder = self._folder(trainer, "test")
+            write_results(folder, rows, correspondence_loss=mean, settings={"checkpoint": _checkpoint(trainer)})
+            rank_zero_info(f"results of {len({row.index for row in rows})} pairs in {folder}")
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.poses = {}
+
+    def on_predict_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        self.poses |= _pose_rows(outputs, batch)
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        gathered = _gather(self.poses)
+        if trainer.is_global_zero:
+            merged = {key: row for part in gathered for key, row in part.items()}
+            path = self._folder(trainer, "predict") / "poses.csv"
+            _write_poses(path, [merged[key] for key in sorted(merged)])
+            rank_zero_info(f"{len(merged)} poses in {path}")
+
+    def _folder(self, trainer: Trainer, stage: str) -> Path:
+        return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / stage
+
+
+POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
+
+
+def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], list[Any]]:
+    """World-to-camera quaternion and translation in COLMAP's order; empty where there is no pose."""
+    rows: dict[tuple[int, str], list[Any]] = {}
+    for name, pose in prediction.poses.items():
+        found = pose.found
+        rotation = pose.rotation.double().where(found[:, None, None], torch.eye(3, device=found.device).double())
+        xyzw = roma.rotmat_to_unitquat(rotation)
+        numbers = torch.cat([xyzw[:, 3:], xyzw[:, :3], pose.translation.double()], -1).tolist()
+        for i, (is_found, converged) in enumerate(zip(found.tolist(), pose.stats.converged.tolist(), strict=True)):
+            values = numbers[i] if is_found else [""] * 7
+            rows[int(batch.index[i]), name] = [batch.ids[i], name, *values, is_found, converged]
+    return rows
+
+
+def _write_poses(path: Path, rows: Sequence[Sequence[Any]]) -> None:
+    table = io.StringIO(newline="")
+    writer = csv.writer(table)
+    writer.writerow(POSE_COLUMNS)
+    writer.writerows(rows)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary.write_text(table.getvalue(), encoding="utf-8")
+    os.replace(temporary, path)
+
+
+def _checkpoint(trainer: Trainer) -> str | None:
+    return str(trainer.ckpt_path) if trainer.ckpt_path else None
+
+
+def _gather(value: Any) -> list[Any]:
+    """The value of every process, in the order of their ranks."""
+    if not dist.is_initialized():
+        return [value]
+    values = [None] * dist.get_world_size()
+    dist.all_gather_object(values, value)
+    return values

@@ -1,0 +1,108 @@
+"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, `bpnp report` prints results."""
+
+import argparse
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from lightning import LightningDataModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger
+
+from bpnp.callbacks import ResultsWriter
+from bpnp.report import report
+from bpnp.task import BlindPnPTask, TrainingDivergedError
+
+DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
+
+Train and evaluate:      bpnp {fit,validate,test,predict} --config configs/quickstart.yaml
+Read results:            bpnp report RUN...
+"""
+
+
+class BpnpCLI(LightningCLI):
+    """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir."""
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
+        parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
+        parser.add_lightning_class_args(ResultsWriter, "results")
+        parser.set_defaults(
+            {
+                "trainer.default_root_dir": "runs/default",
+                "best_checkpoint.monitor": "val/rotation_q2_deg",
+                "best_checkpoint.filename": "best",
+                "best_checkpoint.enable_version_counter": False,
+                "last_checkpoint.filename": "last",
+                "last_checkpoint.enable_version_counter": False,
+            }
+        )
+        for name in ("best_checkpoint", "last_checkpoint"):
+            parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """A CSV log and a progress bar always, whatever else the configuration logs to."""
+        trainer = super().instantiate_trainer(**kwargs)
+        if not any(isinstance(logger, CSVLogger) for logger in trainer.loggers) and self._logging_wanted():
+            trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
+        return trainer
+
+    def _logging_wanted(self) -> bool:
+        return bool(self._get(self.config, "trainer.logger", default=True))
+
+
+def _checkpoint_folder(root: str) -> str:
+    return str(Path(root) / "checkpoints")
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run a command. A mistake of the user's ends in one line on stderr and exit status 2, not in a traceback."""
+    arguments = list(sys.argv[1:] if args is None else args)
+    logging.captureWarnings(True)
+    _quieten()
+    try:
+        if arguments[:1] == ["report"]:
+            _report(arguments[1:])
+        else:
+            _lightning(arguments)
+    except (ValueError, OSError, TrainingDivergedError) as error:
+        if os.environ.get("BPNP_TRACEBACK"):
+            raise
+        print(f"bpnp: error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+
+
+def _lightning(arguments: list[str]) -> None:
+    BpnpCLI(
+        BlindPnPTask,
+        LightningDataModule,
+        subclass_mode_data=True,
+        seed_everything_default=0,
+        save_config_kwargs={"overwrite": True},
+        trainer_defaults={"callbacks": [RichProgressBar()], "max_epochs": 200, "num_sanity_val_steps": 0},
+        parser_kwargs={"description": DESCRIPTION, "prog": "bpnp"},
+        args=arguments,
+    )
+
+
+def _report(arguments: list[str]) -> None:
+    parser = argparse.ArgumentParser(prog="bpnp report", description="Print the tables of one or several test results.")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder that `bpnp test` wrote")
+    parser.add_argument(
+        "--paper", choices=("modelnet40", "megadepth"), help="the paper's rows beneath, for orientation"
+    )
+    chosen = parser.parse_args(arguments)
+    report(chosen.runs, paper=chosen.paper)
+
+
+def _quieten() -> None:
+    """Third-party advice that does not apply here."""
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*Using `DistributedSampler` with the dataloaders.*")
+    warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
+    warnings.filterwarnings("ignore", message=".*LeafSpec.*")

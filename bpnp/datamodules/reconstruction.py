@@ -1,0 +1,172 @@
+"""From COLMAP models to the 2D and 3D points of every image, as numpy arrays. The only file that imports pycolmap."""
+
+import logging
+
+# zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
+import zlib  # noqa: F401
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.datamodules.colmap_format import CameraRecord, ColmapError, ImageRecord, read_records
+
+CAMERA_MODELS: Mapping[int, tuple[str, int]] = {
+    int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
+    for name, model in pycolmap.CameraModelId.__members__.items()
+    if model != pycolmap.CameraModelId.INVALID
+}
+ROUND_TRIP = 0.01  # pixels
+NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """One registered image; camera = rotation p + translation (cam_from_world), 2D points normalised and undistorted.
+
+    points2d (k, 2) sees the scene's points3d[seen], seen (k,) without repetition. clutter2d (c, 2): the keypoints
+    without a 3D point. observed: every 3D point the image has a keypoint of, `seen` and those that were dropped.
+    focal: pixels per unit of normalised coordinates.
+    """
+
+    name: str
+    points2d: NDArray[np.float32]
+    seen: NDArray[np.int64]
+    clutter2d: NDArray[np.float32]
+    observed: NDArray[np.int64]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    focal: float
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A COLMAP model: points3d (n, 3) in scene units in the order of their ids, images in the order of their names.
+
+    lost: how many keypoints, points and images could not be used, by reason.
+    """
+
+    name: str
+    points3d: NDArray[np.float64]
+    images: tuple[ImagePoints, ...]
+    lost: Mapping[str, int]
+
+
+def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Reconstruction:
+    """Read the COLMAP model in `folder`, undistort its keypoints and pair them with their 3D points.
+
+    Not used, and counted in `lost`: keypoints whose undistortion does not project back to within 0.01 pixels (outside
+    the field of view of the camera model); pairs with a point that is not finite, missing from points3D, behind the
+    camera, or nearer than 1e-4 of the image's median depth; a second keypoint of the same point (the one of smaller
+    reprojection error is kept); images with a broken pose. All but the repeated keypoints, which are common, are
+    logged as a warning.
+
+    Raises ColmapError if a file cannot be read, no image is left, or a camera is missing or broken.
+    """
+    path = Path(folder)
+    records = read_records(path, camera_models=CAMERA_MODELS)
+    order = np.argsort(records.point_ids)
+    ids, points3d = records.point_ids[order], records.points3d[order]
+    finite = np.isfinite(points3d).all(-1)
+    ids, points3d = ids[finite], points3d[finite]
+    if not len(ids):
+        raise ColmapError(f"expected 3D points in {path}, got none that is finite; try another model")
+    lost = Counter({"points that are not finite": int((~finite).sum())})
+    cameras: dict[int, pycolmap.Camera] = {}
+    images = []
+    for record in sorted(records.images, key=lambda image: image.name):
+        pose = np.concatenate([record.quaternion, record.translation])
+        if not np.isfinite(pose).all() or not record.quaternion.any():
+            lost["images with a broken pose"] += 1
+            continue
+        if record.camera_id not in cameras:
+            cameras[record.camera_id] = _camera(path, record, records.cameras.get(record.camera_id))
+        images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost))
+    if not images:
+        raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
+    lost = +lost
+    notable = [f"{count} {reason}" for reason, count in lost.items() if reason != "repeated keypoints"]
+    if notable:
+        logger.warning("not used in %s: %s", path, ", ".join(notable))
+    return Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(lost))
+
+
+def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> pycolmap.Camera:
+    if record is None:
+        wrong = "no such camera"
+    elif not np.isfinite(record.params).all():
+        wrong = f"parameters {record.params.tolist()}"
+    else:
+        camera = pycolmap.Camera(model=record.model, params=record.params.tolist())
+        if _focal(camera) > 0:
+            return camera
+        wrong = f"focal length {_focal(camera)}"
+    raise ColmapError(
+        f"expected camera {image.camera_id} of image {image.name!r} in {folder}, got {wrong}; try another model"
+    )
+
+
+def _focal(camera: pycolmap.Camera) -> float:
+    """Mean focal length in pixels; for a model that has none (equirectangular), the scale at the principal ray."""
+    step = 1e-4
+    ahead, aside = camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
+    return float(camera.mean_focal_length() or np.linalg.norm(aside - ahead) / step)
+
+
+def _undistort(camera: pycolmap.Camera, keypoints: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Normalised coordinates of pixels, NaN where there are none.
+
+    pycolmap marks some failures with NaN and returns a wrong finite point for others (a fisheye beyond 90 degrees), so
+    the result has to project back to the pixel.
+    """
+    points = np.asarray(camera.cam_from_img(np.ascontiguousarray(keypoints)), dtype=np.float64)
+    back = np.asarray(camera.img_from_cam(np.column_stack([points, np.ones(len(points))])), dtype=np.float64)
+    with np.errstate(invalid="ignore"):
+        good = np.linalg.norm(back - keypoints, axis=-1) < ROUND_TRIP
+    return np.where(good[:, None], points, np.nan)
+
+
+def _image_points(
+    record: ImageRecord,
+    camera: pycolmap.Camera,
+    ids: NDArray[np.int64],
+    points3d: NDArray[np.float64],
+    lost: Counter[str],
+) -> ImagePoints:
+    rotation = Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix()
+    undistorted = _undistort(camera, record.keypoints)
+    usable = np.isfinite(undistorted).all(-1)
+    lost["keypoints that could not be undistorted"] += int((~usable).sum())
+
+    has_point = record.point_ids >= 0
+    place = np.minimum(np.searchsorted(ids, record.point_ids), len(ids) - 1)
+    known = has_point & (ids[place] == record.point_ids)
+    lost["keypoints of a point that is missing"] += int((has_point & ~known).sum())
+
+    pair = np.flatnonzero(known & usable)
+    camera_points = points3d[place[pair]] @ rotation.T + record.translation
+    depth = camera_points[:, 2]
+    in_front = depth > (NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else 0)
+    lost["pairs with the point behind or in the camera"] += int((~in_front).sum())
+    pair, camera_points = pair[in_front], camera_points[in_front]
+
+    error = np.linalg.norm(camera_points[:, :2] / camera_points[:, 2:] - undistorted[pair], axis=-1)
+    by_error = np.argsort(error, kind="stable")
+    seen, first = np.unique(place[pair[by_error]], return_index=True)
+    lost["repeated keypoints"] += len(pair) - len(seen)
+    return ImagePoints(
+        name=record.name,
+        points2d=undistorted[pair[by_error[first]]].astype(np.float32),
+        seen=seen,
+        clutter2d=undistorted[~has_point & usable].astype(np.float32),
+        observed=np.unique(place[known]),
+        rotation=rotation,
+        translation=record.translation,
+        focal=_focal(camera),
+    )

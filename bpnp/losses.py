@@ -1,0 +1,86 @@
+"""Losses (paper Eqs. 9 to 13), one value per sample; the mean over a batch is the caller's."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bpnp.geometry import angle_between, bearings, rotation_angle, transform
+
+RELEASED_BOUNDS = (math.pi / 2, 1.0)  # radians and scene units, as in the authors' code
+
+
+def correspondence_loss(
+    assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]
+) -> Float[Tensor, " b"]:  # fmt: skip
+    """L_c = sum_ij P_ij (1 - 2 C_ij) (Eq. 9) with C from indices; in [-1, 1) where P sums to one.
+
+    match3d: index of the 2D point that 3D point j was seen as, -1 for none (padding included).
+    """
+    matched = assignment.gather(1, match3d.clamp_min(0).unsqueeze(1)).squeeze(1)
+    return assignment.sum((-2, -1)) - 2 * (matched * (match3d >= 0)).sum(-1)
+
+
+def correspondence_loss_from_pose(
+    assignment: Float[Tensor, "b m n"],
+    points2d: Float[Tensor, "b m 2"],
+    points3d: Float[Tensor, "b n 3"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+    *,
+    angle: float,
+) -> Float[Tensor, " b"]:
+    """Eq. 9 as it is written: C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], angle in radians.
+
+    Supervision by the pose alone. Several pairs of a point may count as correspondences.
+    """
+    return (assignment * (1.0 - 2.0 * pairs_within(points2d, points3d, rotation, translation, angle))).sum((-2, -1))
+
+
+def pairs_within(
+    points2d: Float[Tensor, "b m 2"],
+    points3d: Float[Tensor, "b n 3"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+    angle: float,
+) -> Bool[Tensor, "b m n"]:
+    """[angle(f_i, R p_j + t) <= angle] (Eq. 3).
+
+    By the chord between unit vectors, which keeps its digits at small angles and needs no cross products.
+    """
+    directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
+    chord = torch.cdist(bearings(points2d), directions, compute_mode="donot_use_mm_for_euclid_dist")
+    return chord <= 2 * math.sin(angle / 2)
+
+
+def pose_loss(
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+    rotation_gt: Float[Tensor, "b 3 3"],
+    translation_gt: Float[Tensor, "b 3"],
+    *,
+    bounds: tuple[float, float] | None = None,
+) -> Float[Tensor, " b"]:
+    """L_p = angle(R, R_gt) + ||t - t_gt|| (Eqs. 10 to 12), in radians and scene units.
+
+    bounds: None for the paper's unbounded loss; (largest angle, largest distance) beyond which a term is constant, and
+        has no gradient, as in the released code (`RELEASED_BOUNDS`).
+    """
+    angle = rotation_angle(rotation_gt, rotation)
+    distance = torch.linalg.vector_norm(translation - translation_gt, dim=-1)
+    if bounds is not None:
+        angle, distance = angle.clamp_max(bounds[0]), distance.clamp_max(bounds[1])
+    return angle + distance
+
+
+def reprojection_loss(
+    assignment: Float[Tensor, "b m n"],
+    points2d: Float[Tensor, "b m 2"],
+    points3d: Float[Tensor, "b n 3"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+) -> Float[Tensor, " b"]:
+    """sum_ij P_ij angle(f_i, R p_j + t) in radians (Eq. 2 with P for C): no correspondence and no pose is given."""
+    directions = transform(rotation, translation, points3d)
+    return (assignment * angle_between(bearings(points2d).unsqueeze(2), directions.unsqueeze(1))).sum((-2, -1))

@@ -1,0 +1,133 @@
+"""BPnPNet (Campbell, Liu, Gould, ECCV 2020): blind PnP end to end."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from bpnp.geometry import bearings
+from bpnp.layers.pnp import Method, WeightedPnP
+from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.layers.sinkhorn import Sinkhorn
+from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
+from bpnp.types import Batch, Pose, Prediction
+
+SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
+
+
+class BPnPNet(nn.Module):
+    """Features of both point sets, transport between them, RANSAC on the best pairs, weighted PnP on all of them.
+
+    Args:
+        channels: width of the feature nets.
+        blocks: residual blocks of each feature net.
+        batch_norm: batch norm after each context norm, as in the paper's text; the released code has none.
+        centre_features: subtract each set's mean feature before the normalisation to unit length.
+        image_scale: factor on the image coordinates at the input of the 2D net.
+        normalise_scene: centre and scale the 3D points at the input of the 3D net; poses stay in scene units.
+        mu: entropy weight of the transport.
+        learn_mu: whether mu is learned.
+        dustbin: cost of leaving a point unmatched; null for a full assignment.
+        sinkhorn_tolerance: L1 error of the marginals at which the transport stops.
+        ransac_backend: poselib (LO-RANSAC, PROSAC order) or opencv (the paper's P3P-RANSAC and EPnP).
+        ransac_iterations: most hypotheses; the paper has 1000.
+        threshold: inlier threshold of RANSAC, normalised image coordinates.
+        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
+        pnp_method: newton, or lbfgs as in the paper.
+        pnp_iterations: most iterations of the PnP layer.
+    """
+
+    estimates = ("ransac", "pnp")
+
+    def __init__(
+        self,
+        *,
+        channels: int = 128,
+        blocks: int = 12,
+        batch_norm: bool = False,
+        centre_features: bool = False,
+        image_scale: float = 1.0,
+        normalise_scene: bool = False,
+        mu: float = 0.1,
+        learn_mu: bool = False,
+        dustbin: float | None = None,
+        sinkhorn_tolerance: float = 1e-6,
+        ransac_backend: Backend = "poselib",
+        ransac_iterations: int = 10_000,
+        threshold: float = 0.01,
+        pairs_factor: float = 1.5,
+        pnp_method: Method = "newton",
+        pnp_iterations: int = 50,
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            k: v for k, v in locals().items() if k not in ("self", "__class__")
+        }  # fmt: skip
+        self.image_scale = image_scale
+        self.normalise_scene = normalise_scene
+        shape = {"channels": channels, "blocks": blocks, "batch_norm": batch_norm, "centre": centre_features}
+        self.features2d = PointFeatures(2, **shape)  # type: ignore[arg-type]
+        self.features3d = PointFeatures(3, **shape)  # type: ignore[arg-type]
+        self.align = InputTransform()
+        self.sinkhorn = Sinkhorn(mu=mu, learn_mu=learn_mu, dustbin=dustbin, tolerance=sinkhorn_tolerance)
+        self.ransac = RansacPnP(
+            backend=ransac_backend,
+            pairs_factor=pairs_factor,
+            threshold=threshold,
+            max_iterations=ransac_iterations,
+        )
+        self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
+
+    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+        """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"."""
+        cost = self.cost(batch)
+        assignment, assignment_stats = self.sinkhorn(cost, batch.mask2d, batch.mask3d)
+        if not poses:
+            return Prediction(assignment, assignment_stats)
+        start = Pose(
+            *self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d)
+        )  # fmt: skip
+        refined = Pose(
+            *self.pnp(assignment, bearings(batch.points2d), batch.points3d, start.rotation, start.translation)
+        )  # fmt: skip
+        return Prediction(assignment, assignment_stats, {"ransac": start, "pnp": refined})
+
+    def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
+        """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2]."""
+        points3d = normalise_points3d(batch.points3d, batch.mask3d) if self.normalise_scene else batch.points3d
+        z2d = self.features2d(self.image_scale * batch.points2d, batch.mask2d)
+        z3d = self.features3d(self.align(points3d, batch.mask3d), batch.mask3d)
+        return pairwise_distance(z2d, z3d)
+
+    @classmethod
+    def from_checkpoint(cls, path: str | Path) -> "BPnPNet":
+        """The network of a checkpoint that `bpnp fit` wrote, in evaluation mode.
+
+        Raises FileNotFoundError, or ValueError naming the file if it holds no BPnPNet.
+        """
+        file = Path(path)
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"expected a checkpoint, got no file at {file}; try runs/<name>/checkpoints/last.ckpt"
+            )
+        content = torch.load(file, map_location="cpu", weights_only=True)
+        solver = content.get("solver", {}) if isinstance(content, dict) else {}
+        if solver.get("class") != cls.__name__:
+            raise ValueError(f"expected a checkpoint of BPnPNet, got {solver.get('class', 'another file')} in {file}")
+        net = cls(**solver["settings"])
+        prefix = "solver."
+        state = {k.removeprefix(prefix): v for k, v in content["state_dict"].items() if k.startswith(prefix)}
+        net.load_state_dict(state)
+        return net.eval()
+
+
+def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> Float[Tensor, "b m n"]:
+    """||a_i - b_j||_2 of unit vectors from one matrix product.
+
+    The gradient at distance zero is taken as zero.
+    """
+    squared = 2 - 2 * (a @ b.mT)
+    positive = squared > SQUARED_FLOOR
+    return torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)

@@ -1,0 +1,224 @@
+"""Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
+
+import time
+from typing import Any, Literal
+
+import torch
+from lightning import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+from torchmetrics import MetricCollection
+
+from bpnp.losses import RELEASED_BOUNDS, correspondence_loss, correspondence_loss_from_pose, pose_loss
+from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
+from bpnp.models.bpnpnet import BPnPNet
+from bpnp.types import Batch, Prediction
+
+Stage = Literal["train", "val", "test"]
+
+
+class TrainingDivergedError(RuntimeError):
+    """Too many optimiser steps in a row had no finite loss or gradient."""
+
+
+class BlindPnPTask(LightningModule):
+    """Any solver, trained with L = L_c + pose_weight * L_p (paper Eqs. 9 to 13) and Adam.
+
+    Args:
+        solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses, the first of
+            which is reported without its name (`val/rotation_q2_deg`) and selects checkpoints.
+        learning_rate: of Adam; the paper has 1e-5.
+        weight_decay: of Adam; the paper has 0, the released code 1e-3.
+        pose_weight: gamma_p of Eq. 13. While it is 0 no pose is solved in training; `PoseLossWarmup` raises it.
+        pose_estimate: the estimate that L_p looks at.
+        bounded_pose_loss: clamp L_p at pi/2 and 1.0 as the released code does; the paper's loss is unbounded.
+        correspondence_angle: supervise by the pose alone: pairs within this angle (radians) count as correspondences;
+            null for the true ones.
+        max_skipped_steps: end the run after so many steps in a row without a finite loss and gradient.
+    """
+
+    def __init__(
+        self,
+        solver: nn.Module | None = None,
+        *,
+        learning_rate: float = 1e-5,
+        weight_decay: float = 0.0,
+        pose_weight: float = 0.0,
+        pose_estimate: str = "pnp",
+        bounded_pose_loss: bool = False,
+        correspondence_angle: float | None = None,
+        max_skipped_steps: int = 20,
+    ) -> None:
+        super().__init__()
+        self.solver = BPnPNet() if solver is None else solver
+        self.learning_rate = learning_rate
+        self.weight_decay = weight_decay
+        self.pose_weight = pose_weight
+        self.pose_estimate = pose_estimate
+        self.pose_bounds = RELEASED_BOUNDS if bounded_pose_loss else None
+        self.correspondence_angle = correspondence_angle
+        self.max_skipped_steps = max_skipped_steps
+        self.skipped_steps = 0
+        self.skipped_in_a_row = 0
+        self.loss_is_finite = True
+        self.estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
+        self.pose_metrics = nn.ModuleDict(
+            {stage: nn.ModuleDict({name: _pose_metrics() for name in self.estimates}) for stage in ("val", "test")}
+        )
+        self.loss_metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in ("val", "test")})
+
+    def forward(self, batch: Batch) -> Prediction:
+        return self.solver(batch)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        prediction = self.solver(batch, poses=self.pose_weight > 0)
+        loss = self.losses(prediction, batch, "train").mean()
+        self.loss_is_finite = self.trainer.strategy.reduce_boolean_decision(bool(loss.isfinite()), all=True)
+        self._log_train(loss=loss, skipped_steps=float(self.skipped_steps))
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        self._evaluate(batch, "val")
+
+    def test_step(self, batch: Batch, batch_idx: int) -> tuple[Prediction, float, Tensor | None]:
+        """The prediction, the seconds that it took, and the correspondence loss per pair; for the results writer."""
+        return self._evaluate(batch, "test")
+
+    def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
+        return self.solver(batch)
+
+    def losses(self, prediction: Prediction, batch: Batch, stage: Stage) -> Tensor:
+        """L_c + gamma_p L_p per sample; a sample whose pose did not converge has no L_p, and is counted."""
+        matching = self.correspondence_losses(prediction, batch)
+        if matching is None:
+            raise ValueError("expected a solver with an assignment to train, got none; try bpnp.models.BPnPNet")
+        if stage == "train":
+            self._log_train(correspondence_loss=matching.mean(), **_assignment_stats(prediction))
+        if self.pose_weight == 0:
+            return matching
+        pose = prediction.poses[self.pose_estimate]
+        solved = pose.stats.converged
+        errors = pose_loss(
+            pose.rotation[solved],
+            pose.translation[solved],
+            _known(batch.rotation, "rotation")[solved],
+            _known(batch.translation, "translation")[solved],
+            bounds=self.pose_bounds,
+        )
+        if stage == "train":
+            self._log_train(without_pose=1 - solved.float().mean())
+            if len(errors):
+                self._log_train(pose_loss=errors.mean())
+        return matching.index_add(0, solved.nonzero().squeeze(-1), self.pose_weight * errors)
+
+    def correspondence_losses(self, prediction: Prediction, batch: Batch) -> Tensor | None:
+        """L_c per sample; None if the solver has no assignment or the batch nothing to compare it with."""
+        if prediction.assignment is None:
+            return None
+        if self.correspondence_angle is None:
+            return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
+        return correspondence_loss_from_pose(
+            prediction.assignment,
+            batch.points2d,
+            batch.points3d,
+            _known(batch.rotation, "rotation"),
+            _known(batch.translation, "translation"),
+            angle=self.correspondence_angle,
+        )
+
+    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+        """Without a finite loss and gradient the step is left out: Adam passes over parameters without a gradient."""
+        gradients = [p.grad for p in self.parameters() if p.grad is not None]
+        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in gradients]))
+        if self.loss_is_finite and bool(norm.isfinite()):
+            self.skipped_in_a_row = 0
+            self._log_train(gradient_norm=norm)
+            return
+        optimizer.zero_grad(set_to_none=True)
+        self.skipped_steps += 1
+        self.skipped_in_a_row += 1
+        if self.skipped_in_a_row >= self.max_skipped_steps:
+            raise TrainingDivergedError(
+                f"expected finite losses and gradients, got {self.skipped_in_a_row} steps in a row without, at step "
+                f"{self.global_step}; try a lower model.learning_rate or trainer.gradient_clip_val"
+            )
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        parameters = [p for p in self.parameters() if p.requires_grad]
+        return torch.optim.Adam(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
+        settings = getattr(self.solver, "settings", {})
+        checkpoint["solver"] = {"class": type(self.solver).__name__, "settings": dict(settings)}
+        checkpoint["skipped_steps"] = (self.skipped_steps, self.skipped_in_a_row)
+
+    def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        self.skipped_steps, self.skipped_in_a_row = checkpoint["skipped_steps"]
+
+    def on_validation_epoch_end(self) -> None:
+        self._log_metrics("val")
+
+    def on_test_epoch_end(self) -> None:
+        self._log_metrics("test")
+
+    def _evaluate(self, batch: Batch, stage: Stage) -> tuple[Prediction, float, Tensor | None]:
+        prediction, seconds = self._timed(batch)
+        for name, pose in prediction.poses.items():
+            self.pose_metrics[stage][name].update(pose, batch)  # type: ignore[index, operator, union-attr]
+        matching = self.correspondence_losses(prediction, batch)
+        if matching is not None:
+            self.loss_metrics[stage].update(matching, batch.index)  # type: ignore[operator]
+        return prediction, seconds, matching
+
+    def _timed(self, batch: Batch) -> tuple[Prediction, float]:
+        _wait(self.device)
+        start = time.perf_counter()
+        prediction = self.solver(batch)
+        _wait(self.device)
+        return prediction, time.perf_counter() - start
+
+    def _log_train(self, **values: Tensor | float) -> None:
+        self.log_dict({f"train/{k}": v for k, v in values.items()}, on_step=True, on_epoch=False, batch_size=1)
+
+    def _log_metrics(self, stage: Stage) -> None:
+        for i, name in enumerate(self.estimates):
+            metrics = self.pose_metrics[stage][name]  # type: ignore[index]
+            values = metrics.compute()  # type: ignore[operator, union-attr]
+            metrics.reset()  # type: ignore[operator, union-attr]
+            self._log_all({f"{stage}/{name}/{k}": v for k, v in values.items()})
+            if i == 0:
+                self._log_all({f"{stage}/{k}": v for k, v in values.items()})
+        loss = self.loss_metrics[stage]
+        if loss.update_called:
+            self._log_all({f"{stage}/correspondence_loss": loss.compute()})  # type: ignore[operator]
+            loss.reset()  # type: ignore[operator]
+
+    def _log_all(self, values: dict[str, Tensor]) -> None:
+        # The metrics have already been gathered over processes.
+        self.log_dict({k: v.float() for k, v in values.items()}, rank_zero_only=False, sync_dist=False)
+
+
+def _pose_metrics() -> MetricCollection:
+    return MetricCollection([PoseQuartiles(), PoseRecall()])
+
+
+def _assignment_stats(prediction: Prediction) -> dict[str, Tensor]:
+    stats = prediction.assignment_stats
+    if stats is None:
+        return {}
+    return {
+        "sinkhorn_iterations": stats.iterations.float().mean(),
+        "sinkhorn_unconverged": 1 - stats.converged.float().mean(),
+    }
+
+
+def _known(value: Tensor | None, name: str) -> Tensor:
+    if value is None:
+        raise ValueError(f"expected a batch with its true `{name}`, got None")
+    return value
+
+
+def _wait(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
