@@ -14,7 +14,7 @@ from bpnp.datamodules.colmap_format import ColmapError
 from bpnp.datamodules.reconstruction import ImagePoints, Reconstruction
 
 Side = Literal["both", "2d", "3d"]
-FAR = 100.0  # median distances from the median; float32 coordinates beyond are coarser than 1e-5 of that
+FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 logger = logging.getLogger(__name__)
 
 

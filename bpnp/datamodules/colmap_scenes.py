@@ -86,7 +86,7 @@ def split_scenes(
 
 def _find_models(top: Path) -> list[Path]:
     if not top.is_dir():
-        raise ColmapError(f"expected a folder of COLMAP models, got {top}, which is no folder; try `root`")
+        raise ColmapError(f"expected a folder of COLMAP models, got {top}, which is no folder; try another `root`")
     whole, incomplete, visited = [], [], set[Path]()
     for name, children, files in os.walk(top, followlinks=True):
         folder = Path(name)

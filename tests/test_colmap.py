@@ -1,0 +1,198 @@
+import warnings
+from pathlib import Path
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from planted_model import plant_model
+
+from bpnp.datamodules.colmap import ColmapDataModule
+from bpnp.datamodules.colmap_format import ColmapError
+from bpnp.datamodules.colmap_scenes import find_scenes, split_scenes
+from bpnp.types import Batch
+
+
+def test_models_are_found_in_every_layout(tmp_path: Path) -> None:
+    folders = [
+        "castle/sparse/0",
+        "0007/sparse/manhattan/0",
+        "0007/sparse/manhattan/10",
+        "old/plain",
+        "x/dense/0/sparse",
+    ]
+    for folder in folders:
+        plant_model(tmp_path / folder, images=1)
+    assert find_scenes(tmp_path) == {
+        "0007": {f"0007/sparse/manhattan/{k}": tmp_path / f"0007/sparse/manhattan/{k}" for k in ("0", "10")},
+        "castle": {"castle": tmp_path / folders[0]},
+        "old/plain": {"old/plain": tmp_path / folders[3]},
+        "x": {"x": tmp_path / folders[4]},
+    }
+    for inside in ("castle", "castle/sparse", "castle/sparse/0"):
+        assert find_scenes(tmp_path / inside) == {"castle": {"castle": tmp_path / folders[0]}}
+    assert list(find_scenes(tmp_path / "0007/sparse/manhattan")) == ["0007"]
+    assert list(find_scenes([tmp_path / "x", str(tmp_path / "old")])) == ["plain", "x"]
+    (tmp_path / "loop").symlink_to(tmp_path)
+    assert len(find_scenes(tmp_path)) == 4
+
+
+def test_folders_that_hold_no_scene_are_one_error(tmp_path: Path) -> None:
+    with pytest.raises(ColmapError, match="nowhere, which is no folder"):
+        find_scenes(tmp_path / "nowhere")
+    with pytest.raises(ColmapError, match="got none; try a folder that holds"):
+        find_scenes(tmp_path)
+    plant_model(tmp_path / "a/broken", images=1)
+    (tmp_path / "a/broken/points3D.bin").unlink()
+    with pytest.raises(ColmapError, match="1 folders without one of them .*broken"):
+        find_scenes(tmp_path)
+    plant_model(tmp_path / "a/whole", images=1)
+    with pytest.warns(UserWarning, match="skipped: .* 1 folders without one of them .*broken"):
+        assert list(find_scenes(tmp_path)) == ["a/whole"]
+    plant_model(tmp_path / "b/whole", images=1)
+    with pytest.raises(ColmapError, match="scenes of different names, got .* for 'whole'"):
+        find_scenes([tmp_path / "a/whole", tmp_path / "b/whole"])
+
+
+SCENES = [f"s{i}" for i in range(10)]
+
+
+def test_scenes_are_split_without_overlap() -> None:
+    splits = [split_scenes(SCENES, seed=seed) for seed in range(20)]
+    for split in splits:
+        assert sorted(split["train"] + split["val"] + split["test"]) == SCENES
+        assert {part: len(names) for part, names in split.items()} == {"train": 7, "val": 1, "test": 2}
+    assert splits[3] == split_scenes(SCENES[::-1], seed=3)
+    assert len({tuple(split["test"]) for split in splits}) > 10
+    named = split_scenes(SCENES, train=["s4", "s2"], test=["s0"], val_fraction=0.5)
+    assert (named["train"], named["test"], len(named["val"])) == (["s4", "s2"], ["s0"], 5)
+    assert not {"s4", "s2", "s0"} & set(named["val"])
+
+
+@pytest.mark.parametrize(("count", "expected"), [(1, (0, 0, 1)), (2, (1, 0, 1)), (3, (1, 1, 1))])
+def test_few_scenes_are_tested_on_first(count: int, expected: tuple[int, ...]) -> None:
+    split = split_scenes(SCENES[:count])
+    assert tuple(len(split[part]) for part in ("train", "val", "test")) == expected
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"test": ["s77"]}, "expected scenes among s0, s1, .* got s77"),
+        ({"test": ["s1"], "train": ["s1"]}, "got s1 more than once"),
+        ({"test_fraction": 1.5}, "`test_fraction` between 0 and 1"),
+    ],
+)
+def test_a_split_that_does_not_fit_is_one_error(options: dict, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        split_scenes(SCENES, **options)
+
+
+def plant_scenes(root: Path, count: int = 5) -> None:
+    for i in range(count):
+        plant_model(root / f"s{i}" / "sparse" / "0", images=4, seen=20 + 5 * i, seed=i)
+
+
+def check_batch(batch: Batch) -> None:
+    """True pairs project onto their keypoints; the masks cover the points and no padding."""
+    assert batch.rotation is not None
+    assert batch.match3d is not None
+    points = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
+    true = batch.match3d >= 0
+    expected = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
+    assert ((points[..., :2] / points[..., 2:] - expected)[true]).abs().max() < 1e-5
+    assert (batch.mask3d | ~true).all()
+    assert (batch.points3d[~batch.mask3d] == 0).all()
+
+
+def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
+    plant_scenes(tmp_path)
+    data = ColmapDataModule(str(tmp_path), max_points=22, clutter=0.2, rotate=True, batch_size=3)
+    data.setup()
+    served = {}
+    for part in ("train", "val", "test", "predict"):
+        ids = []
+        for batch in getattr(data, f"{part}_dataloader")():
+            check_batch(batch)
+            ids += batch.ids
+        served[part] = {name.split("/")[0] for name in ids}
+        assert len(ids) == len(set(ids)) == 4 * len(served[part])
+    assert served["test"] == served["predict"]
+    assert served["train"] | served["val"] | served["test"] == {f"s{i}" for i in range(5)}
+    assert sum(len(served[part]) for part in ("train", "val", "test")) == 5
+    assert max(data.sources["train"].sizes) == 22 + round(0.2 * 22)
+    assert data.sources["predict"].pair(0, 0).rotation == pytest.approx(data.sources["predict"].images[0][1].rotation)
+
+
+def test_only_training_draws_anew(tmp_path: Path) -> None:
+    plant_scenes(tmp_path)
+    data = ColmapDataModule(str(tmp_path), eval_max_points=10)
+    data.setup()
+    for part, changes in (("train", True), ("val", False), ("test", False)):
+        first, second = (data.sources[part].pair(0, epoch).points2d for epoch in (0, 1))
+        assert (first != second).any() == changes
+    assert max(data.sources["test"].sizes) == 10
+
+
+def test_a_stage_reads_its_scenes_only(tmp_path: Path) -> None:
+    plant_scenes(tmp_path, 3)
+    (tmp_path / "s0/sparse/0/images.bin").write_bytes(b"")
+    data = ColmapDataModule(str(tmp_path), train_scenes=["s0"], val_scenes=[], test_scenes=["s1"])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        data.setup("test")
+    with pytest.raises(ColmapError, match="s0/sparse/0/images.bin of 0 bytes"):
+        data.setup("fit")
+
+
+def test_a_broken_model_among_others_is_skipped_and_counted(tmp_path: Path) -> None:
+    plant_scenes(tmp_path, 3)
+    (tmp_path / "s1/sparse/0/points3D.bin").write_bytes(b"\0" * 7)
+    data = ColmapDataModule(str(tmp_path), test_fraction=1.0)
+    with pytest.warns(UserWarning, match="skipped 1 of 3 COLMAP models: .*s1/sparse/0/points3D.bin"):
+        data.setup("test")
+    assert {scene.name for scene, _ in data.sources["test"].images} == {"s0", "s2"}
+
+
+def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:
+    plant_scenes(tmp_path, 1)
+    data = ColmapDataModule(str(tmp_path))
+    with pytest.raises(ValueError, match="expected `setup` before the test loader"):
+        data.test_dataloader()
+    data.setup("test")
+    for stage in ("fit", "validate"):
+        with pytest.raises(ValueError, match=f"expected scenes for {stage}, got none left of s0"):
+            data.setup(stage)
+
+
+class OneWeight(LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(()))
+
+    def training_step(self, batch: Batch, index: int) -> torch.Tensor:
+        return self.weight * batch.points2d.square().mean()
+
+    def validation_step(self, batch: Batch, index: int) -> None:
+        raise AssertionError("there is nothing to validate on")
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), 0.1)
+
+
+def test_training_does_without_validation_scenes(tmp_path: Path) -> None:
+    plant_scenes(tmp_path, 2)
+    data = ColmapDataModule(str(tmp_path), val_fraction=0.0)
+    trainer = Trainer(
+        max_steps=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
+    )
+    trainer.fit(OneWeight(), data)
+    assert trainer.global_step == 1
+
+
+def test_every_image_of_real_scenes_is_served_once(shared_data: Path) -> None:
+    scenes = ["castle-P30", "sceaux_castle_txt"]
+    data = ColmapDataModule(str(shared_data / "colmap"), test_scenes=scenes, train_scenes=[], eval_max_points=50)
+    data.setup("test")
+    batches = list(data.test_dataloader())
+    assert sorted(len(batch) for batch in batches) == [7, 16, 16]
+    assert len({name for batch in batches for name in batch.ids}) == 39

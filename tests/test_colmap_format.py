@@ -1,0 +1,61 @@
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_model import plant_model
+
+from bpnp.datamodules.colmap_format import ColmapError
+from bpnp.datamodules.reconstruction import read_reconstruction
+
+
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
+@pytest.mark.parametrize("name", ["cameras", "images", "points3D"])
+def test_a_truncated_file_is_one_error_that_names_it(name: str, suffix: str, tmp_path: Path) -> None:
+    plant_model(tmp_path, text=suffix == "txt")
+    path = tmp_path / f"{name}.{suffix}"
+    content = path.read_bytes()
+    cuts = {0, 1, 4, 8, 9, 20, len(content) - 1, *np.linspace(0, len(content) - 1, 60).astype(int).tolist()}
+    if suffix == "txt":  # also between lines, where every line that is left is whole
+        cuts |= {i + 1 for i, byte in enumerate(content[:-1]) if byte == ord("\n")}
+    for cut in sorted(cuts):
+        path.write_bytes(content[:cut])
+        with pytest.raises(ColmapError, match=f"{name}.{suffix}"):
+            read_reconstruction(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("cameras.bin", b"\x89PNG\r\n\x1a\n" + bytes(range(256)), "cameras.bin"),
+        ("images.bin", np.random.default_rng(0).bytes(5000), "images.bin, got .* truncated or not a COLMAP file"),
+        ("points3D.bin", b"# text\n" * 99, "points3D.bin, got .* truncated or not a COLMAP file"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 77, 9, 9, 1, 1, 1, 1), "got id 77"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, np.nan, 1, 1, 1), "camera 1 of image .* got parameters"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 1, 1, 9, 9, -2, -2, 1, 1), "got focal length -2"),
+        ("cameras.bin", struct.pack("<QIiQQ4d", 1, 7, 1, 9, 9, 1, 1, 1, 1), "got no such camera"),
+        ("cameras.bin", struct.pack("<QIiQQ5d", 1, 1, 1, 9, 9, 1, 1, 1, 1, 1), "to end at byte 64, got 72"),
+        ("images.bin", bytes(8), "got none in .*images.bin"),
+        ("points3D.bin", bytes(8), "got none in .*points3D.bin"),
+        ("points3D.txt", b"1 nan 0 0 0 0 0 0\n", "got none that is finite"),
+        ("cameras.txt", b"1 PINHOLE 9 9 1 1 1\n", "3 parameters, camera model PINHOLE has 4"),
+        ("cameras.txt", b"1 PINHALL 9 9 1 1 1 1\n", "PINHALL"),
+        ("images.txt", b"1 1 0 0 0 zero 0 0 1 a.jpg\n1 1 1\n", "line 1 of .*images.txt"),
+        ("images.txt", b"1 1 0 0 0 0 0 0 1 a.jpg\n1 1 1 2\n", "line 2 of .*images.txt"),
+        ("points3D.txt", b"\x00\xff\xfe garbage\n", "line 1 of .*points3D.txt"),
+        ("points3D.txt", b"99999999999999999999 0 0 0 0 0 0 0\n", "line 1 of .*points3D.txt"),
+    ],
+)
+def test_a_foreign_file_is_one_error_that_names_it(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    plant_model(tmp_path, text=name.endswith("txt"))
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ColmapError, match=message):
+        read_reconstruction(tmp_path)
+
+
+def test_a_missing_file_or_folder_is_one_error(tmp_path: Path) -> None:
+    plant_model(tmp_path / "scene")
+    (tmp_path / "scene" / "points3D.bin").unlink()
+    for folder in ("scene", "nowhere"):
+        with pytest.raises(ColmapError, match=f"{folder}, got .* try the folder sparse/0"):
+            read_reconstruction(tmp_path / folder)
