@@ -1,23 +1,30 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+RUN := runs/quickstart
 
 .PHONY: quickstart test lint install clean
 
 install: $(VENV)/.installed
 
 $(VENV)/.installed: pyproject.toml constraints.txt
-	$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v in ((3, 11), (3, 12)) else f"expected Python 3.11 or 3.12, got {v[0]}.{v[1]}; try: make PYTHON=python3.11")'
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(None if v in ((3, 11), (3, 12)) else "expected Python 3.11 or 3.12, got %d.%d; try: make PYTHON=python3.11" % v)'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
-	touch $@
+	@touch $@
+
+quickstart: install
+	$(BIN)/bpnp test --config configs/quickstart.yaml --results.folder $(RUN)/untrained
+	$(BIN)/bpnp fit --config configs/quickstart.yaml
+	$(BIN)/bpnp test --config configs/quickstart.yaml --ckpt_path $(RUN)/checkpoints/best.ckpt
+	$(BIN)/bpnp report $(RUN)/test --untrained $(RUN)/untrained
 
 lint: install
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
-test: install lint
+test: lint
 	$(BIN)/python -m pytest -n 2
 
 clean:

@@ -14,6 +14,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
+from bpnp.report import report
 from bpnp.report.results import PairRow, write_results
 from bpnp.report.rows import rows_from
 from bpnp.types import Batch, Prediction
@@ -40,7 +41,7 @@ class PoseLossWarmup(Callback):
         if self.switched_at is None and trainer.current_epoch >= self.start_epoch:
             self.switched_at = trainer.current_epoch
             rank_zero_info(f"epoch {trainer.current_epoch}: the pose loss joins with weight {self.weight}")
-        pl_module.pose_weight = 0.0 if self.switched_at is None else self.weight
+        pl_module.pose_weight = 0.0 if self.switched_at is None else self.weight  # type: ignore[assignment]
 
     def state_dict(self) -> dict[str, Any]:
         return {"switched_at": self.switched_at}
@@ -70,10 +71,12 @@ class ResultsWriter(Callback):
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
-        prediction, seconds, losses = outputs
-        self.rows += rows_from(prediction, batch, seconds, inlier_threshold=self.inlier_threshold)
-        if losses is not None:
-            self.losses |= dict(zip(batch.index.tolist(), losses.tolist(), strict=True))
+        rows = rows_from(
+            outputs["prediction"], batch, outputs["seconds"], inlier_threshold=self.inlier_threshold
+        )  # fmt: skip
+        self.rows += rows
+        if outputs["losses"] is not None:
+            self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         gathered = _gather((self.rows, self.losses))
@@ -83,6 +86,7 @@ class ResultsWriter(Callback):
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer, "test")
             write_results(folder, rows, correspondence_loss=mean, settings={"checkpoint": _checkpoint(trainer)})
+            report([folder])
             rank_zero_info(f"results of {len({row.index for row in rows})} pairs in {folder}")
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -48,12 +48,18 @@ class BpnpCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A CSV log and a progress bar always, whatever else the configuration logs to."""
         trainer = super().instantiate_trainer(**kwargs)
-        if not any(isinstance(logger, CSVLogger) for logger in trainer.loggers) and self._logging_wanted():
+        wanted = self._get(self.config, "trainer.logger") is not False
+        if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
             trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
         return trainer
 
-    def _logging_wanted(self) -> bool:
-        return bool(self._get(self.config, "trainer.logger", default=True))
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        """Checkpoints are data, never code; after a test our own table is printed instead of a list of all metrics."""
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        parser.set_defaults({"weights_only": True})
+        if subcommand == "test":
+            parser.set_defaults({"verbose": False})
+        return parser
 
 
 def _checkpoint_folder(root: str) -> str:
@@ -85,7 +91,7 @@ def _lightning(arguments: list[str]) -> None:
         seed_everything_default=0,
         save_config_kwargs={"overwrite": True},
         trainer_defaults={"callbacks": [RichProgressBar()], "max_epochs": 200, "num_sanity_val_steps": 0},
-        parser_kwargs={"description": DESCRIPTION, "prog": "bpnp"},
+        parser_kwargs={"description": DESCRIPTION, "prog": "bpnp", "allow_abbrev": False},
         args=arguments,
     )
 
@@ -96,12 +102,16 @@ def _report(arguments: list[str]) -> None:
     parser.add_argument(
         "--paper", choices=("modelnet40", "megadepth"), help="the paper's rows beneath, for orientation"
     )
+    parser.add_argument("--untrained", type=Path, metavar="RUN", help="the same test before training, to compare with")
     chosen = parser.parse_args(arguments)
-    report(chosen.runs, paper=chosen.paper)
+    report(chosen.runs, paper=chosen.paper, untrained=chosen.untrained)
 
 
 def _quieten() -> None:
     """Third-party advice that does not apply here."""
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(
+        lambda record: "Tip:" not in record.getMessage()
+    )
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*Using `DistributedSampler` with the dataloaders.*")
     warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")

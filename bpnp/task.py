@@ -1,7 +1,7 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
 import time
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
@@ -63,7 +63,11 @@ class BlindPnPTask(LightningModule):
         self.loss_is_finite = True
         self.estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         self.pose_metrics = nn.ModuleDict(
-            {stage: nn.ModuleDict({name: _pose_metrics() for name in self.estimates}) for stage in ("val", "test")}
+            {
+                f"{stage}_{name}": MetricCollection([PoseQuartiles(), PoseRecall()])
+                for stage in ("val", "test")
+                for name in self.estimates
+            }
         )
         self.loss_metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in ("val", "test")})
 
@@ -80,7 +84,7 @@ class BlindPnPTask(LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate(batch, "val")
 
-    def test_step(self, batch: Batch, batch_idx: int) -> tuple[Prediction, float, Tensor | None]:
+    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """The prediction, the seconds that it took, and the correspondence loss per pair; for the results writer."""
         return self._evaluate(batch, "test")
 
@@ -162,14 +166,20 @@ class BlindPnPTask(LightningModule):
     def on_test_epoch_end(self) -> None:
         self._log_metrics("test")
 
-    def _evaluate(self, batch: Batch, stage: Stage) -> tuple[Prediction, float, Tensor | None]:
+    def _evaluate(self, batch: Batch, stage: Stage) -> dict[str, Any]:
         prediction, seconds = self._timed(batch)
         for name, pose in prediction.poses.items():
-            self.pose_metrics[stage][name].update(pose, batch)  # type: ignore[index, operator, union-attr]
-        matching = self.correspondence_losses(prediction, batch)
-        if matching is not None:
-            self.loss_metrics[stage].update(matching, batch.index)  # type: ignore[operator]
-        return prediction, seconds, matching
+            self._pose_metrics(stage, name).update(pose, batch)
+        losses = self.correspondence_losses(prediction, batch)
+        if losses is not None:
+            self._loss_metric(stage).update(losses, batch.index)
+        return {"prediction": prediction, "seconds": seconds, "losses": losses}
+
+    def _pose_metrics(self, stage: Stage, estimate: str) -> MetricCollection:
+        return cast(MetricCollection, self.pose_metrics[f"{stage}_{estimate}"])
+
+    def _loss_metric(self, stage: Stage) -> MeanOverPairs:
+        return cast(MeanOverPairs, self.loss_metrics[stage])
 
     def _timed(self, batch: Batch) -> tuple[Prediction, float]:
         _wait(self.device)
@@ -183,24 +193,20 @@ class BlindPnPTask(LightningModule):
 
     def _log_metrics(self, stage: Stage) -> None:
         for i, name in enumerate(self.estimates):
-            metrics = self.pose_metrics[stage][name]  # type: ignore[index]
-            values = metrics.compute()  # type: ignore[operator, union-attr]
-            metrics.reset()  # type: ignore[operator, union-attr]
+            metrics = self._pose_metrics(stage, name)
+            values = metrics.compute()
+            metrics.reset()
             self._log_all({f"{stage}/{name}/{k}": v for k, v in values.items()})
             if i == 0:
                 self._log_all({f"{stage}/{k}": v for k, v in values.items()})
-        loss = self.loss_metrics[stage]
+        loss = self._loss_metric(stage)
         if loss.update_called:
-            self._log_all({f"{stage}/correspondence_loss": loss.compute()})  # type: ignore[operator]
-            loss.reset()  # type: ignore[operator]
+            self._log_all({f"{stage}/correspondence_loss": loss.compute()})
+            loss.reset()
 
     def _log_all(self, values: dict[str, Tensor]) -> None:
         # The metrics have already been gathered over processes.
-        self.log_dict({k: v.float() for k, v in values.items()}, rank_zero_only=False, sync_dist=False)
-
-
-def _pose_metrics() -> MetricCollection:
-    return MetricCollection([PoseQuartiles(), PoseRecall()])
+        self.log_dict({k: v.float() for k, v in values.items()})
 
 
 def _assignment_stats(prediction: Prediction) -> dict[str, Tensor]:
