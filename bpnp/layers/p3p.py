@@ -20,7 +20,7 @@ class P3P(NamedTuple):
     valid: Bool[Tensor, "*b 4"]
 
 
-def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *, polish: int = 4) -> P3P:
+def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *, polish: int = 2) -> P3P:
     """Solve d_i f_i = R p_i + t, d_i > 0, for three pairs (rows of the last two axes).
 
     With x = d_0/d_2 and y = d_1/d_2 the law of cosines in the triangles at the camera gives two conics in (x, y). One
