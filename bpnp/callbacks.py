@@ -12,12 +12,23 @@ import torch
 import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
+from bpnp.models.checkpoint import read_checkpoint
 from bpnp.report import report
 from bpnp.report.results import PairRow, write_results
 from bpnp.report.rows import rows_from
 from bpnp.types import Batch, Prediction
+
+
+class SafeCheckpointIO(TorchCheckpointIO):
+    """Checkpoints read as data only, with one clear error for a file that is none."""
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        return read_checkpoint(path, map_location=map_location)
 
 
 class PoseLossWarmup(Callback):

@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 
-from bpnp.callbacks import ResultsWriter
+from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
 from bpnp.report import report
 from bpnp.task import BlindPnPTask, TrainingDivergedError
 
@@ -54,12 +54,16 @@ class BpnpCLI(LightningCLI):
         return trainer
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
-        """Checkpoints are data, never code; after a test our own table is printed instead of a list of all metrics."""
+        """Our own tables instead of a list of all metrics, and no assignments kept in memory."""
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        parser.set_defaults({"weights_only": True})
         if subcommand == "test":
             parser.set_defaults({"verbose": False})
+        if subcommand == "predict":
+            parser.set_defaults({"return_predictions": False})
         return parser
+
+    def _parse_ckpt_path(self) -> None:
+        """Nothing to take from a checkpoint: ours hold no settings of the trainer's. It is read once, by the trainer."""
 
 
 def _checkpoint_folder(root: str) -> str:
@@ -90,7 +94,12 @@ def _lightning(arguments: list[str]) -> None:
         subclass_mode_data=True,
         seed_everything_default=0,
         save_config_kwargs={"overwrite": True},
-        trainer_defaults={"callbacks": [RichProgressBar()], "max_epochs": 200, "num_sanity_val_steps": 0},
+        trainer_defaults={
+            "callbacks": [RichProgressBar()],
+            "plugins": [SafeCheckpointIO()],
+            "max_epochs": 200,
+            "num_sanity_val_steps": 0,
+        },
         parser_kwargs={"description": DESCRIPTION, "prog": "bpnp", "allow_abbrev": False},
         args=arguments,
     )

@@ -12,6 +12,7 @@ from torchmetrics import MetricCollection
 from bpnp.losses import RELEASED_BOUNDS, correspondence_loss, correspondence_loss_from_pose, pose_loss
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.checkpoint import check_solver
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["train", "val", "test"]
@@ -158,7 +159,8 @@ class BlindPnPTask(LightningModule):
         checkpoint["skipped_steps"] = (self.skipped_steps, self.skipped_in_a_row)
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        self.skipped_steps, self.skipped_in_a_row = checkpoint["skipped_steps"]
+        check_solver(checkpoint.get("solver", {}), type(self.solver).__name__, getattr(self.solver, "settings", {}))
+        self.skipped_steps, self.skipped_in_a_row = checkpoint.get("skipped_steps", (0, 0))
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val")

@@ -6,14 +6,15 @@ coordinates x/z, y/z (intrinsics applied, distortion removed); 3D points and tra
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, fields
-from typing import Any
+from dataclasses import dataclass, field, fields, is_dataclass
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+_T = TypeVar("_T")
 Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
 
 
@@ -24,6 +25,10 @@ class SolveStats:
     iterations: Int[Tensor, " b"]
     residual: Float[Tensor, " b"]
     converged: Bool[Tensor, " b"]
+
+    def to(self, *args: Any, **kwargs: Any) -> "SolveStats":
+        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
+        return _moved(self, *args, **kwargs)
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,9 @@ class Pose:
         """Samples that have a finite pose."""
         return self.rotation.isfinite().all((-2, -1)) & self.translation.isfinite().all(-1)
 
+    def to(self, *args: Any, **kwargs: Any) -> "Pose":
+        return _moved(self, *args, **kwargs)
+
 
 @dataclass(frozen=True)
 class Prediction:
@@ -47,6 +55,9 @@ class Prediction:
     assignment: Float[Tensor, "b m n"] | None = None
     assignment_stats: SolveStats | None = None
     poses: dict[str, Pose] = field(default_factory=dict)
+
+    def to(self, *args: Any, **kwargs: Any) -> "Prediction":
+        return _moved(self, *args, **kwargs)
 
 
 @dataclass(frozen=True)
@@ -87,22 +98,10 @@ class Batch:
         return self.mask3d.sum(-1)
 
     def to(self, *args: Any, **kwargs: Any) -> "Batch":
-        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
-        return self._map(lambda x: x.to(*args, **kwargs))
+        return _moved(self, *args, **kwargs)
 
     def pin_memory(self) -> "Batch":
-        return self._map(lambda x: x.pin_memory())
-
-    def _map(self, function: Callable[[Tensor], Tensor]) -> "Batch":
-        moved: dict[str, Any] = {}
-        for f in fields(self):
-            value = getattr(self, f.name)
-            if isinstance(value, Tensor):
-                # Tensor.to(float64) would turn masks and indices into numbers.
-                result = function(value)
-                value = result if value.is_floating_point() else result.to(value.dtype)
-            moved[f.name] = value
-        return Batch(**moved)
+        return _mapped(self, lambda x: x.pin_memory())
 
     @classmethod
     def from_arrays(
@@ -156,6 +155,27 @@ class Batch:
             translation=None if translations is None else _stack("translation", translations, (3,), dtype),
             match3d=padded_match,
         )
+
+
+def _moved(value: _T, *args: Any, **kwargs: Any) -> _T:
+    def move(x: Tensor) -> Tensor:
+        moved = x.to(*args, **kwargs)
+        # Tensor.to(float64) would turn masks and indices into numbers.
+        return moved if x.is_floating_point() else moved.to(x.dtype)
+
+    return _mapped(value, move)
+
+
+def _mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
+    """Apply a function to every tensor in dataclasses and dicts of them; the rest stays."""
+    if isinstance(value, Tensor):
+        return cast(_T, function(value))
+    if isinstance(value, dict):
+        return cast(_T, {k: _mapped(v, function) for k, v in value.items()})
+    if is_dataclass(value) and not isinstance(value, type):
+        changed = {f.name: _mapped(getattr(value, f.name), function) for f in fields(value)}
+        return cast(_T, type(value)(**changed))
+    return value
 
 
 def _as_list(values: Arrays, ndim: int) -> list[Tensor]:

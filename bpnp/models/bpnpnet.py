@@ -11,6 +11,7 @@ from bpnp.geometry import bearings
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.sinkhorn import Sinkhorn
+from bpnp.models.checkpoint import read_checkpoint
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
 from bpnp.types import Batch, Pose, Prediction
 
@@ -107,15 +108,10 @@ class BPnPNet(nn.Module):
 
         Raises FileNotFoundError, or ValueError naming the file if it holds no BPnPNet.
         """
-        file = Path(path)
-        if not file.is_file():
-            raise FileNotFoundError(
-                f"expected a checkpoint, got no file at {file}; try runs/<name>/checkpoints/last.ckpt"
-            )
-        content = torch.load(file, map_location="cpu", weights_only=True)
-        solver = content.get("solver", {}) if isinstance(content, dict) else {}
+        content = read_checkpoint(path)
+        solver = content.get("solver", {})
         if solver.get("class") != cls.__name__:
-            raise ValueError(f"expected a checkpoint of BPnPNet, got {solver.get('class', 'another file')} in {file}")
+            raise ValueError(f"expected a checkpoint of BPnPNet, got {solver.get('class', 'another file')} in {path}")
         net = cls(**solver["settings"])
         prefix = "solver."
         state = {k.removeprefix(prefix): v for k, v in content["state_dict"].items() if k.startswith(prefix)}

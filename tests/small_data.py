@@ -1,0 +1,38 @@
+"""Small data sets on disk, in the layouts that the recipes read, and a network small enough to train in a test."""
+
+from pathlib import Path
+
+import numpy as np
+
+from bpnp.datamodules.procedural import procedural_shape
+from bpnp.datamodules.surfaces import Mesh
+
+SMALL_NET = ["--model.solver=bpnp.models.BPnPNet", "--model.solver.channels=16", "--model.solver.blocks=2"]
+SMALL_MESHES = [
+    "--data.num_points=24",
+    "--data.pool_size=64",
+    "--data.train_shapes=12",
+    "--data.val_shapes=5",
+    "--data.test_shapes=7",
+    "--data.train_pairs=24",
+    "--data.batch_size=4",
+]
+
+
+def write_mesh_tree(root: Path, *, train: int = 3, test: int = 2) -> Path:
+    """<root>/{box,lamp}/{train,test}/*.off, half of them with the counts on the header line."""
+    for number, name in enumerate(("box", "lamp")):
+        for split, count in (("train", train), ("test", test)):
+            folder = root / name / split
+            folder.mkdir(parents=True)
+            for i in range(count):
+                mesh = procedural_shape(np.random.default_rng([number, i]))
+                write_off(folder / f"{name}_{i:04d}.off", mesh, joined_header=i % 2 == 1)
+    return root
+
+
+def write_off(path: Path, mesh: Mesh, *, joined_header: bool) -> None:
+    head = f"OFF{' ' if joined_header else chr(10)}{len(mesh.vertices)} {len(mesh.faces)} 0"
+    vertices = [" ".join(map(str, v)) for v in mesh.vertices.tolist()]
+    faces = [" ".join(map(str, (3, *f))) for f in mesh.faces.tolist()]
+    path.write_text("\n".join([head.replace("OFF ", "OFF"), *vertices, *faces]) + "\n")
