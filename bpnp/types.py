@@ -60,7 +60,7 @@ class Prediction:
         return _moved(self, *args, **kwargs)
 
 
-@dataclass(frozen=True)
+@dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy
 class Batch:
     """Pairs of point sets, padded and masked.
 
@@ -119,21 +119,24 @@ class Batch:
         """Pad and mask one pair, or lists of pairs of different sizes.
 
         points2d (m, 2) and points3d (n, 3) for one pair, or sequences of such arrays; rotation (3, 3), translation
-        (3,), match3d (n,) and focal () likewise. Padding is zero. The dtype is float64 if a 2D array is, else float32.
+        (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D array is, else float32;
+        the batch is on the CPU.
 
         Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
         or a match3d index that is no 2D point.
         """
-        sets2d, sets3d = _as_list(points2d, 2), _as_list(points3d, 2)
+        sets2d, sets3d = _as_list("points2d", points2d, 2), _as_list("points3d", points3d, 2)
         size = len(sets2d)
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in sets2d) else torch.float32
         sets2d = [_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
         sets3d = [_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
-        rotations = None if rotation is None else _as_list(rotation, 2)
-        translations = None if translation is None else _as_list(translation, 1)
-        matches = None if match3d is None else _as_list(match3d, 1)
+        rotations = None if rotation is None else _as_list("rotation", rotation, 2)
+        translations = None if translation is None else _as_list("translation", translation, 1)
+        matches = None if match3d is None else _as_list("match3d", match3d, 1)
+        focals = [torch.ones(())] if focal is None else _as_list("focal", focal, 0)
+        focals = focals * size if len(focals) == 1 else focals
         for name, values in (("points3d", sets3d), ("rotation", rotations), ("translation", translations),
-                             ("match3d", matches)):  # fmt: skip
+                             ("match3d", matches), ("focal", focals), ("index", index), ("ids", ids)):  # fmt: skip
             if values is not None and len(values) != size:
                 raise ValueError(f"expected `{name}` for {size} pairs as in `points2d`, got {len(values)}")
         m, n = max(len(x) for x in sets2d), max(len(x) for x in sets3d)
@@ -142,13 +145,12 @@ class Batch:
             padded_match = torch.full((size, n), -1, dtype=torch.long)
             for i, match in enumerate(matches):
                 padded_match[i, : len(sets3d[i])] = _match(i, match, len(sets2d[i]), len(sets3d[i]))
-        focals = torch.ones(size) if focal is None else torch.as_tensor(np.asarray(focal)).reshape(-1).expand(size)
         return cls(
             points2d=_pad(sets2d, m),
             points3d=_pad(sets3d, n),
             mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
             mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
-            focal=focals.to(dtype).clone(),
+            focal=_stack("focal", focals, (), dtype),
             index=torch.arange(size) if index is None else torch.as_tensor(index, dtype=torch.long),
             ids=tuple(str(i) for i in range(size)) if ids is None else tuple(ids),
             rotation=None if rotations is None else _stack("rotation", rotations, (3, 3), dtype),
@@ -160,8 +162,8 @@ class Batch:
 def _moved(value: _T, *args: Any, **kwargs: Any) -> _T:
     def move(x: Tensor) -> Tensor:
         moved = x.to(*args, **kwargs)
-        # Tensor.to(float64) would turn masks and indices into numbers.
-        return moved if x.is_floating_point() else moved.to(x.dtype)
+        # A dtype is for numbers: half precision has no index 257.
+        return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
 
     return _mapped(value, move)
 
@@ -178,12 +180,24 @@ def _mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
     return value
 
 
-def _as_list(values: Arrays, ndim: int) -> list[Tensor]:
-    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of tensors."""
-    if isinstance(values, (list, tuple)) and values and not np.isscalar(values[0]) and np.ndim(values[0]) == ndim:
-        return [torch.as_tensor(v) for v in values]
-    array = torch.as_tensor(values) if isinstance(values, Tensor) else torch.as_tensor(np.asarray(values))
+def _as_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
+    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
+    if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
+        return [_as_tensor(name, v) for v in values]
+    array = _as_tensor(name, values)
+    if array.numel() == 0 and array.ndim != ndim:
+        raise ValueError(f"expected at least one pair, got an empty `{name}`")
     return list(array) if array.ndim == ndim + 1 else [array]
+
+
+def _as_tensor(name: str, values: Arrays) -> Tensor:
+    if isinstance(values, Tensor):
+        return values.cpu()
+    try:
+        array = np.asarray(values)
+        return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
 
 
 def _points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
@@ -212,6 +226,8 @@ def _stack(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch
     for i, value in enumerate(values):
         if value.shape != shape:
             raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in pair {i}")
+        if not value.isfinite().all():
+            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in pair {i}")
     return torch.stack([v.to(dtype) for v in values])
 
 

@@ -64,18 +64,20 @@ def test_a_killed_run_resumes_and_ends_as_an_uninterrupted_one(tmp_path: Path) -
 
 
 def test_two_processes_give_the_figures_of_one(tmp_path: Path) -> None:
+    # In float64: Adam turns the rounding of a gradient that should be zero into a whole step.
+    double = "--trainer.precision=64-true"
     results = {}
     for devices in (1, 2):
         folder = tmp_path / str(devices)
         strategy = [f"--trainer.devices={devices}", "--trainer.strategy=" + ("ddp" if devices == 2 else "auto")]
-        finish(start("fit", folder, *strategy, "--trainer.max_epochs=2"))
-        finish(start("test", folder, *strategy, f"--ckpt_path={folder}/checkpoints/last.ckpt"))
+        finish(start("fit", folder, *strategy, double, "--trainer.max_epochs=2"))
+        finish(start("test", folder, *strategy, double, f"--ckpt_path={folder}/checkpoints/last.ckpt"))
         results[devices] = read_results(folder / "test")
     one, two = results[1], results[2]
     # Seven test pairs in batches of four: the second process repeats some, which count once.
     assert [row.id for row in two.rows] == [row.id for row in one.rows]
     assert len(one.rows) == 7 * 2
-    assert two.correspondence_loss == pytest.approx(one.correspondence_loss, abs=1e-5)
+    assert two.correspondence_loss == pytest.approx(one.correspondence_loss, abs=1e-8)
     for estimate, values in one.estimates.items():
         for key in ("rotation_q2_deg", "translation_q2", "recall_rotation_20deg"):
-            assert two.estimates[estimate][key] == pytest.approx(values[key], rel=1e-2, abs=1e-3), (estimate, key)
+            assert two.estimates[estimate][key] == pytest.approx(values[key], rel=1e-6), (estimate, key)
