@@ -69,7 +69,7 @@ def entropic_plan(
 
     With V = dL/dP and multipliers a, b from [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1]:
     dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = -sum P.(V - a1^T - 1b^T).log(P)/mu, dL/drow = a, dL/dcol = b
-    (up to the one constant that P cannot tell apart, chosen so that both have the same weighted mean).
+    (up to the one constant that P cannot tell apart, chosen so that the mean of b, weighted by c, is zero).
     The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
     """
     return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal)

@@ -17,18 +17,28 @@ RIDGE = 1e-13
 def solve_multipliers(
     plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]]:
-    """Multipliers (a, b) of the projection of `gradient` onto plans with the marginals of `plan`.
+    """Multipliers (a, b) of the projection of `gradient` onto plans with the marginals of `plan`; sum(P^T 1 . b) = 0.
 
-    Rows are centred before the elimination, so that the right-hand side loses no digits when P is almost a permutation.
-    Conjugate gradients, two products a step; samples where they stall are solved by one Cholesky factorisation.
+    Conjugate gradients, two products a step; samples where they stall are solved by one Cholesky factorisation. These
+    have groups of points with weak links, which magnify the rounding of the right-hand side: it is made in float64 too.
     """
-    weighted = plan * gradient
     rows, cols = plan.sum(-1), plan.sum(-2)
+    row_mean, rhs = _reduce(plan, gradient, rows)
+    b, solved = _conjugate_gradients(plan, rows, cols, rhs, CG_TOLERANCE[plan.dtype])
+    if not bool(solved.all()):
+        hard = (~solved).nonzero().squeeze(-1)
+        part = plan[hard].double()
+        part_rows, part_cols = part.sum(-1), part.sum(-2)
+        _, part_rhs = _reduce(part, gradient[hard].double(), part_rows)
+        b = b.index_copy(0, hard, _factorised(part, part_rows, part_cols, part_rhs).to(b.dtype))
+    return row_mean - _divide(_times(plan, b), rows), b
+
+
+def _reduce(plan: Tensor, gradient: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean of `gradient` in each row, and the right-hand side that is left once the rows are eliminated."""
+    weighted = plan * gradient
     row_mean = _divide(weighted.sum(-1), rows)
-    rhs = weighted.sum(-2) - _transpose_times(plan, row_mean)
-    b = _solve_columns(plan, rows, cols, rhs, CG_TOLERANCE[plan.dtype])
-    a = row_mean - _divide(_times(plan, b), rows)
-    return a, b
+    return row_mean, weighted.sum(-2) - _transpose_times(plan, row_mean)
 
 
 def newton_direction(
@@ -38,23 +48,12 @@ def newton_direction(
     rows, cols = plan.sum(-1), plan.sum(-2)
     row_error = _divide(row_marginal - rows, rows)
     rhs = col_marginal - cols - _transpose_times(plan, row_error)
-    y = _solve_columns(plan, rows, cols, rhs, NEWTON_TOLERANCE)
-    return row_error - _divide(_times(plan, y), rows), y
-
-
-def _solve_columns(
-    plan: Float[Tensor, "b m n"],
-    rows: Float[Tensor, "b m"],
-    cols: Float[Tensor, "b n"],
-    rhs: Float[Tensor, "b n"],
-    tolerance: float,
-) -> Float[Tensor, "b n"]:
-    """Solve S b = rhs with sum(cols * b) = 0, per sample, to a residual smaller by `tolerance`."""
-    b, solved = _conjugate_gradients(plan, rows, cols, rhs, tolerance)
+    y, solved = _conjugate_gradients(plan, rows, cols, rhs, NEWTON_TOLERANCE)
     if not bool(solved.all()):
         hard = (~solved).nonzero().squeeze(-1)
-        b = b.index_copy(0, hard, _factorised(plan[hard], rows[hard], cols[hard], rhs[hard]).to(b.dtype))
-    return b
+        exact = _factorised(*(x[hard].double() for x in (plan, rows, cols, rhs)))
+        y = y.index_copy(0, hard, exact.to(y.dtype))
+    return row_error - _divide(_times(plan, y), rows), y
 
 
 def _conjugate_gradients(
@@ -88,20 +87,19 @@ def _conjugate_gradients(
 
 
 def _factorised(plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor) -> Tensor:
-    """Cholesky of S in float64. The diagonal is the sum of the other entries of its row: as a difference from `cols` it
-    would be noise when P is almost a permutation."""
-    plan, rows, cols, rhs = plan.double(), rows.double(), cols.double(), rhs.double()
-    weights = plan.mT @ (plan * _divide(torch.ones_like(rows), rows).unsqueeze(-1))
-    weights.diagonal(dim1=-2, dim2=-1).zero_()
-    degree = weights.sum(-1)
-    # Columns that share no row with another have no off-diagonal entry: their b is free, zero is taken. The relative
-    # ridge does the same for groups of columns, and makes S definite.
-    isolated = degree <= torch.finfo(degree.dtype).tiny
-    laplacian = -weights
-    laplacian.diagonal(dim1=-2, dim2=-1).add_(torch.where(isolated, 1, degree * (1 + RIDGE)))
+    """Cholesky of S, in float64.
+
+    The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
+    almost a permutation.
+    """
+    laplacian = plan.mT @ (plan * _divide(-torch.ones_like(rows), rows).unsqueeze(-1))
+    diagonal = laplacian.diagonal(dim1=-2, dim2=-1)
+    diagonal.zero_()
+    # Between groups of columns that hardly share a row, the right-hand side is rounding and S nearly singular. The
+    # ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
+    diagonal.copy_(torch.where(cols > 0, RIDGE * cols - laplacian.sum(-1), 1))
     factor, _ = torch.linalg.cholesky_ex(laplacian)
-    solution = torch.cholesky_solve(torch.where(isolated, 0, rhs).unsqueeze(-1), factor).squeeze(-1)
-    return _centre(solution, cols)
+    return _centre(torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1), cols)
 
 
 def _centre(b: Tensor, cols: Tensor) -> Tensor:

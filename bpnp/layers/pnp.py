@@ -19,6 +19,7 @@ from bpnp.types import SolveStats
 
 Method = Literal["newton", "lbfgs"]
 FAR = 1e4  # scene radii; a pose beyond has run away to where every point is seen in one direction
+LINE_SEARCH_TOLERANCE = 1e-7  # a line search on values in float64 resolves no gradient much smaller than this
 WELL_POSED = 1e-9  # smallest to largest Hessian eigenvalue for which a derivative is given
 
 
@@ -38,7 +39,8 @@ def weighted_pnp(
     assignment: P, zero at padded points. bearings: unit f_i. points3d: p_j, any unit. rotation, translation: the start,
         which receives no gradient; a sample whose start is NaN has no pose.
     method: "newton", damped, per sample, O(n) an iteration; "lbfgs", strong Wolfe on the dense objective, per sample.
-    tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii.
+    tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii; 1e-7 at least
+        for "lbfgs", whose line search cannot see less.
 
     Returns rotation, translation and stats per sample. Iterations run in float64. Gradients flow to assignment,
     bearings and points3d by the implicit function theorem with the true Hessian (Lemma 1). `converged` is False, and
@@ -53,17 +55,20 @@ def weighted_pnp(
     points, frame = _normalise(points3d.double(), q.detach())
     start_found = rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
     start_r = torch.where(start_found[:, None, None], rotation.double(), torch.eye(3, device=q.device).double())
+    start_r = roma.special_procrustes(start_r.detach())  # steps keep what a rounded start lacks to a rotation
     start_t = torch.where(start_found[:, None], translation.double(), torch.ones_like(frame.centre))
     with torch.no_grad():
         start = _Start(start_r, frame.enter(start_r, start_t))
         if method == "newton":
             r, t, iterations = _newton(q, points, start, tolerance, max_iterations)
         else:
+            tolerance = max(tolerance, LINE_SEARCH_TOLERANCE)
             r, t, iterations = _lbfgs(assignment.double(), bearings.double(), points, start, tolerance, max_iterations)
         stats, hessian_factor = _judge(q, points, r, t, start_found, iterations, tolerance)
 
     def solve_adjoint(gradient: Tensor) -> Tensor:
-        return torch.cholesky_solve(gradient.unsqueeze(-1), hessian_factor).squeeze(-1) * stats.converged[:, None]
+        adjoint = torch.cholesky_solve(gradient.unsqueeze(-1), hessian_factor).squeeze(-1)
+        return torch.where(stats.converged[:, None], adjoint, 0)
 
     step = at_optimum(
         torch.zeros_like(r[:, 0].repeat(1, 2)), lambda _, q, p: pose_gradient(q, p, r, t), solve_adjoint, q, points
@@ -155,7 +160,7 @@ def _lbfgs(
         optimiser = torch.optim.LBFGS(
             [pose],
             max_iter=max_iterations,
-            tolerance_grad=tolerance * float(p.sum()),
+            tolerance_grad=0.01 * tolerance * float(torch.linalg.vector_norm(p.mT @ f, dim=-1).sum()),
             tolerance_change=0.0,
             line_search_fn="strong_wolfe",
         )

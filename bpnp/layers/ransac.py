@@ -1,20 +1,18 @@
 """RANSAC on the most probable pairs: a robust first pose from a soft assignment (paper section 3.3)."""
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-import cv2
 import numpy as np
-import poselib
 import torch
 from jaxtyping import Bool, Float, Int
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from bpnp.layers.consensus import consensus
+from bpnp.layers.estimators import MIN_INLIERS, Estimator, mean_residual, opencv_ransac, poselib_ransac
 from bpnp.types import SolveStats
 
-Backend = Literal["poselib", "opencv"]
-MIN_INLIERS = 4  # three points fit up to four poses exactly
+Backend = Literal["auto", "poselib", "opencv", "torch"]
+ESTIMATORS: dict[str, Estimator] = {"poselib": poselib_ransac, "opencv": opencv_ransac}
 
 
 class PairList(NamedTuple):
@@ -24,16 +22,6 @@ class PairList(NamedTuple):
     index3d: Int[Tensor, "b k"]
     probability: Float[Tensor, "b k"]
     mask: Bool[Tensor, "b k"]
-
-
-class _Found(NamedTuple):
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    inliers: NDArray[np.bool_]
-    iterations: int
-
-
-_Estimator = Callable[[NDArray[np.float64], NDArray[np.float64], float, int, int], _Found | None]
 
 
 def top_pairs(
@@ -63,115 +51,80 @@ def ransac_pnp(
     *,
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
-    backend: Backend = "poselib",
+    backend: Backend = "auto",
     pairs_factor: float = 1.5,
     threshold: float = 0.01,
-    max_iterations: int = 10_000,
+    max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
     """Pose from the k = pairs_factor * min(m, n) most probable pairs by RANSAC with a P3P solver.
 
     assignment: P; its order alone matters. points2d: normalised image coordinates. points3d: scene units.
     backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC, then EPnP on its
-        inliers: the paper's, with 1000 iterations.
+        inliers: the paper's, with 1000 iterations. EPnP is unreliable on points of one plane.
     threshold: largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
     seed: of the sampling, the same for each sample, so that a pose does not depend on the other samples.
 
-    Returns rotation, translation and stats (residual: mean reprojection error of the inliers; iterations: hypotheses,
-    or the bound on them where the backend does not tell). A sample for which no pose has 4 inliers holds NaN and
-    `converged` False. No gradient: the pose only starts a solver that has one.
+    Returns rotation, translation and stats (residual: mean reprojection error of the inliers, root mean square for
+    "torch"; iterations: hypotheses, or the bound on them where the backend does not tell). A sample for which no pose
+    has 4 inliers holds NaN and `converged` False. No gradient: the pose only starts a solver that has one.
     Raises ValueError for an unknown backend.
     """
-    if backend not in _ESTIMATORS:
-        raise ValueError(f"expected `backend` one of {sorted(_ESTIMATORS)}, got {backend!r}")
-    estimate = _ESTIMATORS[backend]
+    if backend not in ("auto", "torch", *ESTIMATORS):
+        raise ValueError(f"expected `backend` auto, poselib, opencv or torch, got {backend!r}")
+    if backend == "auto":
+        backend = "torch" if assignment.device.type == "cuda" else "poselib"
     pairs = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
-    image = _gather(points2d, pairs.index2d)
-    scene = _gather(points3d, pairs.index3d)
-    b = len(assignment)
+    image, scene = _pick(points2d, pairs.index2d), _pick(points3d, pairs.index3d)
+    if backend == "torch":
+        rotation, translation, stats = _together(image, scene, pairs, threshold, max_iterations, seed)
+    else:
+        rotation, translation, stats = _one_by_one(
+            ESTIMATORS[backend], image, scene, pairs, threshold, max_iterations, seed
+        )
+    return rotation.to(assignment), translation.to(assignment), stats
+
+
+def _pick(points: Float[Tensor, "b m d"], index: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
+    return points.detach().gather(1, index.unsqueeze(-1).expand(-1, -1, points.shape[-1])).double()
+
+
+def _together(
+    image: Tensor, scene: Tensor, pairs: PairList, threshold: float, hypotheses: int, seed: int
+) -> tuple[Tensor, Tensor, SolveStats]:
+    """All samples at once on their device, a fixed amount of work. Probability zero is a pair like any other."""
+    weights = pairs.probability.double().clamp_min(torch.finfo(torch.float64).tiny)
+    rotation, translation, inliers, score, found = consensus(
+        image, scene, weights, mask=pairs.mask, threshold=threshold, hypotheses=hypotheses, seed=seed
+    )
+    outliers = pairs.mask.sum(-1) - inliers.sum(-1)
+    # The score is the truncated sum of squares: what is left of it are the inliers'.
+    squared = (score - outliers * threshold**2).clamp_min(0) / inliers.sum(-1).clamp_min(1)
+    residual = torch.where(found, squared.sqrt(), torch.inf)
+    return rotation, translation, SolveStats(torch.full_like(outliers, hypotheses), residual, found)
+
+
+def _one_by_one(
+    estimate: Estimator, image: Tensor, scene: Tensor, pairs: PairList, threshold: float, iterations: int, seed: int
+) -> tuple[Tensor, Tensor, SolveStats]:
+    b = len(image)
     rotation, translation = np.full((b, 3, 3), np.nan), np.full((b, 3), np.nan)
-    iterations, residual, found = np.zeros(b, int), np.full(b, np.inf), np.zeros(b, bool)
+    taken, residual, found = np.zeros(b, int), np.full(b, np.inf), np.zeros(b, bool)
     for i, count in enumerate(pairs.mask.sum(-1).tolist()):
-        x, p = image[i, :count], scene[i, :count]
-        # Around the origin, so that a scene far from it loses no digits in the minimal solver.
-        centre = p.mean(0) if count else np.zeros(3)
-        result = estimate(x, p - centre, threshold, max_iterations, seed) if count >= MIN_INLIERS else None
-        if result is None:
+        if count < MIN_INLIERS:
             continue
-        error = _residual(result, x, p - centre)
-        if error is None:
+        x, p = image[i, :count].cpu().numpy(), scene[i, :count].cpu().numpy()
+        # Around the origin, so that a scene far from it loses no digits in the minimal solver.
+        centre = p.mean(0)
+        result = estimate(x, p - centre, threshold, iterations, seed)
+        error = None if result is None else mean_residual(result, x, p - centre)
+        if result is None or error is None:
             continue
         rotation[i], translation[i] = result.rotation, result.translation - result.rotation @ centre
-        iterations[i], residual[i], found[i] = result.iterations, error, True
-    stats = SolveStats(
-        torch.as_tensor(iterations, device=assignment.device),
-        torch.as_tensor(residual).to(assignment),
-        torch.as_tensor(found, device=assignment.device),
-    )
-    return torch.as_tensor(rotation).to(assignment), torch.as_tensor(translation).to(assignment), stats
-
-
-def _gather(points: Tensor, index: Tensor) -> NDArray[np.float64]:
-    picked = points.detach().gather(1, index.unsqueeze(-1).expand(-1, -1, points.shape[-1]))
-    return picked.double().cpu().numpy()
-
-
-def _residual(found: _Found, points2d: NDArray[np.float64], points3d: NDArray[np.float64]) -> float | None:
-    """Mean reprojection error of the inliers; None if the pose is not finite or too few inliers lie in front."""
-    if not (np.isfinite(found.rotation).all() and np.isfinite(found.translation).all()):
-        return None
-    y = points3d[found.inliers] @ found.rotation.T + found.translation
-    front = y[:, 2] > 0
-    if front.sum() < MIN_INLIERS:
-        return None
-    error = y[front, :2] / y[front, 2:] - points2d[found.inliers][front]
-    return float(np.linalg.norm(error, axis=-1).mean())
-
-
-def _poselib(
-    points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float, max_iterations: int, seed: int
-) -> _Found | None:
-    options = {
-        "max_reproj_error": threshold,
-        "max_iterations": max_iterations,
-        "min_iterations": min(1000, max_iterations),
-        "progressive_sampling": True,
-        "seed": seed,
-    }
-    camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}
-    pose, info = poselib.estimate_absolute_pose(points2d, points3d, camera, options, {})
-    return _Found(pose.R, pose.t, np.asarray(info["inliers"], bool), int(info["iterations"]))
-
-
-def _opencv(
-    points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float, max_iterations: int, seed: int
-) -> _Found | None:
-    del seed  # OpenCV's generator starts afresh at each call
-    try:
-        ok, rotvec, translation, inliers = cv2.solvePnPRansac(
-            points3d,
-            points2d,
-            np.eye(3),
-            None,
-            iterationsCount=max_iterations,
-            reprojectionError=threshold,
-            flags=cv2.SOLVEPNP_P3P,
-        )
-        if not ok or inliers is None or len(inliers) < MIN_INLIERS:
-            return None
-        chosen = inliers.ravel()
-        _, rotvec, translation = cv2.solvePnP(
-            points3d[chosen], points2d[chosen], np.eye(3), None, flags=cv2.SOLVEPNP_EPNP
-        )
-    except cv2.error:  # degenerate inliers: OpenCV has no pose to offer
-        return None
-    mask = np.zeros(len(points2d), bool)
-    mask[chosen] = True
-    rotation = np.asarray(cv2.Rodrigues(rotvec)[0], float)
-    return _Found(rotation, np.asarray(translation, float).ravel(), mask, max_iterations)
-
-
-_ESTIMATORS: dict[str, _Estimator] = {"poselib": _poselib, "opencv": _opencv}
+        taken[i], residual[i], found[i] = result.iterations, error, True
+    device = image.device
+    stats = SolveStats(*(torch.as_tensor(x, device=device) for x in (taken, residual, found)))
+    return torch.as_tensor(rotation, device=device), torch.as_tensor(translation, device=device), stats
 
 
 class RansacPnP(nn.Module):
@@ -180,10 +133,10 @@ class RansacPnP(nn.Module):
     def __init__(
         self,
         *,
-        backend: Backend = "poselib",
+        backend: Backend = "auto",
         pairs_factor: float = 1.5,
         threshold: float = 0.01,
-        max_iterations: int = 10_000,
+        max_iterations: int = 1000,
         seed: int = 0,
     ) -> None:
         super().__init__()

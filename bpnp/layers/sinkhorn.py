@@ -29,7 +29,8 @@ def sinkhorn(
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
     """Joint probability of every pair, and per-sample stats.
 
-    cost: M >= 0, any finite values. mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).
+    cost: M, infinite for a pair that cannot be.
+    mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).
     row_marginal, col_marginal: r and c, each summing to one over real points (default uniform); they receive gradients.
     mask2d, mask3d: True at real points; a padded row or column gets no mass.
     dustbin: cost of leaving a point unmatched, a number or a scalar tensor; None for a full assignment. With it the
@@ -42,11 +43,13 @@ def sinkhorn(
     Raises ValueError for mu <= 0 or a sample without a real point on either side.
     """
     mu_tensor = torch.as_tensor(mu, dtype=cost.dtype, device=cost.device)
-    if not isinstance(mu, Tensor) and not mu > 0:
-        raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+    if not bool(mu_tensor > 0):
+        raise ValueError(f"expected `mu` > 0, got {float(mu_tensor)}; try 0.1")
     b, m, n = cost.shape
     real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
+    if not bool((real2d.any(-1) & real3d.any(-1)).all()):
+        raise ValueError("expected at least one real point on each side of every sample, got an empty mask")
     rows = _uniform(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
     cols = _uniform(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
     if dustbin is not None:
@@ -58,8 +61,6 @@ def sinkhorn(
 
 
 def _uniform(real: Bool[Tensor, "b k"], dtype: torch.dtype) -> Float[Tensor, "b k"]:
-    if not bool(real.any(-1).all()):
-        raise ValueError("expected at least one real point on each side of every sample, got an empty mask")
     return real.to(dtype) / real.sum(-1, keepdim=True)
 
 
@@ -68,12 +69,12 @@ def _with_dustbin(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Append a bin to each side; point marginals scale to m/(m+n) and n/(m+n), the bins take the other side's share."""
     bin_cost = torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device)
-    m, n = real2d.sum(-1, keepdim=True), real3d.sum(-1, keepdim=True)
+    m, n = (real.sum(-1, keepdim=True).to(cost.dtype) for real in (real2d, real3d))
     share2d, share3d = m / (m + n), n / (m + n)
     cost = torch.cat([cost, bin_cost.expand(*cost.shape[:2], 1)], -1)
     cost = torch.cat([cost, bin_cost.expand(cost.shape[0], 1, cost.shape[2])], -2)
-    rows = torch.cat([rows * share2d, share3d.to(rows.dtype)], -1)
-    cols = torch.cat([cols * share3d, share2d.to(cols.dtype)], -1)
+    rows = torch.cat([rows * share2d, share3d], -1)
+    cols = torch.cat([cols * share3d, share2d], -1)
     return cost, rows, cols
 
 
@@ -91,10 +92,14 @@ class Sinkhorn(nn.Module):
         max_iterations: int = 1000,
     ) -> None:
         super().__init__()
+        if not mu > 0:
+            raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+        if learn_dustbin and dustbin is None:
+            raise ValueError("expected a `dustbin` cost to learn from, got None; try 1.0")
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu))) if learn_mu else None
         self.mu = mu
         self.dustbin = dustbin
-        self.bin_cost = nn.Parameter(torch.tensor(float(dustbin or 0.0))) if learn_dustbin else None
+        self.bin_cost = nn.Parameter(torch.tensor(float(dustbin))) if learn_dustbin and dustbin is not None else None
         self.tolerance = tolerance
         self.max_iterations = max_iterations
 

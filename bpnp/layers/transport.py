@@ -104,7 +104,7 @@ def _anneal(cost: Tensor, rows: Tensor, cols: Tensor, mu: Tensor) -> tuple[Tenso
     Log-domain sweeps at falling temperatures, each sample from its own range of costs down to mu, where one sweep
     ends it. A point without mass has the potential -inf.
     """
-    real = (rows > 0).unsqueeze(-1) & (cols > 0).unsqueeze(-2)
+    real = (rows > 0).unsqueeze(-1) & (cols > 0).unsqueeze(-2) & cost.isfinite()
     highest = cost.masked_fill(~real, -math.inf).amax((-2, -1))
     lowest = cost.masked_fill(~real, math.inf).amin((-2, -1))
     warm = (COARSEST * (highest - lowest)).clamp_min(mu)

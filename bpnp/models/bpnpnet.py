@@ -32,8 +32,9 @@ class BPnPNet(nn.Module):
         learn_mu: whether mu is learned.
         dustbin: cost of leaving a point unmatched; null for a full assignment.
         sinkhorn_tolerance: L1 error of the marginals at which the transport stops.
-        ransac_backend: poselib (LO-RANSAC, PROSAC order) or opencv (the paper's P3P-RANSAC and EPnP).
-        ransac_iterations: most hypotheses; the paper has 1000.
+        ransac_backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole
+            batch on its device), or auto (torch on cuda, else poselib).
+        ransac_iterations: most hypotheses, as in the paper.
         threshold: inlier threshold of RANSAC, normalised image coordinates.
         pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
         pnp_method: newton, or lbfgs as in the paper.
@@ -55,8 +56,8 @@ class BPnPNet(nn.Module):
         learn_mu: bool = False,
         dustbin: float | None = None,
         sinkhorn_tolerance: float = 1e-6,
-        ransac_backend: Backend = "poselib",
-        ransac_iterations: int = 10_000,
+        ransac_backend: Backend = "auto",
+        ransac_iterations: int = 1000,
         threshold: float = 0.01,
         pairs_factor: float = 1.5,
         pnp_method: Method = "newton",
@@ -96,7 +97,8 @@ class BPnPNet(nn.Module):
         return Prediction(assignment, assignment_stats, {"ransac": start, "pnp": refined})
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
-        """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2]."""
+        """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2], in the network's dtype."""
+        batch = batch.to(self.features2d.enter.weight.dtype)
         points3d = normalise_points3d(batch.points3d, batch.mask3d) if self.normalise_scene else batch.points3d
         z2d = self.features2d(self.image_scale * batch.points2d, batch.mask2d)
         z3d = self.features3d(self.align(points3d, batch.mask3d), batch.mask3d)
