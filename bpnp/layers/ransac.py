@@ -117,7 +117,7 @@ def _one_by_one(
         # Around the origin, so that a scene far from it loses no digits in the minimal solver.
         centre = p.mean(0)
         result = estimate(x, p - centre, threshold, iterations, seed)
-        error = None if result is None else mean_residual(result, x, p - centre)
+        error = None if result is None else mean_residual(result, x, p - centre, threshold)
         if result is None or error is None:
             continue
         rotation[i], translation[i] = result.rotation, result.translation - result.rotation @ centre
