@@ -1,4 +1,4 @@
-"""The plain commands around data and weights: `bpnp convert-weights`."""
+"""The plain commands around data and weights: `bpnp prepare` and `bpnp convert-weights`."""
 
 import argparse
 import logging
@@ -8,7 +8,9 @@ from typing import Any
 
 import lightning
 import torch
+from rich.console import Console
 
+from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
 from bpnp.models.released import load_released
 from bpnp.task import BlindPnPTask
 
@@ -50,3 +52,72 @@ def convert_weights(arguments: list[str]) -> None:
     finally:
         temporary.unlink(missing_ok=True)
     logger.info("wrote %s", chosen.out)
+
+
+def prepare(arguments: list[str]) -> None:
+    """`bpnp prepare {modelnet40,megadepth} SOURCE`: a data set as it was published, as one memory-mapped store.
+
+    Raises ValueError or OSError as `prepare_meshes` and `prepare_colmap` do.
+    """
+    chosen = _prepare_parser().parse_args(arguments)
+    if chosen.dataset == "modelnet40":
+        prepared = prepare_meshes(
+            chosen.source,
+            chosen.output,
+            points=chosen.points,
+            normalisation=chosen.normalisation,
+            processes=chosen.processes,
+        )
+    else:
+        prepared = prepare_colmap(
+            chosen.source,
+            chosen.output,
+            min_points=chosen.min_points,
+            clutter=chosen.clutter,
+            processes=chosen.processes,
+        )
+    _show(prepared)
+
+
+def _prepare_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="bpnp prepare",
+        description="Pack a data set, once. A run that was killed goes on where it was when it is started again.",
+    )
+    datasets = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
+    meshes = datasets.add_parser("modelnet40", help="ModelNet40, or any folder or zip of meshes in its layout")
+    meshes.add_argument("--points", type=_positive, default=2048, help="surface samples of a mesh (default: 2048)")
+    meshes.add_argument("--normalisation", choices=("unit_sphere", "unit_cube", "none"), default="unit_sphere")
+    colmap = datasets.add_parser("megadepth", help="MegaDepth, or any folder of COLMAP models")
+    colmap.add_argument("--min-points", type=_positive, default=4, help="fewest true pairs of an image (default: 4)")
+    colmap.add_argument(
+        "--clutter", type=float, default=0.0, help="natural clutter to keep, as a ratio to the true pairs (default: 0)"
+    )
+    for name, command, what in (
+        ("modelnet40", meshes, "ModelNet40.zip, its folder, or the folder of ply_data_*.h5"),
+        ("megadepth", colmap, "the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin"),
+    ):
+        command.add_argument("source", type=Path, metavar="SOURCE", help=what)
+        command.add_argument(
+            "--output", type=Path, default=Path("data", name), help="new folder (default: %(default)s)"
+        )
+        command.add_argument("--processes", type=_positive, default=os.cpu_count() or 1, help="(default: %(default)s)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"expected a number of 1 or more, got {number}")
+    return number
+
+
+def _show(prepared: Prepared) -> None:
+    console = Console()
+    counts = ", ".join(f"{count:,} {what}" for what, count in prepared.counts.items())
+    console.print(f"{prepared.folder}: {counts}", highlight=False, soft_wrap=True)
+    if prepared.skipped:
+        listed = prepared.folder / "manifest.json"
+        console.print(f"left out {len(prepared.skipped)}, all listed in {listed}; such as:", soft_wrap=True)
+        for name, reason in list(prepared.skipped.items())[:10]:
+            console.print(f"  {name}: {reason}", highlight=False, soft_wrap=True, markup=False)

@@ -11,7 +11,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.batching import PairSource
-from bpnp.datamodules.meshes import MeshDataModule, MeshSource, hold_out
+from bpnp.datamodules.mesh_source import MeshSource, hold_out
+from bpnp.datamodules.meshes import MeshDataModule
 from bpnp.datamodules.pools import SurfacePools
 from bpnp.datamodules.views import Views, draw_pair
 

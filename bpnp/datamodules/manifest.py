@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,13 +26,12 @@ def is_store(folder: str | Path) -> bool:
 def new_store(folder: Path) -> Iterator[Path]:
     """A folder to fill; at the end, if nothing was raised, it is renamed to `folder` in one step.
 
-    Until then it is ``.<name>.unfinished`` beside it; what an earlier, killed process left there is removed.
+    Until then it is ``.<name>.<process>.unfinished`` beside it, and only that is left by a process that is killed.
     Raises StoreError if `folder` exists.
     """
     if folder.exists():
         raise StoreError(f"expected a new folder to write to, got {folder}, which exists; try another or remove it")
-    temporary = folder.with_name(f".{folder.name}.unfinished")
-    shutil.rmtree(temporary, ignore_errors=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.unfinished")
     temporary.mkdir(parents=True)
     try:
         yield temporary
@@ -85,6 +84,12 @@ def read_manifest(folder: Path, *, kind: str) -> dict[str, Any]:
         if "digest" in entry and _file_digest(path) != entry["digest"]:
             raise StoreError(f"expected {path} as it was written, got other bytes; try copying or preparing again")
     return manifest
+
+
+def fingerprint(files: Iterable[Path]) -> str:
+    """A digest of the names, sizes and times of files: whether they are still the same."""
+    stats = [(path.name, path.stat().st_size, path.stat().st_mtime_ns) for path in files]
+    return hashlib.blake2b(json.dumps(stats).encode(), digest_size=16).hexdigest()
 
 
 def _file_digest(path: Path) -> str:

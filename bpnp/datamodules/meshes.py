@@ -1,6 +1,5 @@
 """Meshes seen by virtual cameras: ModelNet40, any folder in its layout, or procedural shapes."""
 
-import warnings
 from pathlib import Path
 from typing import Literal
 
@@ -9,74 +8,19 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import Pair, pair_loader
+from bpnp.datamodules.batching import PairSource, pair_loader
+from bpnp.datamodules.manifest import StoreError, is_store
 from bpnp.datamodules.mesh_folder import folder_pools
+from bpnp.datamodules.mesh_source import MeshSource, hold_out
+from bpnp.datamodules.outliers import Outliers, harder
 from bpnp.datamodules.pools import SurfacePools
 from bpnp.datamodules.procedural import SPLITS, procedural_pools
+from bpnp.datamodules.surface_store import open_surfaces
 from bpnp.datamodules.surfaces import Normalisation
-from bpnp.datamodules.views import MIN_SEEN, Views, draw_pair
+from bpnp.datamodules.views import MIN_SEEN, Views
 from bpnp.types import Batch
 
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
-
-
-def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split range(count) at random into training rows and validation rows, at least one of each, both sorted.
-
-    Raises ValueError for a fraction outside (0, 1) or fewer than two rows.
-    """
-    if not 0 < fraction < 1:
-        raise ValueError(f"expected `val_fraction` between 0 and 1, got {fraction}")
-    if count < 2:
-        raise ValueError(f"expected at least 2 training meshes, to hold one out for validation, got {count}")
-    held = min(count - 1, max(1, round(fraction * count)))
-    order = np.random.default_rng(seed).permutation(count)
-    return np.sort(order[held:]), np.sort(order[:held])
-
-
-class MeshSource:
-    """A `PairSource`: pair i is view i // k of mesh rows[i % k], k meshes in all.
-
-    A pair is a function of (seed, split, index), and of the epoch too with `fresh_views`.
-    Warns if the views may lose points behind the camera. Raises ValueError for no pairs.
-    """
-
-    def __init__(
-        self,
-        pools: SurfacePools,
-        rows: NDArray[np.int64],
-        *,
-        num_pairs: int,
-        num_points: int,
-        views: Views,
-        seed: int,
-        split: str,
-        fresh_views: bool = False,
-    ) -> None:
-        if num_pairs < 1:
-            raise ValueError(f"expected at least one {split} pair, got {num_pairs}")
-        if not views.sees_all(pools.radius):
-            warnings.warn(
-                f"the {split} meshes reach {pools.radius:.3g} from their origin: points that fall behind a camera at "
-                f"`distance` {views.distance} get no 2D point; try normalisation unit_sphere or a larger distance",
-                stacklevel=2,
-            )
-        # fewer pairs than meshes: a fair sample of them, the first ones would be all of one class
-        rng = np.random.default_rng(seed)
-        self.rows = np.sort(rng.choice(rows, num_pairs, replace=False)) if num_pairs < len(rows) else rows
-        self.pools, self.num_pairs, self.num_points, self.views = pools, num_pairs, num_points, views
-        self.seed, self.split, self.fresh_views = seed, split, fresh_views
-
-    @property
-    def sizes(self) -> NDArray[np.int64]:
-        return np.full(self.num_pairs, self.num_points)
-
-    def pair(self, index: int, epoch: int) -> Pair:
-        view, mesh = divmod(index, len(self.rows))
-        row = self.rows[mesh]
-        rng = np.random.default_rng([self.seed, SPLITS.index(self.split), epoch if self.fresh_views else 0, index])
-        name = f"{self.pools.names[row]}#{view}"
-        return draw_pair(name, self.pools.points[row], num_points=self.num_points, views=self.views, rng=rng)
 
 
 class MeshDataModule(LightningDataModule):
@@ -87,8 +31,8 @@ class MeshDataModule(LightningDataModule):
     loaders.
 
     Args:
-        root: folder of meshes in ModelNet40's layout, <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural
-            shapes.
+        root: folder that `bpnp prepare modelnet40` made, or folder of meshes in ModelNet40's layout,
+            <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
         train_pairs: training pairs; pair i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed pairs of the paper.
         val_fraction: share of the training meshes that is held out for validation.
@@ -106,6 +50,8 @@ class MeshDataModule(LightningDataModule):
         distance: added to the translation along the optical axis, scene units.
         focal: focal length, pixels.
         noise_px: standard deviation of the noise on 2D points, pixels.
+        train_outliers: outliers and occlusion in training and validation; none for none.
+        test_outliers: the same in testing and prediction.
         train_shapes: procedural training shapes; like val_shapes and test_shapes only used without root.
         val_shapes: procedural validation shapes; with root val_fraction counts.
         test_shapes: procedural test shapes.
@@ -134,6 +80,8 @@ class MeshDataModule(LightningDataModule):
         distance: float = 4.5,
         focal: float = 800.0,
         noise_px: float = 2.0,
+        train_outliers: Outliers | None = None,
+        test_outliers: Outliers | None = None,
         train_shapes: int = 1000,
         val_shapes: int = 100,
         test_shapes: int = 200,
@@ -154,11 +102,12 @@ class MeshDataModule(LightningDataModule):
         self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
         self.views = Views(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
+        self.outliers = {"train": train_outliers, "val": train_outliers, "test": test_outliers}
         self.fresh_views, self.val_fraction, self.seed = fresh_views, val_fraction, seed
         self.batch_size = batch_size
         self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
         self.num_workers = num_workers
-        self.sources: dict[str, MeshSource] = {}
+        self.sources: dict[str, PairSource] = {}
 
     def prepare_data(self) -> None:
         """Build the caches in one process, for `setup` to open in all."""
@@ -191,12 +140,13 @@ class MeshDataModule(LightningDataModule):
             num_workers=self.num_workers,
         )
 
-    def _open(self, stage: str | None) -> dict[str, MeshSource]:
+    def _open(self, stage: str | None) -> dict[str, PairSource]:
         return {split: self._source(split) for split in (SPLITS if stage is None else STAGES[stage])}
 
-    def _source(self, split: str) -> MeshSource:
+    def _source(self, split: str) -> PairSource:
         pools, rows = self._meshes(split)
-        return MeshSource(
+        fresh = self.fresh_views and split == "train"
+        source = MeshSource(
             pools,
             rows,
             num_pairs=len(rows) if (pairs := self.num_pairs[split]) is None else pairs,
@@ -204,8 +154,9 @@ class MeshDataModule(LightningDataModule):
             views=self.views,
             seed=self.seed,
             split=split,
-            fresh_views=self.fresh_views and split == "train",
+            fresh_views=fresh,
         )
+        return harder(source, self.outliers[split], seed=self.seed, fresh=fresh)
 
     def _meshes(self, split: str) -> tuple[SurfacePools, NDArray[np.int64]]:
         """Surface samples, and which of their rows belong to a split."""
@@ -219,14 +170,21 @@ class MeshDataModule(LightningDataModule):
                 cache_dir=self.cache_dir,
             )
             return pools, np.arange(len(pools))
-        pools = folder_pools(
-            self.root,
-            "test" if split == "test" else "train",
-            pool_size=self.pool_size,
-            normalisation=self.normalisation,
-            cache_dir=self.cache_dir,
-        )
+        pools = self._pools(self.root, "test" if split == "test" else "train")
         if split == "test":
             return pools, np.arange(len(pools))
         training, held_out = hold_out(len(pools), self.val_fraction, seed=self.seed)
         return pools, training if split == "train" else held_out
+
+    def _pools(self, root: Path, split: str) -> SurfacePools:
+        if not is_store(root):
+            return folder_pools(
+                root, split, pool_size=self.pool_size, normalisation=self.normalisation, cache_dir=self.cache_dir
+            )
+        store = open_surfaces(root)
+        if (kept := store.parameters["normalisation"]) != self.normalisation:
+            raise StoreError(
+                f"expected meshes of `normalisation` {self.normalisation}, got {kept} in {root}; try {kept}, or "
+                f"preparing again with --normalisation {self.normalisation}"
+            )
+        return store.pools(split, pool_size=self.pool_size)

@@ -86,7 +86,10 @@ class PairStore:
         )
 
     def _map(self, name: str, dtype: np.dtype) -> NDArray[Any]:
-        return np.asarray(np.memmap(self.folder / name, dtype, mode="r"))  # still mapped, no subclass
+        path = self.folder / name
+        if path.stat().st_size == 0:  # nothing to map
+            return np.empty(0, dtype)
+        return np.asarray(np.memmap(path, dtype, mode="r"))  # still mapped, no subclass
 
     def _column(self, name: str) -> NDArray[np.int64]:
         return self._index[name].astype(np.int64)
@@ -102,7 +105,7 @@ def write_pairs(
     """Pack (scene, pair) after (scene, pair) into the new `folder`, in constant memory; complete or not there at all.
 
     parameters: kept in the manifest, must be JSON. skipped: what could not be used, and why.
-    Raises StoreError if the folder exists or there is no pair.
+    Raises StoreError if the folder exists.
     """
     with new_store(folder) as unfinished:
         totals = Counter[str]()
@@ -127,16 +130,14 @@ def write_pairs(
                 record["crc32"] = _checksum(*arrays)
                 record["focal"], record["rotation"] = pair.focal, pair.rotation
                 record["translation"] = pair.translation
-                for file, content in zip(files, (*(a.tobytes() for a in arrays), record.tobytes(), name), strict=True):
-                    file.write(content)
+                for file, part in zip(files, (*(a.tobytes() for a in arrays), record.tobytes(), name), strict=True):
+                    file.write(part)
                 per_scene[scene] += 1
                 totals.update(points2d=len(arrays[0]), points3d=len(arrays[1]), matched=int(record["matched"]))
                 totals["name bytes"] += len(name)
         finally:
             for file in files:
                 file.close()
-        if not scenes:
-            raise StoreError(f"expected at least one pair to write to {folder}, got none")
         counts = {"pairs": per_scene.total(), **{k: v for k, v in totals.items() if k != "name bytes"}}
         content = {
             "kind": KIND,

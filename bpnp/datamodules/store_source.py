@@ -1,5 +1,6 @@
 """The pairs of a packed store as a source for training and testing."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.batching import Pair
 from bpnp.datamodules.manifest import StoreError
-from bpnp.datamodules.outliers import select
+from bpnp.datamodules.outliers import Side, select
 from bpnp.datamodules.pair_store import PairStore
 
 
@@ -16,14 +17,16 @@ class StoreSource:
     """A `PairSource`: rows of a store, with as many of their points as wanted, each side in random order.
 
     rows: positions of the pairs in the store.
-    min_points: pairs with fewer true pairs are left out; how many is in `skipped`.
+    min_points: pairs with fewer true pairs are left out; how many is warned about and kept in `skipped`.
     max_points: at most this many true pairs of a pair, drawn without replacement; None for all.
-    clutter: points without a partner, as a ratio to the true pairs kept, as many as the store has; drawn on both sides.
+    clutter: points without a partner, as a ratio to the true pairs kept, or as many as the store has.
+    clutter_side: which sides get it, "both", "2d" or "3d".
     rotate: turn the 3D points by a uniformly random rotation.
     fresh: draw anew in every epoch, else the same each time.
     seed: a pair is a function of (seed, epoch, index).
 
-    Raises StoreError if no pair is left.
+    Raises ValueError for `max_points` below `min_points`, StoreError if no pair is left or the store was made with less
+    clutter.
     """
 
     def __init__(
@@ -34,10 +37,19 @@ class StoreSource:
         min_points: int = 4,
         max_points: int | None = None,
         clutter: float = 0.0,
+        clutter_side: Side = "both",
         rotate: bool = False,
         fresh: bool = False,
         seed: int = 0,
     ) -> None:
+        if max_points is not None and max_points < min_points:
+            raise ValueError(f"expected `max_points` of at least `min_points` = {min_points}, got {max_points}")
+        stored = store.parameters.get("clutter", np.inf)
+        if clutter > stored:
+            raise StoreError(
+                f"expected `clutter` of at most {stored}, what {store.folder} was made with, got {clutter}; try that, "
+                f"or preparing again with --clutter {clutter}"
+            )
         self.store = store
         self.rows = rows[store.matched[rows] >= min_points]
         self.skipped = len(rows) - len(self.rows)
@@ -46,16 +58,23 @@ class StoreSource:
                 f"expected pairs of {min_points} or more matched points in {store.folder}, got none of {len(rows)}; "
                 "try a smaller `min_points` or other scenes"
             )
-        self.max_points, self.clutter = max_points, clutter
+        if self.skipped:
+            warnings.warn(
+                f"skipped {self.skipped} of {len(rows)} pairs of {store.folder}: fewer than {min_points} true pairs",
+                stacklevel=2,
+            )
+        self.max_points = max_points
+        self.clutter2d, self.clutter3d = clutter * (clutter_side != "3d"), clutter * (clutter_side != "2d")
         self.rotate, self.fresh, self.seed = rotate, fresh, seed
 
     @property
     def sizes(self) -> NDArray[np.int64]:
         """Points of the larger side of each pair."""
-        kept = self._kept(self.store.matched[self.rows])
-        count2d, count3d = self.store.count2d[self.rows], self.store.count3d[self.rows]
-        free = np.maximum(count2d, count3d) - self.store.matched[self.rows]
-        return kept + np.minimum(free, np.rint(self.clutter * kept).astype(np.int64))
+        matched = self.store.matched[self.rows]
+        kept = self._kept(matched)
+        extra2d = np.minimum(self.store.count2d[self.rows] - matched, np.rint(self.clutter2d * kept))
+        extra3d = np.minimum(self.store.count3d[self.rows] - matched, np.rint(self.clutter3d * kept))
+        return kept + np.maximum(extra2d, extra3d).astype(np.int64)
 
     def pair(self, index: int, epoch: int) -> Pair:
         rng = np.random.default_rng([self.seed, epoch if self.fresh else 0, index])
@@ -64,9 +83,9 @@ class StoreSource:
         true3d = true3d[: self._kept(len(true3d))]
         free2d = np.setdiff1d(np.arange(len(pair.points2d)), pair.match3d)
         free3d = np.flatnonzero(pair.match3d < 0)
-        extra = round(self.clutter * len(true3d))
-        kept2d = np.concatenate([np.unique(pair.match3d[true3d]), rng.permutation(free2d)[:extra]])
-        kept3d = np.concatenate([true3d, rng.permutation(free3d)[:extra]])
+        extra2d, extra3d = round(self.clutter2d * len(true3d)), round(self.clutter3d * len(true3d))
+        kept2d = np.concatenate([np.unique(pair.match3d[true3d]), rng.permutation(free2d)[:extra2d]])
+        kept3d = np.concatenate([true3d, rng.permutation(free3d)[:extra3d]])
         pair = select(pair, rng.permutation(kept2d), rng.permutation(kept3d))
         if not self.rotate:
             return pair

@@ -1,5 +1,6 @@
 """Triangle meshes: reading them, the primitives procedural shapes are made of, and uniform samples of their surface."""
 
+import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -53,18 +54,23 @@ def read_mesh(path: Path) -> Mesh:
     vertices.
     """
     try:
-        return _read_off(path) if path.suffix.lower() == ".off" else _read_other(path)
+        return parse_mesh(path.read_bytes(), path.suffix)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 
 
-def _read_off(path: Path) -> Mesh:
+def parse_mesh(content: bytes, suffix: str) -> Mesh:
+    """The mesh in the bytes of a file with this suffix, as `read_mesh`; the MeshError names no file."""
+    return _parse_off(content) if suffix.lower() == ".off" else _parse_other(content, suffix.lower())
+
+
+def _parse_off(content: bytes) -> Mesh:
     """The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
 
     trimesh reads OFF too, but five times slower, and takes a file that ends early for one with fewer faces.
     """
-    text = path.read_text(encoding="utf-8-sig", errors="replace")
-    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip())]
+    text = content.decode("utf-8-sig", errors="replace")
+    lines = [stripped for line in text.splitlines() if (stripped := line.partition("#")[0].strip())]
     header = re.match(r"(?:ST)?C?N?OFF\b|OFF(?=\d)", lines[0]) if lines else None
     if header is None:
         raise MeshError(f"expected `OFF` in the first line, got {text[:20]!r}")
@@ -97,14 +103,15 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
     return np.concatenate(fans)
 
 
-def _read_other(path: Path) -> Mesh:
-    if path.stat().st_size == 0:
+def _parse_other(content: bytes, suffix: str) -> Mesh:
+    if not content:
         raise MeshError("expected a mesh, got an empty file")
     try:
         # force: one mesh of all parts, each where the scene puts it; process: no search for equal vertices
-        mesh = trimesh.load(path, force="mesh", process=False, skip_materials=True)
+        file = io.BytesIO(content)
+        mesh = trimesh.load(file, file_type=suffix[1:], force="mesh", process=False, skip_materials=True)
     except Exception as error:
-        raise MeshError(f"expected a {path.suffix} mesh, got a file that trimesh cannot read ({error})") from error
+        raise MeshError(f"expected a {suffix} mesh, got a file that trimesh cannot read ({error})") from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
     return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))

@@ -1,0 +1,181 @@
+"""Where a data set of meshes comes from: a folder, a zip that stays packed, or HDF5 files of sampled points."""
+
+import re
+import zipfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.datamodules.mesh_folder import LAYOUT, mesh_files
+from bpnp.datamodules.surfaces import (
+    SUFFIXES,
+    MeshError,
+    Normalisation,
+    normalise,
+    parse_mesh,
+    read_mesh,
+    sample_surface,
+)
+
+SPLITS = ("train", "test")
+ENTRY = re.compile(rf"(?:.*/)?([^/]+/(?:{'|'.join(SPLITS)})/[^/.][^/]*)({'|'.join(map(re.escape, SUFFIXES))})", re.I)
+
+
+@runtime_checkable
+class MeshArchive(Protocol):
+    """Meshes by name, ``<class>/<split>/<stem>``; the training meshes come first. Can be sent to another process."""
+
+    @property
+    def names(self) -> Sequence[str]: ...
+
+    @property
+    def files(self) -> Sequence[Path]:
+        """What the meshes are read from."""
+
+    def part(self, names: Sequence[str]) -> "MeshArchive":
+        """Only these meshes."""
+
+    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
+        """`count` normalised surface samples (count, 3), a function of the mesh and its name. Raises MeshError."""
+
+
+@dataclass(frozen=True)
+class MeshFiles:
+    """Mesh files, in a folder or (`archive`) in a zip: `entries` gives the path of each name."""
+
+    entries: dict[str, str]
+    archive: Path | None = None
+
+    @property
+    def names(self) -> Sequence[str]:
+        return list(self.entries)
+
+    @property
+    def files(self) -> Sequence[Path]:
+        return [Path(path) for path in self.entries.values()] if self.archive is None else [self.archive]
+
+    def part(self, names: Sequence[str]) -> "MeshFiles":
+        return replace(self, entries={name: self.entries[name] for name in names})
+
+    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
+        mesh = read_mesh(Path(self.entries[name])) if self.archive is None else self._packed(name)
+        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        return normalise(sample_surface(mesh, count, rng), mode)
+
+    def _packed(self, name: str) -> Any:
+        assert self.archive is not None
+        entry = self.entries[name]
+        try:
+            return parse_mesh(_open(self.archive).read(entry), Path(entry).suffix)
+        except (MeshError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+            raise MeshError(f"{self.archive}/{entry}: {error}") from error
+
+
+@dataclass(frozen=True)
+class SampledFiles:
+    """HDF5 files of sampled points (``modelnet40_ply_hdf5_2048``): `rows` gives the file and the row of each name."""
+
+    rows: dict[str, tuple[Path, int]]
+
+    @property
+    def names(self) -> Sequence[str]:
+        return list(self.rows)
+
+    @property
+    def files(self) -> Sequence[Path]:
+        return sorted({path for path, _ in self.rows.values()})
+
+    def part(self, names: Sequence[str]) -> "SampledFiles":
+        return SampledFiles({name: self.rows[name] for name in names})
+
+    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
+        path, row = self.rows[name]
+        points = np.asarray(_open(path)["data"][row], np.float64)
+        if points.shape[0] < count or points.shape[1:] != (3,) or not np.isfinite(points).all():
+            raise MeshError(f"{path}: expected {count} finite points, got shape {points.shape} in row {row}")
+        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        return normalise(rng.permutation(points)[:count], mode)
+
+
+def open_archive(source: Path) -> MeshArchive:
+    """The meshes of `source`: ModelNet40.zip, its folder, the folder of its HDF5 files, or any folder in its layout.
+
+    Raises ValueError that names the file or folder: missing, empty, foreign, or h5py not installed.
+    """
+    if source.is_file():
+        return _zip_archive(source)
+    if not source.is_dir():
+        raise ValueError(f"expected ModelNet40.zip or a folder with {LAYOUT}, got {source}, which is not there")
+    inside = sorted(path for path in source.iterdir() if path.is_dir())
+    for folder in (source, *inside):
+        if list(folder.glob("ply_data_*.h5")):
+            return _sampled_archive(folder)
+    roots = [folder for folder in (source, *inside) if any(next(folder.glob(f"*/{s}"), None) for s in SPLITS)]
+    if not roots:
+        raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
+    entries = {}
+    for split in SPLITS:
+        for path in mesh_files(roots[0], split):
+            entries[path.relative_to(roots[0]).with_suffix("").as_posix()] = str(path)
+    return MeshFiles(entries)
+
+
+def _zip_archive(path: Path) -> MeshFiles:
+    try:
+        found = [ENTRY.fullmatch(entry) for entry in _open(path).namelist() if "__MACOSX" not in entry]
+    except (zipfile.BadZipFile, OSError) as error:
+        raise ValueError(f"expected a zip of meshes, got {path} ({error}); try downloading it again") from error
+    entries = {match[1]: match[0] for match in found if match}
+    if not entries:
+        raise ValueError(f"expected meshes {LAYOUT} in {path}, got none; try ModelNet40.zip")
+    order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2].lower()), name))
+    return MeshFiles({name: entries[name] for name in order}, archive=path)
+
+
+def _sampled_archive(folder: Path) -> SampledFiles:
+    shapes = folder / "shape_names.txt"
+    if not shapes.is_file():
+        raise ValueError(f"expected {shapes} beside the HDF5 files, got none; try unpacking the archive again")
+    classes = shapes.read_text(encoding="utf-8").split()
+    rows: dict[str, tuple[Path, int]] = {}
+    for split in SPLITS:
+        for path in sorted(folder.glob(f"ply_data_{split}*.h5")):
+            try:
+                file = _open(path)
+                labels, data = np.asarray(file["label"]).reshape(-1), file["data"]
+                names = [f"{classes[label]}/{split}/{path.stem}-{row:04d}" for row, label in enumerate(labels)]
+            except (OSError, KeyError, IndexError) as error:
+                raise ValueError(
+                    f"expected `data` and `label` in {path}, got a file that has none or cannot be read ({error}); try "
+                    "unpacking the archive again"
+                ) from error
+            if data.ndim != 3 or len(data) != len(names):
+                raise ValueError(f"expected a label for each shape, got {len(names)} for {data.shape} in {path}")
+            rows |= {name: (path, row) for row, name in enumerate(names)}
+    return SampledFiles(rows)
+
+
+def _open(path: Path) -> Any:
+    return _opened(path, path.stat().st_size, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=8)
+def _opened(path: Path, size: int, time: int) -> Any:
+    """A file of many meshes, kept open for the next one; a file that has changed is another."""
+    del size, time
+    return zipfile.ZipFile(path) if path.suffix != ".h5" else _h5py().File(path, "r")
+
+
+def _h5py() -> ModuleType:
+    try:
+        import h5py  # type: ignore[import-untyped]
+    except ImportError as error:
+        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error
+    return h5py
