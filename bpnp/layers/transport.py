@@ -41,20 +41,31 @@ def solve_plan(
     radius = torch.full_like(residual, NEWTON_RADIUS)
     # Samples that are not done have all taken the same steps: which ones share the batch does not matter to any.
     taken = 1
-    while taken < max_iterations and len(some := (residual > tolerance).nonzero().squeeze(-1)):
+    enough = min(STEPS_IN_FLOAT32, max_iterations) if plan.dtype == torch.float32 else max_iterations
+    while taken < enough and len(some := (residual > tolerance).nonzero().squeeze(-1)):
         part, part_rows, part_cols = plan[some], rows[some], cols[some]
-        if taken >= STEPS_IN_FLOAT32:
-            part, part_rows, part_cols = part.double(), part_rows.double(), part_cols.double()
         sweeps = 1
         if taken < SWEEPS_BEFORE_NEWTON:
             sweeps = min(SWEEPS_BEFORE_NEWTON, max_iterations) - taken
         else:
             part, radius[some] = _newton(part, part_rows, part_cols, radius[some])
-        part, part_residual, part_sweeps = _sweep(part, part_rows, part_cols, tolerance, sweeps)
+        part, residual[some], part_sweeps = _sweep(part, part_rows, part_cols, tolerance, sweeps)
         taken += sweeps
-        residual[some] = part_residual.to(residual.dtype)
         iterations[some] += part_sweeps
-        plan = plan.index_copy(0, some, part.to(plan.dtype)) if len(some) < len(plan) else part.to(plan.dtype)
+        plan = plan.index_copy(0, some, part) if len(some) < len(plan) else part
+    # Afresh in float64: entries that underflow in float32 do not come back.
+    if taken < max_iterations and len(some := (residual > tolerance).nonzero().squeeze(-1)):
+        exact, stats = solve_plan(
+            cost[some].double(),
+            rows[some].double(),
+            cols[some].double(),
+            mu=mu.double(),
+            tolerance=tolerance,
+            max_iterations=max_iterations - taken,
+        )
+        plan = plan.index_copy(0, some, exact.to(plan.dtype))
+        residual[some] = stats.residual.to(residual.dtype)
+        iterations[some] += stats.iterations
     return plan, SolveStats(iterations, residual, residual <= tolerance)
 
 

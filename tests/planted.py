@@ -1,0 +1,84 @@
+"""Planted problems: point sets whose pose and correspondences are known."""
+
+from dataclasses import dataclass
+
+import roma
+import torch
+from torch import Tensor
+
+from bpnp.geometry import bearings, project, transform
+from bpnp.types import Batch
+
+
+@dataclass(frozen=True)
+class Planted:
+    """b pairs of m 2D and n 3D points; `match3d` (b, n) is the 2D point of each 3D point, -1 for none."""
+
+    points2d: Tensor
+    points3d: Tensor
+    rotation: Tensor
+    translation: Tensor
+    match3d: Tensor
+
+    @property
+    def pose(self) -> tuple[Tensor, Tensor]:
+        return self.rotation, self.translation
+
+    @property
+    def bearings(self) -> Tensor:
+        return bearings(self.points2d)
+
+    def permutation(self) -> Tensor:
+        """The true assignment, (b, m, n), sum one."""
+        index = torch.arange(self.points2d.shape[1]).unsqueeze(-1)
+        correct = (index == self.match3d.unsqueeze(1)).to(self.points2d.dtype)
+        return correct / correct.sum((-2, -1), keepdim=True)
+
+    def diffuse(self, scale: float) -> Tensor:
+        """exp(-|x - project(R p + t)|^2 / 2 scale^2) over all pairs, sum one."""
+        seen = project(transform(self.rotation, self.translation, self.points3d))
+        weights = torch.exp(-((self.points2d.unsqueeze(2) - seen.unsqueeze(1)) ** 2).sum(-1) / (2 * scale**2))
+        return weights / weights.sum((-2, -1), keepdim=True)
+
+    def near(self, amount: float, *, seed: int = 0) -> tuple[Tensor, Tensor]:
+        """A pose `amount` radians off the true one, and about as many scene units."""
+        generator = torch.Generator().manual_seed(seed)
+        turn, shift = (_normal(generator, len(self.rotation), 3).to(self.rotation.dtype) for _ in range(2))
+        turn = amount * torch.nn.functional.normalize(turn, dim=-1)
+        return roma.rotvec_to_rotmat(turn) @ self.rotation, self.translation + amount * shift
+
+    def batch(self) -> Batch:
+        return Batch.from_arrays(self.points2d, self.points3d, self.rotation, self.translation, self.match3d)
+
+
+def plant(
+    size: int,
+    points: int,
+    *,
+    seed: int = 0,
+    noise: float = 0.0,
+    outliers2d: int = 0,
+    outliers3d: int = 0,
+    dtype: torch.dtype = torch.float64,
+) -> Planted:
+    """`size` scenes of `points` normally distributed points, 4 to 6 units in front of a camera of any rotation.
+
+    The image points are shuffled and disturbed by normal `noise`; the outliers of each side have no match.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(_normal(generator, size, 4), dim=-1))
+    points3d = 0.7 * _normal(generator, size, points + outliers3d, 3).clamp(-2, 2)
+    translation = torch.rand(size, 3, generator=generator, dtype=torch.float64) - 0.5
+    translation[:, 2] += 5
+    camera = transform(rotation, translation, points3d[:, :points])
+    clutter = 0.2 * _normal(generator, size, outliers2d, 2)
+    points2d = torch.cat([project(camera) + noise * _normal(generator, size, points, 2), clutter], 1)
+    order = torch.rand(size, points2d.shape[1], generator=generator).argsort(-1)
+    points2d = points2d.gather(1, order.unsqueeze(-1).expand_as(points2d))
+    match3d = torch.full((size, points + outliers3d), -1)
+    match3d[:, :points] = order.argsort(-1)[:, :points]
+    return Planted(points2d.to(dtype), points3d.to(dtype), rotation.to(dtype), translation.to(dtype), match3d)
+
+
+def _normal(generator: torch.Generator, *shape: int) -> Tensor:
+    return torch.randn(*shape, generator=generator, dtype=torch.float64)

@@ -1,0 +1,219 @@
+import math
+
+import pytest
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from bpnp.layers import Sinkhorn, sinkhorn
+
+EXACT = {"tolerance": 1e-13, "max_iterations": 5000}
+
+
+def random_cost(*shape: int, seed: int = 0) -> Tensor:
+    return 2 * torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def marginals(*shape: int, seed: int = 0) -> Tensor:
+    weights = 0.2 + random_cost(*shape, seed=seed)
+    return weights / weights.sum(-1, keepdim=True)
+
+
+def plain_sinkhorn(cost: Tensor, mu: float, rows: Tensor, cols: Tensor, *, iterations: int = 100_000) -> Tensor:
+    """Plan (b, m, n) by rescaling in the log domain until the row sums are right to 1e-13."""
+    kernel, log_r, log_c = -cost / mu, rows.log(), cols.log()
+    v = torch.zeros_like(cols)
+    for i in range(iterations):
+        u = log_r - torch.logsumexp(kernel + v.unsqueeze(-2), -1)
+        v = log_c - torch.logsumexp(kernel + u.unsqueeze(-1), -2)
+        if i % 100 == 0:
+            plan = (kernel + u.unsqueeze(-1) + v.unsqueeze(-2)).exp()
+            if (plan.sum(-1) - rows).abs().sum(-1).max() < 1e-13:
+                return plan
+    raise AssertionError(f"the reference did not converge at mu = {mu}")
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.05, 0.01, 1e-3])
+@pytest.mark.parametrize("shape", [(2, 5, 5), (2, 4, 6), (2, 1, 5), (2, 4, 1)])
+def test_agrees_with_plain_scaling(mu: float, shape: tuple[int, int, int]) -> None:
+    cost = random_cost(*shape)
+    rows, cols = marginals(*shape[:2], seed=1), marginals(shape[0], shape[2], seed=2)
+    expected = plain_sinkhorn(cost, mu, rows, cols)
+    plan, stats = sinkhorn(cost, mu=mu, row_marginal=rows, col_marginal=cols, **EXACT)
+    assert stats.converged.all()
+    assert (plan - expected).abs().max() < 1e-12
+    plan, stats = sinkhorn(cost.float(), mu=mu, row_marginal=rows.float(), col_marginal=cols.float())
+    assert stats.converged.all()
+    # The exponent cost / mu holds 24 bits in float32.
+    assert (plan - expected).abs().max() < 4 * torch.finfo(torch.float32).eps * 2 / mu
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("mu", [1.0, 0.1, 0.01])
+def test_marginals_hold(dtype: torch.dtype, mu: float) -> None:
+    plan, stats = sinkhorn(random_cost(4, 60, 40).to(dtype), mu=mu)
+    rows, cols = plan.double().sum(-1), plan.double().sum(-2)
+    assert plan.dtype == dtype
+    assert stats.converged.all()
+    assert (rows - 1 / 60).abs().sum(-1).max() < 2e-6
+    assert (cols - 1 / 40).abs().sum(-1).max() < 2e-6
+    torch.testing.assert_close((rows - 1 / 60).abs().sum(-1), stats.residual.double(), atol=5e-7, rtol=0)
+
+
+def test_becomes_the_optimal_assignment_as_mu_falls() -> None:
+    cost = random_cost(8, 12, 12, seed=3)
+    plan, stats = sinkhorn(cost, mu=2e-4, **EXACT)
+    assert stats.converged.all()
+    for sample, expected in zip(plan, cost, strict=True):
+        i, j = linear_sum_assignment(expected)
+        assert (12 * sample[i, j]).min() > 0.99
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_padding_and_neighbours_change_nothing(dtype: torch.dtype) -> None:
+    sizes = [(5, 7), (12, 9), (1, 4), (3, 1), (12, 12)]
+    costs = [random_cost(1, m, n, seed=m * n).to(dtype) for m, n in sizes]
+    padded = torch.full((len(sizes), 12, 12), 0.7, dtype=dtype)
+    mask2d, mask3d = (torch.zeros(len(sizes), 12, dtype=torch.bool) for _ in range(2))
+    for i, (m, n) in enumerate(sizes):
+        padded[i, :m, :n], mask2d[i, :m], mask3d[i, :n] = costs[i][0], True, True
+    together, stats = sinkhorn(padded, mu=0.02, mask2d=mask2d, mask3d=mask3d)
+    for i, (m, n) in enumerate(sizes):
+        alone, alone_stats = sinkhorn(costs[i], mu=0.02)
+        assert (together[i, :m, :n] - alone[0]).abs().max() < 4 * torch.finfo(dtype).eps
+        assert not together[i].masked_select(~(mask2d[i, :, None] & mask3d[i])).any()
+        assert stats.iterations[i] == alone_stats.iterations[0]
+
+
+def test_a_point_with_zero_marginal_takes_no_part() -> None:
+    cost, rows, cols = random_cost(2, 6, 5), marginals(2, 6), marginals(2, 5)
+    rows[:, 2], cols[:, 4] = 0, 0
+    rows, cols = rows / rows.sum(-1, keepdim=True), cols / cols.sum(-1, keepdim=True)
+    plan, stats = sinkhorn(cost, row_marginal=rows, col_marginal=cols, **EXACT)
+    kept = torch.tensor([0, 1, 3, 4, 5])
+    expected = plain_sinkhorn(cost[:, kept, :4], 0.1, rows[:, kept], cols[:, :4])
+    assert stats.converged.all()
+    assert (plan[:, kept, :4] - expected).abs().max() < 1e-12
+    assert plan[:, 2].abs().max() == 0
+    assert plan[..., 4].abs().max() == 0
+
+
+def test_a_pair_of_infinite_cost_is_never_matched() -> None:
+    cost = random_cost(2, 6, 6)
+    cost[:, torch.arange(6), torch.arange(6)] = torch.inf
+    uniform = torch.full((2, 6), 1 / 6, dtype=torch.float64)
+    plan, stats = sinkhorn(cost, mu=0.05, **EXACT)
+    assert stats.converged.all()
+    assert plan.diagonal(dim1=1, dim2=2).abs().max() == 0
+    expected = plain_sinkhorn(cost.clamp_max(100), 0.05, uniform, uniform)
+    assert (plan - expected).abs().max() < 1e-12
+
+
+def test_dustbin_is_one_more_row_and_column() -> None:
+    cost = random_cost(2, 4, 6)
+    augmented = torch.full((2, 5, 7), 0.9, dtype=torch.float64)
+    augmented[:, :4, :6] = cost
+    rows = torch.tensor([0.1] * 4 + [0.6], dtype=torch.float64).expand(2, 5)
+    cols = torch.tensor([0.1] * 6 + [0.4], dtype=torch.float64).expand(2, 7)
+    plan, stats = sinkhorn(cost, dustbin=0.9, **EXACT)
+    assert stats.converged.all()
+    assert (plan - plain_sinkhorn(augmented, 0.1, rows, cols)[:, :4, :6]).abs().max() < 1e-12
+
+
+def test_dustbin_of_a_padded_sample_counts_its_real_points() -> None:
+    cost = random_cost(1, 4, 6)
+    padded = torch.nn.functional.pad(cost, (0, 2, 0, 3), value=0.1)
+    alone, _ = sinkhorn(cost, dustbin=0.5, **EXACT)
+    plan, _ = sinkhorn(padded, dustbin=0.5, mask2d=torch.arange(7)[None] < 4, mask3d=torch.arange(8)[None] < 6, **EXACT)
+    assert (plan[:, :4, :6] - alone).abs().max() < 1e-14
+    assert not plan[:, 4:].any()
+    assert not plan[:, :, 6:].any()
+
+
+def test_unmatched_points_end_in_the_dustbin() -> None:
+    cost = torch.full((1, 5, 6), 2.0)
+    cost[0, torch.arange(3), torch.arange(3)] = 0  # three pairs match, two and three points do not
+    plan, _ = sinkhorn(cost, mu=0.03, dustbin=0.5)
+    share = 11 * plan[0]
+    assert share.diagonal()[:3].min() > 0.99
+    assert share[3:].sum() < 1e-6
+    assert share[:, 3:].sum() < 1e-6
+
+
+@pytest.mark.parametrize("level", [0.99, 0.999, 0.999999])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_almost_a_permutation_is_no_obstacle(level: float, dtype: torch.dtype) -> None:
+    n, mu = 50, 0.05
+    odds = (n - 1) * level / (1 - level)
+    cost = mu * math.log(odds) * (1 - torch.eye(n, dtype=dtype)).unsqueeze(0)
+    plan, stats = sinkhorn(cost, mu=mu)
+    assert stats.converged.all()
+    assert stats.iterations.max() < 5
+    assert abs(float(plan.diagonal(dim1=1, dim2=2).sum()) - level) < 1e-5
+
+
+def test_equal_costs_give_independence() -> None:
+    rows, cols = marginals(2, 5), marginals(2, 8, seed=1)
+    plan, _ = sinkhorn(torch.zeros(2, 5, 8, dtype=torch.float64), row_marginal=rows, col_marginal=cols, **EXACT)
+    assert (plan - rows.unsqueeze(-1) * cols.unsqueeze(-2)).abs().max() < 1e-15
+
+
+def test_row_and_column_offsets_of_the_cost_change_nothing() -> None:
+    cost = random_cost(2, 6, 8)
+    offset = 50 * random_cost(2, 6, 1, seed=1) - 20 * random_cost(2, 1, 8, seed=2)
+    expected, _ = sinkhorn(cost, mu=0.05, **EXACT)
+    plan, stats = sinkhorn(cost + offset, mu=0.05, **EXACT)
+    assert stats.converged.all()
+    assert (plan - expected).abs().max() < 1e-11
+
+
+def test_reports_that_it_has_not_converged() -> None:
+    cost = random_cost(3, 20, 20)
+    cost[1] = 0  # converges at once
+    plan, stats = sinkhorn(cost, mu=0.01, max_iterations=2)
+    assert stats.converged.tolist() == [False, True, False]
+    assert stats.iterations.tolist() == [2, 1, 2]
+    torch.testing.assert_close(stats.residual, (plan.sum(-1) - 1 / 20).abs().sum(-1))
+
+
+def test_a_sample_with_nan_is_flagged_and_alone() -> None:
+    cost = random_cost(3, 6, 6)
+    expected, _ = sinkhorn(cost)
+    cost[1, 2, 3] = torch.nan
+    plan, stats = sinkhorn(cost)
+    assert stats.converged.tolist() == [True, False, True]
+    assert torch.equal(plan[[0, 2]], expected[[0, 2]])
+
+
+@pytest.mark.parametrize("mu", [0.0, -1.0, math.nan, torch.tensor(-0.1)])
+def test_says_what_mu_must_be(mu: float | Tensor) -> None:
+    with pytest.raises(ValueError, match="expected `mu` > 0, got"):
+        sinkhorn(random_cost(1, 3, 3), mu=mu)
+    if not isinstance(mu, Tensor):
+        with pytest.raises(ValueError, match="expected `mu` > 0, got"):
+            Sinkhorn(mu=mu, learn_mu=True)
+
+
+@pytest.mark.parametrize("side", ["mask2d", "mask3d"])
+@pytest.mark.parametrize("given", [True, False])
+def test_says_that_a_sample_has_no_points(side: str, given: bool) -> None:
+    mask = torch.tensor([[True, True, True], [False, False, False]])
+    uniform = torch.full((2, 3), 1 / 3, dtype=torch.float64) if given else None
+    with pytest.raises(ValueError, match="at least one real point on each side"):
+        sinkhorn(random_cost(2, 3, 3), row_marginal=uniform, col_marginal=uniform, **{side: mask})
+
+
+def test_the_module_passes_its_options_on() -> None:
+    cost = random_cost(2, 5, 6).float()
+    mask2d, mask3d = torch.arange(5).expand(2, 5) < 4, torch.arange(6).expand(2, 6) < 5
+    layer = Sinkhorn(mu=0.3, learn_mu=True, dustbin=0.4, learn_dustbin=True, tolerance=1e-3, max_iterations=7)
+    expected, stats = sinkhorn(
+        cost, mu=0.3, dustbin=0.4, mask2d=mask2d, mask3d=mask3d, tolerance=1e-3, max_iterations=7
+    )  # fmt: skip
+    plan, layer_stats = layer(cost, mask2d, mask3d)
+    torch.testing.assert_close(plan, expected)
+    assert torch.equal(stats.iterations, layer_stats.iterations)
+    plan.amax().backward()
+    assert {name for name, p in layer.named_parameters() if p.grad is not None} == {"log_mu", "bin_cost"}
+    with pytest.raises(ValueError, match="expected a `dustbin` cost to learn from"):
+        Sinkhorn(learn_dustbin=True)
