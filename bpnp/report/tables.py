@@ -4,7 +4,6 @@ Every table fits in `WIDTH` columns without breaking a number.
 """
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, recalls
 from bpnp.report.results import Results, read_results
+from bpnp.report.runs import named_runs
 
 WIDTH = 100
 Paper = Literal["modelnet40", "megadepth"]
@@ -141,10 +141,7 @@ def report(
     `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
     columns wide. Raises ValueError if a folder cannot be read.
     """
-    if not paths:
-        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
-    shared = os.path.commonpath([Path(path).absolute().parent for path in paths])
-    runs = {os.path.relpath(Path(path).absolute(), shared): read_results(path) for path in paths}
+    runs = {name: read_results(path) for name, path in named_runs(paths).items()}
     if console is None:
         console = Console()
         console.width = max(console.width, WIDTH)
@@ -199,7 +196,7 @@ def _table(
         table.add_column(column.header, justify="right", no_wrap=True)
     best = {column.key: _best(column, list(rows.values())) for column in columns}
     for label, values in rows.items():
-        shown = {column.key: _cell(column, values) for column in columns}
+        shown = {column.key: cell(column, values) for column in columns}
         cells = (Text(text, "bold" if text == best[key] else "") for key, text in shown.items())
         table.add_row(Text(label), *cells)
     table.add_section()
@@ -208,7 +205,8 @@ def _table(
     return table
 
 
-def _cell(column: Column, values: Values) -> str:
+def cell(column: Column, values: Values) -> str:
+    """What a table shows of a column: a share in percent, else `number`."""
     value = values.get(column.key)
     return f"{100 * value:.1f}" if column.share and value is not None else number(value)
 
@@ -218,4 +216,4 @@ def _best(column: Column, rows: Sequence[Values]) -> str | None:
     known = [row for row in rows if math.isfinite(row.get(column.key, math.nan))]
     if len(rows) < 2 or not known:
         return None
-    return _cell(column, (max if column.share else min)(known, key=lambda row: row[column.key]))
+    return cell(column, (max if column.share else min)(known, key=lambda row: row[column.key]))

@@ -1,0 +1,91 @@
+// One pair: its numbers in every run that has it, and its points where a run kept them.
+
+let open = null;
+
+function openPair(i) {
+  const series = listedSeries();
+  open = { position: i, id: series.ids[i] };
+  byId("pair-title").textContent = open.id || "(no name)";
+  drawNumbers();
+  const kept = [series, ...SERIES].find(({ run, ids }) => run.views[ids.indexOf(open.id)]);
+  byId("pair-views").hidden = kept === undefined;
+  byId("pair-missing").hidden = kept !== undefined;
+  const place = listed.indexOf(i);
+  byId("pair-previous").disabled = place <= 0;
+  byId("pair-next").disabled = place < 0 || place === listed.length - 1;
+  if (!byId("pair").open) byId("pair").showModal();
+  history.replaceState(null, "", `#pair=${encodeURIComponent(wellFormed(open.id))}`);
+  if (kept === undefined) return;
+  open.view = unpackedView(kept.run.views[kept.ids.indexOf(open.id)]);
+  open.cameras = camerasOf(open.view, kept.run);
+  const wanted = open.cameras.findIndex(({ name }) => name === series.estimate);
+  byId("pair-estimate").replaceChildren(...open.cameras.map(({ name }, k) => element("option", { value: k }, name)));
+  byId("pair-estimate").value = String(Math.max(wanted, 0));
+  redrawViews();
+}
+
+function drawNumbers() {
+  const rows = SERIES.map((series) => [series, series.ids.indexOf(open.id)]).filter(([, i]) => i >= 0);
+  const body = rows.map(([series, i]) =>
+    element("tr", {}, element("th", { scope: "row" }, swatch(series), series.name),
+      ...PAIR_COLUMNS.map(([key]) => element("td", {}, pairText(key, pairColumn(series, key)[i]))),
+      element("td", { class: "words" }, DATA.causes[series.get("cause")[i]])));
+  const heads = [...PAIR_COLUMNS.map(([, text]) => text), "cause"].map((text) => element("th", { scope: "col" }, text));
+  byId("pair-numbers").replaceChildren(
+    element("thead", {}, element("tr", {}, element("th", { scope: "col" }, "estimate"), ...heads)),
+    element("tbody", {}, ...body));
+}
+
+function unpackedView(view) {
+  const points = (packed) => {
+    const { low, size } = packed;
+    const steps = column(packed);
+    return Array.from({ length: steps.length / low.length }, (_, i) =>
+      low.map((start, k) => start + (steps[i * low.length + k] / 65535) * size[k]));
+  };
+  return {
+    points2d: points(view.points2d),
+    points3d: points(view.points3d),
+    box2d: view.points2d,
+    match3d: column(view.match3d),
+    assigned3d: column(view.assigned3d),
+    pose: view.pose,
+    estimates: view.estimates,
+  };
+}
+
+function camerasOf(view, run) {
+  const estimates = Object.entries(view.estimates).filter(([, pose]) => pose !== null).map(([name, pose]) => ({
+    name, pose, colour: SERIES.find((series) => series.run === run && series.estimate === name)?.colour ?? "var(--c0)" }));
+  return view.pose === null ? estimates : [{ name: "true pose", pose: view.pose, colour: "var(--text)", upright: true }, ...estimates];
+}
+
+function redrawViews() {
+  if (!byId("pair").open || !open?.view || byId("pair-views").hidden) return;
+  const camera = open.cameras[byId("pair-estimate").value];
+  drawScene(open.view, open.cameras);
+  if (camera) drawImage(open.view, camera, byId("pair-lines").value);
+}
+
+function prepareDialog() {
+  const step = (by) => () => openPair(listed[listed.indexOf(open.position) + by]);
+  byId("pair-previous").addEventListener("click", step(-1));
+  byId("pair-next").addEventListener("click", step(1));
+  byId("pair-close").addEventListener("click", () => byId("pair").close());
+  byId("pair").addEventListener("close", () => history.replaceState(null, "", location.pathname + location.search));
+  for (const id of ["pair-estimate", "pair-lines"]) byId(id).addEventListener("input", redrawViews);
+}
+
+// Names that are not UTF-8 hold lone surrogates, which addresses cannot.
+const wellFormed = (text) => text.replace(/\p{Surrogate}/gu, "\ufffd");
+
+// A link to report.html#pair=ID opens that pair.
+function openFromAddress() {
+  if (!location.hash.startsWith("#pair=")) return;
+  const id = decodeURIComponent(location.hash.slice("#pair=".length));
+  const i = SERIES.findIndex((series) => series.ids.some((own) => wellFormed(own) === id));
+  if (i < 0) return;
+  byId("pair-series").value = String(i);
+  drawPairs();
+  openPair(SERIES[i].ids.findIndex((own) => wellFormed(own) === id));
+}

@@ -1,0 +1,202 @@
+"""Results as one HTML file that needs nothing else: no network, no server, no library.
+
+The numbers travel as JSON inside the file, long columns as base64 of little-endian arrays: eight runs of ten thousand
+pairs stay under 20 MB. What is drawn from them is in `assets`.
+"""
+
+import base64
+import html
+import json
+import os
+from collections.abc import Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bpnp.report.causes import CAUSES, SOLVED_DEG, cause_of
+from bpnp.report.palette import DARK, DARK_BACKGROUND, DASHES, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.results import PairRow, Results, read_results
+from bpnp.report.runs import named_runs
+from bpnp.report.tables import PAPER, RESULT_COLUMNS, Paper, cell
+from bpnp.report.training_log import TrainingLog, read_training_log
+from bpnp.report.views import PairView, read_views
+
+SCRIPTS = (
+    "data.js",
+    "chart.js",
+    "quartiles.js",
+    "plots.js",
+    "training.js",
+    "pairs.js",
+    "scene.js",
+    "image.js",
+    "dialog.js",
+    "main.js",
+)
+FORMATS = {"f4": "<f4", "i4": "<i4", "u2": "<u2", "i2": "<i2", "u1": "u1"}
+ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
+COUNTS = ("inliers", "iterations")
+SIZES = ("m", "n", "true_pairs")
+
+
+def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
+    """Write the page of one or several results folders, whole or not at all, and return where it is.
+
+    Raises ValueError if a folder, its views or its training log cannot be read.
+    """
+    output = Path(output)
+    text = page_html(paths, paper=paper)
+    output.parent.mkdir(parents=True, exist_ok=True)
+    temporary = output.with_name(f".{output.name}.{os.getpid()}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        os.replace(temporary, output)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return output
+
+
+def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str:
+    """The page as text. Raises ValueError as `write_page`."""
+    folders = named_runs(paths)
+    runs = {name: read_results(path) for name, path in folders.items()}
+    views = {name: read_views(path) for name, path in folders.items()}
+    assets = files("bpnp.report") / "assets"
+    scripts = "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS)
+    parts = {
+        "style": _colours() + (assets / "page.css").read_text(encoding="utf-8"),
+        "script": f"(() => {{\n{scripts}}})();\n",
+        "data": script_json(page_data(runs, views, _logs(folders), paper=paper)),
+        "title": html.escape("bpnp: " + ", ".join(runs)),
+    }
+    pieces = (assets / "page.html").read_text(encoding="utf-8").split("%%")
+    return "".join(parts[piece] if i % 2 else piece for i, piece in enumerate(pieces))
+
+
+def page_data(
+    runs: Mapping[str, Results],
+    views: Mapping[str, Sequence[PairView]],
+    logs: Mapping[str, TrainingLog],
+    *,
+    paper: Paper | None = None,
+) -> dict[str, Any]:
+    """All that the page shows, in the types of strict JSON and the packed columns of `packed`."""
+    shapes = styles({name: list(results.estimates) for name, results in runs.items()})
+    ids: list[list[str]] = []
+    shown = []
+    for name, results in runs.items():
+        estimates = list(results.estimates)
+        pairs = [row for row in results.rows if row.estimate == estimates[0]]
+        own = [row.id for row in pairs]
+        if own not in ids:
+            ids.append(own)
+        position = {row.index: i for i, row in enumerate(pairs)}
+        shown.append(
+            {
+                "name": name,
+                "written": results.written,
+                "bpnp_version": results.bpnp_version,
+                "settings": results.settings,
+                "correspondence_loss": results.correspondence_loss,
+                "ids": ids.index(own),
+                "sizes": {key: packed([getattr(row, key) for row in pairs], "i4") for key in SIZES},
+                "estimates": {
+                    key: _estimate([row for row in results.rows if row.estimate == key], results.estimates[key])
+                    | {"colour": shapes[name, key][0], "dashes": DASHES[shapes[name, key][1]]}
+                    for key in estimates
+                },
+                "views": {str(position[v.index]): _view(v) for v in views.get(name, ()) if v.index in position},
+            }
+        )
+    return {
+        "runs": shown,
+        "ids": ids,
+        "causes": CAUSES,
+        "solved_deg": SOLVED_DEG,
+        "columns": [{"header": column.header.split("\n"), "share": column.share} for column in RESULT_COLUMNS],
+        "paper": _paper(paper),
+        "logs": [_log(name, log) for name, log in logs.items()],
+    }
+
+
+def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
+    """Numbers as {kind: base64}; kinds as in `FORMATS`."""
+    return {kind: base64.b64encode(np.asarray(values, dtype=FORMATS[kind]).tobytes()).decode()}
+
+
+def script_json(value: Any) -> str:
+    """JSON that can stand in a script element: no name in it can close the element or open another."""
+    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
+    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def _estimate(rows: Sequence[PairRow], values: Mapping[str, float]) -> dict[str, Any]:
+    numbers = [values.get(column.key) for column in RESULT_COLUMNS]
+    texts = [cell(column, values) for column in RESULT_COLUMNS]
+    finite = [value if value is not None and np.isfinite(value) else None for value in numbers]
+    return {
+        "cells": list(zip(texts, finite, strict=True)),
+        "columns": {key: packed([getattr(row, key) for row in rows], "f4") for key in ERRORS}
+        | {key: packed([getattr(row, key) for row in rows], "i4") for key in COUNTS}
+        | {"cause": packed([CAUSES.index(cause_of(row)) for row in rows], "u1")},
+    }
+
+
+def _view(view: PairView) -> dict[str, Any]:
+    """Coordinates in steps of 1/65535 of their box: finer than a screen shows."""
+    shown: dict[str, Any] = {
+        "match3d": packed(view.match3d, "i2"),
+        "assigned3d": packed(view.assigned3d, "i2"),
+        "pose": None if view.pose is None else _numbers(view.pose),
+        "estimates": {name: _numbers(pose) for name, pose in view.estimates.items()},
+    }
+    for name, points in (("points2d", view.points2d), ("points3d", view.points3d)):
+        low, size = points.min(0), np.ptp(points, axis=0)
+        steps = np.round((points - low) / np.where(size > 0, size, 1) * 65535)
+        shown[name] = {"low": low.tolist(), "size": size.tolist(), **packed(steps.ravel(), "u2")}
+    return shown
+
+
+def _numbers(pose: tuple[Any, Any]) -> list[float] | None:
+    values = [*np.asarray(pose[0], float).ravel().tolist(), *np.asarray(pose[1], float).tolist()]
+    return values if np.isfinite(values).all() else None
+
+
+def _paper(paper: Paper | None) -> list[dict[str, Any]]:
+    if paper is None:
+        return []
+    name, estimates = PAPER[paper]
+    return [
+        {"name": f"{name}: {estimate}", "cells": [values.get(column.key, "-") for column in RESULT_COLUMNS]}
+        for estimate, values in estimates.items()
+    ]
+
+
+def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
+    """Each training once, under the name of the first results that stem from it."""
+    logs: dict[tuple[Path, ...], tuple[str, TrainingLog]] = {}
+    for name, folder in folders.items():
+        log = read_training_log(folder)
+        if log is not None:
+            logs.setdefault(log.files, (name, log))
+    return dict(logs.values())
+
+
+def _log(name: str, log: TrainingLog) -> dict[str, Any]:
+    curves = {
+        key: {"steps": packed(steps, "f4"), "values": packed(values, "f4")}
+        for key, (steps, values) in log.curves.items()
+    }
+    return {"name": name, "switch_step": log.switch_step, "curves": curves}
+
+
+def _colours() -> str:
+    schemes = ((LIGHT, LIGHT_BACKGROUND), (DARK, DARK_BACKGROUND))
+    light, dark = (
+        " ".join(f"--c{i}: {colour};" for i, colour in enumerate(colours)) + f" --background: {background};"
+        for colours, background in schemes
+    )
+    return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"

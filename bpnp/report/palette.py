@@ -1,0 +1,31 @@
+"""Colours of runs and estimates, for the page and for figures.
+
+Eight of each scheme that stay apart for readers with normal vision, protanopia and deuteranopia (at least 30 in CIE
+Lab) and tritanopia (23), at a contrast of 3 or more against the background. Estimates also differ by their dashes.
+"""
+
+from collections.abc import Mapping, Sequence
+
+LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#58006e", "#201816")
+DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
+LIGHT_BACKGROUND = "#ffffff"
+DARK_BACKGROUND = "#14171c"
+DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
+
+
+def styles(runs: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], tuple[int, int]]:
+    """Indices of colour and dashes for each estimate of each run.
+
+    With at most eight series each has its own colour; with more, each run has one. Estimates of one name share a line.
+    """
+    series = [(run, estimate) for run, estimates in runs.items() for estimate in estimates]
+    names = list(dict.fromkeys(estimate for _, estimate in series))
+    order = {key: i for i, key in enumerate(series)} if len(series) <= len(LIGHT) else None
+    places = {run: i for i, run in enumerate(runs)}
+    return {
+        (run, estimate): (
+            (places[run] if order is None else order[run, estimate]) % len(LIGHT),
+            names.index(estimate) % len(DASHES),
+        )
+        for run, estimate in series
+    }

@@ -1,0 +1,39 @@
+"""Several results side by side: what they are called, and their aggregates as plain rows."""
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bpnp.report.results import Results, read_results
+
+
+def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
+    """Results folders by what their paths do not share. Of a run's folder, its `test`.
+
+    Raises ValueError if there is none.
+    """
+    if not paths:
+        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
+    folders = [Path(path).absolute() for path in paths]
+    folders = [
+        path / "test" if (path / "test" / "summary.json").is_file() and not (path / "summary.json").exists() else path
+        for path in folders
+    ]
+    shared = os.path.commonpath([path.parent for path in folders])
+    return {os.path.relpath(path, shared): path for path in folders}
+
+
+def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> list[dict[str, Any]]:
+    """Aggregates of one or several results for notebooks: a dict per run and estimate, "run", "estimate",
+    "correspondence_loss" and all numbers of `summarise`. `pandas.DataFrame(table([...]))` makes a dataframe of it.
+
+    runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
+    """
+    if not isinstance(runs, Mapping):
+        runs = {name: read_results(path) for name, path in named_runs(runs).items()}
+    return [
+        {"run": name, "estimate": estimate, "correspondence_loss": results.correspondence_loss, **values}
+        for name, results in runs.items()
+        for estimate, values in results.estimates.items()
+    ]

@@ -1,0 +1,101 @@
+"""The training curves of a run, from the CSV files that Lightning's CSVLogger leaves beside its results."""
+
+import csv
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+FOLDERS = ("logs", "lightning_logs")
+LOSS = "train/loss"
+CURVES = (
+    LOSS,
+    "train/correspondence_loss",
+    "train/pose_loss",
+    "val/correspondence_loss",
+    "val/rotation_q2_deg",
+    "val/recall_joint_15deg_0.5",
+)
+# These are logged from the first step with a pose loss on.
+SWITCH_MARKS = ("train/pose_loss", "train/without_pose")
+MOST_POINTS = 500
+
+
+@dataclass(frozen=True)
+class TrainingLog:
+    """Curves by name, each as (steps, values) of at most `MOST_POINTS` points.
+
+    switch_step: the first logged step with the pose loss, None if it never joined. files: where the curves come from.
+    """
+
+    curves: dict[str, tuple[list[float], list[float]]]
+    switch_step: int | None
+    files: tuple[Path, ...]
+
+
+def read_training_log(results: Path | str) -> TrainingLog | None:
+    """The log of the run that a results folder belongs to: in `logs` or `lightning_logs` of it or of its parent.
+
+    Of several versions the newest that trained counts, with those before it that it continues (a resumed run). None if
+    nothing was trained. Raises ValueError that names the file if a value is no number.
+    """
+    folder = Path(results).absolute()
+    for place in (folder, folder.parent):
+        files = [file for name in FOLDERS for file in (place / name).glob("version_*/metrics.csv")]
+        logs = [(file, _read(file)) for file in sorted(files, key=_version)]
+        trained = [(file, log) for file, log in logs if LOSS in log]
+        if trained:
+            return _joined(trained)
+    return None
+
+
+def _joined(logs: list[tuple[Path, dict[str, dict[int, float]]]]) -> TrainingLog:
+    """The newest log, and of older ones that started before it the steps up to its start."""
+    files: list[Path] = []
+    curves: dict[str, dict[int, float]] = {}
+    start = math.inf
+    for file, log in reversed(logs):
+        first = min(log[LOSS])
+        if first < start:
+            files.append(file)
+            for name, values in log.items():
+                before = {step: value for step, value in values.items() if step < start}
+                curves[name] = before | curves.get(name, {})
+            start = first
+    marks = [step for name in SWITCH_MARKS for step in curves.get(name, {})]
+    return TrainingLog(
+        curves={name: _thinned(curves[name]) for name in CURVES if name in curves},
+        switch_step=min(marks, default=None),
+        files=tuple(reversed(files)),
+    )
+
+
+def _read(path: Path) -> dict[str, dict[int, float]]:
+    """By column, the values by step."""
+    columns: dict[str, dict[int, float]] = {}
+    wanted = {*CURVES, *SWITCH_MARKS}
+    with path.open(encoding="utf-8", newline="") as file:
+        reader = csv.DictReader(file)
+        if reader.fieldnames is not None and "step" not in reader.fieldnames:
+            raise ValueError(f"expected column 'step' in {path}, got {reader.fieldnames}")
+        for row in reader:
+            try:
+                for name in wanted:
+                    if row.get(name):
+                        columns.setdefault(name, {})[int(row["step"])] = float(row[name])
+            except ValueError as error:
+                raise ValueError(f"expected numbers in {path}, line {reader.line_num}, got {error}") from error
+    return columns
+
+
+def _thinned(values: dict[int, float]) -> tuple[list[float], list[float]]:
+    """Steps and values in order; of long curves the means of equal parts."""
+    steps = sorted(values)
+    size = math.ceil(len(steps) / MOST_POINTS)
+    parts = [steps[i : i + size] for i in range(0, len(steps), size)]
+    means = [math.fsum(values[step] for step in part) / len(part) for part in parts]
+    return [sum(part) / len(part) for part in parts], means
+
+
+def _version(path: Path) -> tuple[float, str]:
+    number = path.parent.name.removeprefix("version_")
+    return float(number if number.isdigit() else "inf"), str(path)

@@ -1,0 +1,61 @@
+"""Results of planted pairs for the tests of the page and of the figures."""
+
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from bpnp.report import PairRow, Results, write_results
+from bpnp.report.views import PairView, write_views
+
+HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcff"
+
+
+def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) -> list[PairRow]:
+    """Random rows; the first pair has a hostile name, every seventh no pose, the second no reprojection error."""
+    rng = np.random.default_rng(seed)
+    planted = []
+    for i in range(count):
+        name = HOSTILE if i == 0 else f"scene/{i:04d}"
+        m, n = (int(size) for size in rng.integers(10, 99, 2))
+        for estimate in estimates:
+            found = i % 7 != 6
+            errors = (
+                [float(rng.gamma(1, 8)), *rng.gamma(1, 0.5, 3).tolist()] if found else [180.0, np.inf, np.inf, 180.0]
+            )
+            if i == 1:
+                errors[3] = np.nan
+            converged = found and bool(rng.random() < 0.8)
+            inliers, seconds = int(rng.integers(0, m)), float(rng.gamma(4, 0.01))
+            planted.append(
+                PairRow(i, name, estimate, *errors, inliers, m, n, min(m, n), 12, 1e-8, converged, found, seconds)
+            )
+    return planted
+
+
+def view(index: int, name: str, points: int = 30) -> PairView:
+    """Points in front of a camera, exactly projected; `ransac` is the true pose, `pnp` has none."""
+    rng = np.random.default_rng(index)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 4.0])
+    points3d = rng.uniform(-1, 1, (points, 3)).astype(np.float32)
+    camera = points3d @ rotation.T + translation
+    match = np.arange(points, dtype=np.int32)
+    missing = (np.full((3, 3), np.nan), np.full(3, np.nan))
+    estimates = {"ransac": (rotation, translation), "pnp": missing}
+    points2d = (camera[:, :2] / camera[:, 2:]).astype(np.float32)
+    return PairView(index, name, points2d, points3d, match, match[::-1].copy(), (rotation, translation), estimates, 2.0)
+
+
+def write_run(folder: Path, count: int, seed: int) -> Results:
+    """Results with the views of their worst and their first pair, and a log of a training whose pose loss joins."""
+    planted = rows(count, seed)
+    results = write_results(folder / "test", planted, correspondence_loss=0.25, settings={"command": HOSTILE})
+    first = [row for row in planted if row.estimate == "ransac"]
+    worst = max(first, key=lambda row: (row.rotation_error_deg, -row.index))
+    write_views(folder / "test", [view(row.index, row.id) for row in (first[0], worst)])
+    log = folder / "logs" / "version_0" / "metrics.csv"
+    log.parent.mkdir(parents=True)
+    lines = ["step,train/loss,train/pose_loss,val/rotation_q2_deg"]
+    lines += [f"{step},{1 / (step + 1 + seed)},{0.5 if step >= 50 else ''}," for step in range(0, 100, 10)]
+    log.write_text("\n".join([*lines, "99,,,3.5"]))
+    return results
