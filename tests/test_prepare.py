@@ -290,7 +290,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
 
 def test_outliers_reach_the_batches_of_a_store(tmp_path: Path) -> None:
     scenes(tmp_path / "scenes", 4)
-    prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=4, clutter=0.0, processes=2)
+    prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=4, clutter=0.0, processes=1)
     module = ColmapDataModule(
         str(tmp_path / "store"),
         max_points=20,
