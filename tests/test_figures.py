@@ -1,0 +1,96 @@
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.image import imread
+from report_data import HOSTILE, view, write_run
+from rich.console import Console
+
+from bpnp.report.commands import report_command, view_command
+from bpnp.report.figures import plot_pair, recall_curve, save_figure
+from bpnp.report.views import view_of
+
+
+def points_of(axes: object, marker: str) -> np.ndarray:
+    (line,) = (found for found in axes.get_lines() if found.get_marker() == marker and len(found.get_xdata()))  # type: ignore[attr-defined]
+    return np.c_[line.get_data()]
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_recall_curves_are_the_shares_of_pairs_within(tmp_path: Path, log: bool) -> None:
+    results = write_run(tmp_path, 60, 0)
+    figure = recall_curve({"run": results}, log=log)
+    assert [line.get_label() for line in figure.axes[0].get_lines()] == ["ransac", "pnp"]
+    for number, estimate in enumerate(("ransac", "pnp")):
+        rows = [row for row in results.rows if row.estimate == estimate]
+        rotation = np.array([row.rotation_error_deg for row in rows])
+        translation = np.array([row.translation_error for row in rows])
+        reprojection = np.array([row.reprojection_error_deg for row in rows])
+        joint = np.where(translation <= 0.5, rotation, np.inf)
+        for axes, errors in zip(
+            figure.axes, (rotation, translation, joint, reprojection[~np.isnan(reprojection)]), strict=True
+        ):
+            x, y = axes.get_lines()[number].get_data()
+            limits = np.linspace(0, axes.get_xlim()[1], 50)
+            # A curve with steps after its points has the y of the last point up to there.
+            drawn = np.asarray(y)[np.searchsorted(np.asarray(x), limits, side="right") - 1]
+            np.testing.assert_allclose(drawn, [(errors <= limit).mean() for limit in limits])
+
+
+def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
+    planted = view(3, "<b>$x_1$</b>")
+    figure = plot_pair(planted)
+    seen, projected = (points_of(figure.axes[1], marker) for marker in ("o", "x"))
+    np.testing.assert_allclose(seen, planted.points2d)
+    np.testing.assert_allclose(projected, planted.points2d, atol=1e-5)
+    top, bottom = figure.axes[1].get_ylim()
+    assert top > bottom
+    with pytest.raises(ValueError, match=r"expected an estimate among \['ransac', 'pnp'\], got 'best'"):
+        plot_pair(planted, estimate="best")
+    assert figure.axes[1].get_title() == ""
+    assert plot_pair(planted, estimate="pnp").axes[1].get_title() == "no pose"
+
+
+def test_wrong_matches_are_dotted_and_unknown_ones_are_not() -> None:
+    planted = view(3, "pair", points=10)
+    styles = [line.get_linestyle() for line in plot_pair(planted, lines="assigned3d").axes[1].get_lines()]
+    assert styles.count(":") == 10
+    assert planted.pose is not None
+    matches = np.stack([np.arange(4), np.arange(4)], -1)
+    solved = view_of(planted.points2d, planted.points3d, *planted.pose, matches=matches)
+    styles = [line.get_linestyle() for line in plot_pair(solved).axes[1].get_lines()]
+    assert (styles.count(":"), styles.count("-")) == (0, 4)
+    with pytest.raises(ValueError, match=r"expected `matches` of 10 2D and 10 3D points, got indices up to \[0, 10\]"):
+        view_of(planted.points2d, planted.points3d, *planted.pose, matches=np.array([[0, 10]]))
+
+
+@pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
+def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
+    path = save_figure(plot_pair(view(0, HOSTILE)), tmp_path / "new" / f"pair{suffix}")
+    assert [p.name for p in path.parent.iterdir()] == [path.name]
+    heads = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
+    assert path.read_bytes().startswith(heads[suffix])
+    with pytest.raises(ValueError, match=r"expected a file name that ends in .png, .svg, .pdf, got 'pair.jpg'"):
+        save_figure(plot_pair(view(0, "")), tmp_path / "pair.jpg")
+
+
+def test_commands_write_what_they_say(tmp_path: Path) -> None:
+    write_run(tmp_path / "run", 12, 0)
+    console = Console(file=io.StringIO(), width=120, color_system=None)
+    page, recall = tmp_path / "report.html", tmp_path / "recall.png"
+    with console.capture() as capture:
+        report_command([str(tmp_path / "run"), "--html", str(page), "--recall", str(recall)], console)
+    assert [line for line in capture.get().splitlines() if "wrote" in line] == [f"wrote {page}", f"wrote {recall}"]
+    assert "Pose errors, 12 pairs" in capture.get()
+    assert imread(recall).std() > 0.05
+    with console.capture() as capture:
+        view_command([str(tmp_path / "run"), "script", "--lines", "assigned"], console)
+    written = Path(capture.get().removeprefix("wrote ").rstrip("\n"))
+    assert written.parent == tmp_path / "run" / "test" / "views"
+    assert imread(written).std() > 0.05
+    with pytest.raises(ValueError, match="got 'nothing'; try one of"):
+        view_command([str(tmp_path / "run"), "nothing"], console)
+    (tmp_path / "run" / "test" / "views.npz").unlink()
+    with pytest.raises(ValueError, match=r"expected views.npz in .*run/test, got none"):
+        view_command([str(tmp_path / "run")], console)
