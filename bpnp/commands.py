@@ -11,6 +11,7 @@ import torch
 from rich.console import Console
 
 from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
+from bpnp.datamodules.preprocessed import prepare_preprocessed
 from bpnp.models.released import load_released
 from bpnp.task import BlindPnPTask
 
@@ -55,9 +56,9 @@ def convert_weights(arguments: list[str]) -> None:
 
 
 def prepare(arguments: list[str]) -> None:
-    """`bpnp prepare {modelnet40,megadepth} SOURCE`: a data set as it was published, as one memory-mapped store.
+    """`bpnp prepare DATASET SOURCE`: a data set as it was published, as one memory-mapped store.
 
-    Raises ValueError or OSError as `prepare_meshes` and `prepare_colmap` do.
+    Raises ValueError or OSError as `prepare_meshes`, `prepare_colmap` and `prepare_preprocessed` do.
     """
     chosen = _prepare_parser().parse_args(arguments)
     if chosen.dataset == "modelnet40":
@@ -68,6 +69,8 @@ def prepare(arguments: list[str]) -> None:
             normalisation=chosen.normalisation,
             processes=chosen.processes,
         )
+    elif chosen.dataset == "preprocessed":
+        prepared = prepare_preprocessed(chosen.source, chosen.output, dataset=chosen.name)
     else:
         prepared = prepare_colmap(
             chosen.source,
@@ -93,15 +96,19 @@ def _prepare_parser() -> argparse.ArgumentParser:
     colmap.add_argument(
         "--clutter", type=float, default=0.0, help="natural clutter to keep, as a ratio to the true pairs (default: 0)"
     )
+    pickles = datasets.add_parser("preprocessed", help="the pickles that the authors of BPnPNet published")
+    pickles.add_argument("--dataset", dest="name", help="where there are several, such as data61_2d3d")
+    for command in (meshes, colmap):
+        command.add_argument("--processes", type=_positive, default=os.cpu_count() or 1, help="(default: %(default)s)")
     for name, command, what in (
         ("modelnet40", meshes, "ModelNet40.zip, its folder, or the folder of ply_data_*.h5"),
         ("megadepth", colmap, "the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin"),
+        ("preprocessed", pickles, "the folder with <dataset>_train and <dataset>_test"),
     ):
         command.add_argument("source", type=Path, metavar="SOURCE", help=what)
         command.add_argument(
             "--output", type=Path, default=Path("data", name), help="new folder (default: %(default)s)"
         )
-        command.add_argument("--processes", type=_positive, default=os.cpu_count() or 1, help="(default: %(default)s)")
     return parser
 
 

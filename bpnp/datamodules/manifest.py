@@ -56,20 +56,18 @@ def write_manifest(folder: Path, content: Mapping[str, Any], *, digested: tuple[
         os.fsync(file.fileno())
 
 
+def read_parameters(folder: Path) -> dict[str, Any]:
+    """How a store was made, of whatever kind it is. Raises StoreError for a broken manifest."""
+    return dict(_parsed(folder)["parameters"])
+
+
 def read_manifest(folder: Path, *, kind: str) -> dict[str, Any]:
     """The manifest of a folder, after the sizes of its files and the digests it holds were compared.
 
     Raises StoreError that names the folder or the file: no manifest, another kind or format, a file that is missing,
     cut, or not the one that was written.
     """
-    try:
-        manifest = json.loads((folder / NAME).read_text(encoding="utf-8"))
-        digest = manifest.pop("digest")
-        whole = digest == _digest(manifest)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise StoreError(f"expected a folder made by `bpnp prepare`, got {folder} ({error})") from error
-    if not whole:
-        raise StoreError(f"expected an unchanged {folder / NAME}, got one that was edited or cut; try preparing again")
+    manifest = _parsed(folder)
     if (manifest["format"], manifest["kind"]) != (FORMAT, kind):
         raise StoreError(
             f"expected {kind} in format {FORMAT}, got {manifest['kind']} in format {manifest['format']} in {folder}; "
@@ -83,6 +81,18 @@ def read_manifest(folder: Path, *, kind: str) -> dict[str, Any]:
             raise StoreError(f"expected {path} of {entry['bytes']} bytes, got {found}; try copying or preparing again")
         if "digest" in entry and _file_digest(path) != entry["digest"]:
             raise StoreError(f"expected {path} as it was written, got other bytes; try copying or preparing again")
+    return manifest
+
+
+def _parsed(folder: Path) -> dict[str, Any]:
+    try:
+        manifest = json.loads((folder / NAME).read_text(encoding="utf-8"))
+        digest = manifest.pop("digest")
+        whole = digest == _digest(manifest)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise StoreError(f"expected a folder made by `bpnp prepare`, got {folder} ({error})") from error
+    if not whole:
+        raise StoreError(f"expected an unchanged {folder / NAME}, got one that was edited or cut; try preparing again")
     return manifest
 
 

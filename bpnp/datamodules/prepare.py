@@ -1,12 +1,10 @@
 """From a data set as it was published to one of our stores, in parallel; a killed run goes on where it was."""
 
-import os
 import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +13,11 @@ from bpnp.datamodules.batching import Pair
 from bpnp.datamodules.colmap_format import FILES, ColmapError
 from bpnp.datamodules.colmap_pairs import ColmapSource
 from bpnp.datamodules.colmap_scenes import find_scenes
-from bpnp.datamodules.manifest import StoreError, fingerprint, is_store
+from bpnp.datamodules.manifest import StoreError, fingerprint
 from bpnp.datamodules.mesh_archives import MeshArchive, open_archive
 from bpnp.datamodules.pair_store import PairStore, write_pairs
 from bpnp.datamodules.reconstruction import read_reconstruction
-from bpnp.datamodules.shards import make_parts, workplace
+from bpnp.datamodules.shards import make_once, make_parts
 from bpnp.datamodules.surface_store import open_surfaces, write_surfaces
 from bpnp.datamodules.surfaces import MeshError, Normalisation
 
@@ -45,20 +43,19 @@ def prepare_meshes(
     """
     archive = open_archive(source)
     parameters = {"points": points, "normalisation": normalisation, "source": fingerprint(archive.files)}
-    if not is_store(output):
+
+    def make(folder: Path) -> None:
         names = archive.names
         batches = [names[i : i + MESHES_A_PART] for i in range(0, len(names), MESHES_A_PART)]
         jobs = [(archive.part(batch), points, normalisation) for batch in batches]
-        _free(output)
-        with workplace(output, parameters) as folder:
-            parts = make_parts(folder, jobs, sample_part, processes=processes, label="sampling meshes")
-            skipped = {name: reason for part in parts for name, reason in open_surfaces(part).skipped.items()}
-            if len(skipped) == len(names):
-                raise StoreError(_nothing_usable("mesh", source, skipped))
-            write_surfaces(folder / "store", _meshes_of(parts), parameters=parameters, skipped=skipped)
-            os.rename(folder / "store", output)
+        parts = make_parts(folder, jobs, sample_part, processes=processes, label="sampling meshes")
+        skipped = {name: reason for part in parts for name, reason in open_surfaces(part).skipped.items()}
+        if len(skipped) == len(names):
+            raise nothing_usable("mesh", source, skipped)
+        write_surfaces(folder / "store", _meshes_of(parts), parameters=parameters, skipped=skipped)
+
+    make_once(output, parameters, make)
     store = open_surfaces(output)
-    _same(output, store.parameters, parameters)
     return Prepared(output, Counter(name.split("/")[-2] for name in store.names), store.skipped)
 
 
@@ -73,19 +70,18 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
     found = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))
     inputs = fingerprint(file for file in found if file.is_file())
     parameters = {"min_points": min_points, "clutter": clutter, "source": inputs}
-    if not is_store(output):
+
+    def make(folder: Path) -> None:
         jobs = [(*model, min_points, clutter) for model in models]
-        _free(output)
-        with workplace(output, parameters) as folder:
-            parts = make_parts(folder, jobs, read_part, processes=processes, label="reading COLMAP models")
-            stores = [PairStore(part) for part in parts]
-            skipped = {name: reason for store in stores for name, reason in store.skipped.items()}
-            if not any(len(store) for store in stores):
-                raise StoreError(_nothing_usable("image", source, skipped))
-            write_pairs(folder / "store", _pairs_of(stores), parameters=parameters, skipped=skipped)
-            os.rename(folder / "store", output)
+        parts = make_parts(folder, jobs, read_part, processes=processes, label="reading COLMAP models")
+        stores = [PairStore(part) for part in parts]
+        skipped = {name: reason for store in stores for name, reason in store.skipped.items()}
+        if not any(len(store) for store in stores):
+            raise nothing_usable("image", source, skipped)
+        write_pairs(folder / "store", _pairs_of(stores), parameters=parameters, skipped=skipped)
+
+    make_once(output, parameters, make)
     store = PairStore(output)
-    _same(output, store.parameters, parameters)
     return Prepared(output, {"scenes": len(store.scenes), "pairs": len(store)}, store.skipped)
 
 
@@ -130,20 +126,8 @@ def _pairs_of(stores: Sequence[PairStore]) -> Iterator[tuple[str, Pair]]:
             yield store.scenes[store.scene[i]], store.pair(i)
 
 
-def _free(output: Path) -> None:
-    if output.exists():
-        raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another name")
-    output.parent.mkdir(parents=True, exist_ok=True)
-
-
-def _same(output: Path, found: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    if different := sorted(key for key in wanted if found.get(key) != wanted[key]):
-        raise StoreError(
-            f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
-            "try another --output, or remove it"
-        )
-
-
-def _nothing_usable(what: str, source: Path, skipped: Mapping[str, str]) -> str:
+def nothing_usable(what: str, source: Path, skipped: Mapping[str, str]) -> StoreError:
     first = next(iter(skipped.values()), "none found")
-    return f"expected at least one usable {what} in {source}, got {len(skipped)} that are not; the first: {first}"
+    return StoreError(
+        f"expected at least one usable {what} in {source}, got {len(skipped)} that are not; the first: {first}"
+    )

@@ -74,7 +74,7 @@ class _Type:
     """A dtype to be: one of a number, or of objects."""
 
     text: str
-    order: str = "="
+    order: Any = "="
 
     def __setstate__(self, state: Any) -> None:
         order, parts = state[1], state[2:5]

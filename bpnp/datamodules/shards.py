@@ -18,7 +18,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bpnp.datamodules.manifest import StoreError
+from bpnp.datamodules.manifest import StoreError, is_store, read_parameters
 
 Work = Callable[[Any, Path], None]  # writes the store of one part, complete or not at all
 
@@ -47,6 +47,26 @@ def workplace(output: Path, inputs: Mapping[str, Any]) -> Iterator[Path]:
         yield folder
         _empty(folder, keep=())
     folder.rmdir()
+
+
+def make_once(output: Path, parameters: Mapping[str, Any], make: Callable[[Path], None]) -> None:
+    """Let `make(folder)` write the store `folder / "store"` and move it to `output`, unless that is there already.
+
+    Raises StoreError if `output` is not a store, or one of other `parameters`.
+    """
+    if is_store(output):
+        made = read_parameters(output)
+        if different := sorted(key for key in parameters if made.get(key) != parameters[key]):
+            raise StoreError(
+                f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
+                "try another --output, or remove it"
+            )
+        return
+    if output.exists():
+        raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another name")
+    with workplace(output, parameters) as folder:
+        make(folder)
+        os.rename(folder / "store", output)
 
 
 def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int, label: str) -> list[Path]:

@@ -1,0 +1,188 @@
+"""The data sets as the authors of BPnPNet published them: pickles of 2D points, 3D points, poses and correspondences.
+
+``<dataset>_{train,test}/preprocessed/{p2d,p3d,R_gt,t_gt,W_gt,num_points_2d,num_points_3d}.pkl``, each a dict or a list
+indexed by sample; or the form before that, ``<dataset>_{train,test}[/<scene>]/{matches,R,t}.pkl``, where a row of
+`matches` (k, 5) is a 2D point and its 3D point. Points are normalised, camera = R p + t.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.datamodules.batching import Pair
+from bpnp.datamodules.restricted import PickleError, load_pickle
+
+SPLITS = ("train", "test")
+PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
+MATCHES = ("matches", "R", "t")
+FOCAL = {"modelnet40": 800.0}  # pixels; for the others nothing is known
+MIN_TRUE = 4  # pairs; fewer do not fix a pose
+PROBED = 50  # samples that decide which side W_gt is indexed by
+AGREEMENT = 0.1  # median distance of a projected 3D point to its 2D point, normalised
+
+
+class SampleError(ValueError):
+    """A sample that cannot be used."""
+
+
+@dataclass(frozen=True)
+class AuthorsPart:
+    """The pickles of one folder."""
+
+    scene: str  # train, test, or one of them and a scene
+    folder: Path
+    names: Sequence[str]
+
+    @property
+    def files(self) -> list[Path]:
+        return [self.folder / f"{name}.pkl" for name in self.names]
+
+
+def find_parts(root: Path, dataset: str | None = None) -> tuple[str, list[AuthorsPart]]:
+    """The name of the data set below `root` and its folders of pickles.
+
+    Raises ValueError: nothing found, several data sets and no `dataset`, or a pickle of a folder missing.
+    """
+    if not root.is_dir():
+        raise ValueError(f"expected a folder with <dataset>_train and <dataset>_test, got {root}, which is no folder")
+    found = sorted({path.name.rpartition("_")[0] for split in SPLITS for path in root.glob(f"*_{split}")})
+    if dataset is None and len(found) > 1:
+        raise ValueError(f"expected one data set in {root}, got {', '.join(found)}; try --dataset {found[0]}")
+    chosen = dataset or (found[0] if found else "")
+    if chosen not in found or not chosen:
+        raise ValueError(f"expected {dataset or '<dataset>'}_train and _test in {root}, got {found or 'none'}")
+    parts = []
+    for split in SPLITS:
+        top = root / f"{chosen}_{split}"
+        if (top / "preprocessed").is_dir():
+            parts.append(AuthorsPart(split, top / "preprocessed", PREPROCESSED))
+        elif (top / "matches.pkl").is_file():
+            parts.append(AuthorsPart(split, top, MATCHES))
+        else:
+            folders = sorted(path.parent for path in top.glob("*/matches.pkl"))
+            parts += [AuthorsPart(f"{split}/{folder.name}", folder, MATCHES) for folder in folders]
+    if not parts:
+        raise ValueError(f"expected preprocessed/*.pkl or matches.pkl in {root / chosen}_train and _test, got neither")
+    missing = [str(file) for part in parts for file in part.files if not file.is_file()]
+    if missing:
+        raise ValueError(f"expected all pickles of {chosen}, got no {', '.join(missing[:4])}; try downloading it again")
+    return chosen, parts
+
+
+def read_part(part: AuthorsPart, *, focal: float) -> Iterator[tuple[str, Pair | SampleError]]:
+    """(name, pair) of every sample of a folder, or the reason why a sample cannot be used.
+
+    Copies that fill small sets up to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
+    Data61/2D3D, the 3D point of each 2D point: the one that agrees with the poses is taken. -1, or an index one past
+    the end, is no point. Raises PickleError that names the file.
+    """
+    columns = {file.stem: _column(file) for file in part.files}
+    keys = list(next(iter(columns.values())))
+    for name, column in columns.items():
+        if column.keys() != set(keys):
+            first = part.names[0]
+            raise PickleError(
+                f"expected the {len(keys)} samples of {first}.pkl in {part.folder / name}.pkl too, got {len(column)} "
+                "or others"
+            )
+    samples = [{name: column[key] for name, column in columns.items()} for key in keys]
+    by_2d = part.names == PREPROCESSED and _indexed_by_2d(part, samples[:PROBED])
+    for key, sample in zip(keys, samples, strict=True):
+        name = f"{part.scene}/{key:06d}"
+        try:
+            yield name, _pair(name, sample, by_2d=by_2d, focal=focal)
+        except SampleError as error:
+            yield name, error
+
+
+def _column(file: Path) -> dict[int, Any]:
+    content = load_pickle(file)
+    if isinstance(content, Mapping) and all(type(key) is int for key in content):
+        column = dict(sorted(content.items()))
+    elif isinstance(content, (list, tuple)) or (isinstance(content, np.ndarray) and content.ndim):
+        column = dict(enumerate(content))
+    else:
+        raise PickleError(f"expected a dict or list indexed by sample in {file}, got a {type(content).__name__}")
+    if not column:
+        raise PickleError(f"expected at least one sample in {file}, got none")
+    return column
+
+
+def _indexed_by_2d(part: AuthorsPart, samples: Sequence[Mapping[str, Any]]) -> bool:
+    """Whether W_gt is an m-vector: which reading projects the 3D points nearer to their 2D points."""
+    errors: dict[bool, list[float]] = {False: [], True: []}
+    for sample in samples:
+        for by_2d, found in errors.items():
+            try:
+                pair = _pair("", sample, by_2d=by_2d, focal=1.0)
+            except SampleError:
+                found.append(np.inf)
+                continue
+            true = pair.match3d >= 0
+            camera = pair.points3d[true] @ pair.rotation.T + pair.translation
+            with np.errstate(divide="ignore", invalid="ignore"):
+                distance = camera[:, :2] / camera[:, 2:] - pair.points2d[pair.match3d[true]]
+            found.append(float(np.median(np.linalg.norm(np.nan_to_num(distance, nan=np.inf), axis=-1))))
+    direct, inverse = (float(np.median(errors[by_2d])) for by_2d in (False, True))
+    if AGREEMENT < min(direct, inverse) < np.inf:
+        raise PickleError(
+            f"expected the poses in {part.folder} to project 3D points onto their 2D points, got a median distance of "
+            f"{min(direct, inverse):.3g}; try normalised 2D points and poses with camera = R p + t"
+        )
+    return inverse < direct
+
+
+def _pair(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) -> Pair:
+    if "matches" in sample:
+        matches = _numbers(sample["matches"], "matches", 5)
+        points2d, points3d = matches[:, :2], matches[:, 2:]
+        rotation, translation = sample["R"], sample["t"]
+        match3d = np.arange(len(matches))
+    else:
+        points2d = _numbers(sample["p2d"], "p2d", 2)[: _count(sample["num_points_2d"])]
+        points3d = _numbers(sample["p3d"], "p3d", 3)[: _count(sample["num_points_3d"])]
+        rotation, translation = sample["R_gt"], sample["t_gt"]
+        match3d = _match3d(sample["W_gt"], len(points2d), len(points3d), by_2d=by_2d)
+    rotation, translation = _numbers(rotation, "R", 3), np.asarray(translation, np.float64).reshape(-1)
+    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
+        raise SampleError("expected a rotation matrix, got another matrix")
+    if np.linalg.det(rotation) < 0 or translation.shape != (3,) or not np.isfinite(translation).all():
+        raise SampleError("expected a rotation and a finite translation, got a reflection or something else")
+    if (match3d >= 0).sum() < MIN_TRUE:
+        raise SampleError(f"expected {MIN_TRUE} or more true pairs, got {(match3d >= 0).sum()}")
+    return Pair(name, points2d.astype("f4"), points3d.astype("f4"), rotation, translation, match3d, focal)
+
+
+def _numbers(value: Any, name: str, width: int) -> NDArray[np.float64]:
+    try:
+        array = np.asarray(value, np.float64)
+    except (TypeError, ValueError) as error:
+        raise SampleError(f"expected numbers in {name}, got something else") from error
+    if array.ndim != 2 or array.shape[1] != width or not len(array) or not np.isfinite(array).all():
+        raise SampleError(f"expected finite {name} of shape (k, {width}), got {array.shape} or NaN")
+    return array
+
+
+def _count(value: Any) -> int:
+    return int(np.asarray(value).reshape(-1)[0])
+
+
+def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
+    """The 2D point of each 3D point, -1 for none, from W_gt and its tiled copies."""
+    length, other = (m, n) if by_2d else (n, m)
+    index = np.asarray(value).reshape(-1)[:length]
+    if len(index) < length or not np.issubdtype(index.dtype, np.number):
+        raise SampleError(f"expected {length} indices in W_gt, got {len(index)}")
+    index = index.astype(np.int64)
+    if index.min() < -1 or index.max() > other:
+        raise SampleError(f"expected W_gt between -1 and {other}, got {index.min()} to {index.max()}")
+    index = np.where(index == other, -1, index)
+    if not by_2d:
+        return index
+    match3d = np.full(n, -1)
+    match3d[index[index >= 0]] = np.flatnonzero(index >= 0)
+    return match3d

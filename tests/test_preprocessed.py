@@ -1,0 +1,179 @@
+"""The authors' pickles: planted pairs come back with their matches, copies dropped, both directions of W_gt."""
+
+import os
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bpnp.commands import prepare
+from bpnp.datamodules.manifest import StoreError
+from bpnp.datamodules.outliers import Outliers
+from bpnp.datamodules.pair_store import PairStore
+from bpnp.datamodules.preprocessed import PreprocessedDataModule, prepare_preprocessed
+from bpnp.datamodules.restricted import PickleError
+
+Sample = dict[str, np.ndarray]
+
+
+def sample(seed: int, *, tiled: int = 40) -> Sample:
+    """A noise-free pair; 3D point j was seen as 2D point W_gt[j]; both sets are filled with copies up to `tiled`."""
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(5, tiled + 1))
+    points3d = rng.normal(size=(count, 3))
+    rotation, translation = Rotation.from_quat(rng.normal(size=4)).as_matrix(), np.array([0.1, 0.2, 8.0])
+    camera = points3d @ rotation.T + translation
+    w = rng.permutation(count)
+    points2d = np.empty((count, 2))
+    points2d[w] = camera[:, :2] / camera[:, 2:]
+    copies = np.resize(np.arange(count), tiled)
+    sizes = {"num_points_2d": np.array([count]), "num_points_3d": np.array([count])}
+    return {"p2d": points2d[copies], "p3d": points3d[copies], "W_gt": w[copies], "R_gt": rotation} | {
+        "t_gt": translation, **sizes
+    }  # fmt: skip
+
+
+def dump(folder: Path, samples: list[Sample], *, protocol: int = 4) -> None:
+    folder.mkdir(parents=True)
+    for name in samples[0]:
+        values = [s[name] for s in samples]
+        content = values if name in ("R_gt", "t_gt") else dict(enumerate(values))
+        (folder / f"{name}.pkl").write_bytes(pickle.dumps(content, protocol))
+
+
+def write(root: Path, samples: list[Sample], dataset: str = "modelnet40") -> Path:
+    for split in ("train", "test"):
+        dump(root / f"{dataset}_{split}" / "preprocessed", samples)
+    return root
+
+
+def check(store: PairStore, samples: list[Sample]) -> None:
+    assert len(store) == 2 * len(samples)
+    for i in range(len(store)):
+        pair, expected = store.pair(i), samples[i % len(samples)]
+        count = expected["num_points_2d"][0]
+        assert (len(pair.points2d), len(pair.points3d)) == (count, count)
+        assert (pair.match3d >= 0).all()
+        camera = pair.points3d @ pair.rotation.T + pair.translation
+        assert pair.points2d[pair.match3d] == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
+        assert pair.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
+
+
+def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    samples = [sample(i) for i in range(8)]
+    write(tmp_path / "data", samples)
+    prepare(["preprocessed", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
+    assert "8 train, 8 test" in capsys.readouterr().out
+    store = PairStore(tmp_path / "store")
+    check(store, samples)
+    assert store.scenes == ("train", "test")
+    assert store.pair(0).focal == 800
+    assert prepare_preprocessed(tmp_path / "data", tmp_path / "store").counts == {"train": 8, "test": 8}
+
+
+def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(8)]
+    for s in samples:
+        count = s["num_points_2d"][0]
+        s["W_gt"] = np.resize(np.argsort(s["W_gt"][:count]), 40)
+    write(tmp_path, samples, "data61_2d3d")
+    prepare_preprocessed(tmp_path, tmp_path / "store")
+    check(PairStore(tmp_path / "store"), samples)
+
+
+def test_the_form_before_preprocessing(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(6)]
+    for split in ("train", "test"):
+        for scene, part in (("0001", samples[:3]), ("0002", samples[3:])):
+            folder = tmp_path / f"megadepth_{split}" / scene
+            folder.mkdir(parents=True)
+            rows = [np.hstack([s["p2d"][s["W_gt"]], s["p3d"]])[: s["num_points_2d"][0]] for s in part]
+            for name, values in (("matches", rows), ("R", [s["R_gt"] for s in part])):
+                (folder / f"{name}.pkl").write_bytes(pickle.dumps(values, 2))
+            (folder / "t.pkl").write_bytes(pickle.dumps([s["t_gt"][:, None] for s in part], 2))
+    prepare_preprocessed(tmp_path, tmp_path / "store")
+    store = PairStore(tmp_path / "store")
+    assert store.scenes == ("train/0001", "train/0002", "test/0001", "test/0002")
+    check(store, samples)
+
+
+BAD = {
+    "rotation": {"R_gt": np.ones((3, 3))},
+    "reflection": {"R_gt": -np.eye(3)},
+    "translation": {"t_gt": np.array([0, np.nan, 1])},
+    "2D points": {"p2d": np.full((40, 2), np.inf)},
+    "3D points": {"p3d": np.zeros((40, 2))},
+    "correspondences": {"W_gt": np.full(40, 77)},
+    "few correspondences": {"W_gt": np.zeros(2, int)},
+    "no correspondence": {"W_gt": np.full(40, -1)},
+    "no numbers": {"p2d": [["a", "b"]]},
+}
+
+
+def test_bad_samples_are_counted(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(20)] + [sample(30) | change for change in BAD.values()]
+    prepared = prepare_preprocessed(write(tmp_path, samples), tmp_path / "store")
+    assert prepared.counts == {"train": 20, "test": 20}
+    assert set(prepared.skipped) == {f"{split}/{20 + i:06d}" for split in ("train", "test") for i in range(len(BAD))}
+    assert all(reason.startswith("expected") for reason in prepared.skipped.values())
+
+
+class Exploit:
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, ("touch hacked",)
+
+
+def test_bad_sources_are_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    root, output = write(tmp_path / "data", [sample(i) for i in range(4)]), tmp_path / "store"
+    for content, message in (
+        (pickle.dumps([Exploit()]), "system"),
+        (b"", "p3d.pkl"),
+        (pickle.dumps(3), "dict or list"),
+        (pickle.dumps([]), "at least one sample"),
+        (pickle.dumps([np.zeros((4, 3))] * 3), "too, got"),
+    ):
+        (root / "modelnet40_test" / "preprocessed" / "p3d.pkl").write_bytes(content)
+        with pytest.raises(PickleError, match=message):
+            prepare_preprocessed(root, output)
+    (root / "modelnet40_test" / "preprocessed" / "p3d.pkl").unlink()
+    with pytest.raises(ValueError, match="no .*p3d.pkl"):
+        prepare_preprocessed(root, output)
+    write(tmp_path / "data", [sample(0)], "other")
+    with pytest.raises(ValueError, match="--dataset modelnet40"):
+        prepare_preprocessed(root, output)
+    with pytest.raises(ValueError, match="nowhere"):
+        prepare_preprocessed(tmp_path / "nowhere", output)
+    with pytest.raises(ValueError, match="got none"):
+        prepare_preprocessed(root / "other_test", output)
+    shifted = [sample(i) | {"t_gt": np.array([5.0, 5.0, 8.0])} for i in range(4)]
+    with pytest.raises(PickleError, match="project"):
+        prepare_preprocessed(write(tmp_path / "shifted", shifted), output)
+    unusable = [sample(i) | BAD["rotation"] for i in range(4)]
+    with pytest.raises(StoreError, match="at least one usable sample"):
+        prepare_preprocessed(write(tmp_path / "unusable", unusable), output)
+    assert not output.exists()
+    assert not Path("hacked").exists()
+
+
+def test_data_module(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(20)]
+    options = {"val_fraction": 0.2, "batch_size": 4, "cache_dir": str(tmp_path / "cache"), "max_points": 6}
+    options |= {"test_outliers": Outliers(ratio=1.0), "min_points": 5}
+    module = PreprocessedDataModule(str(write(tmp_path / "data", samples)), **options)
+    module.prepare_data()
+    module.setup()
+    names = [name for batch in module.train_dataloader() for name in batch.ids]
+    held_out = [name for batch in module.val_dataloader() for name in batch.ids]
+    assert sorted(names + held_out) == [f"train/{i:06d}" for i in range(20)]
+    assert len(held_out) == 4
+    for batch in module.test_dataloader():
+        true = (batch.match3d >= 0).sum(-1)
+        assert (batch.count2d == 2 * true).all()
+        assert (batch.count3d == 2 * true).all()
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+    again = PreprocessedDataModule(str(next((tmp_path / "cache").iterdir())), **options)
+    again.setup("test")
+    assert len(again.sources["test"].sizes) == 20
