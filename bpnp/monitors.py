@@ -1,0 +1,115 @@
+"""What a training shows while it runs: speed, where the assignment puts its mass, and pictures of a few pairs."""
+
+import os
+import time
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch import Callback
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+
+from bpnp.report.dashboards import image
+from bpnp.report.figures import plot_pair, save_figure
+from bpnp.report.views import PairView, views_from
+from bpnp.types import Batch, Prediction
+
+
+class OfflineWandbLogger(WandbLogger):
+    """Lightning's W&B logger that sends nothing unless asked: offline where WANDB_MODE is not set.
+
+    Args:
+        project, name: of the run.
+        save_dir: where the folder of an offline run goes, for `wandb sync`.
+    """
+
+    def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str = "runs") -> None:
+        os.makedirs(save_dir, exist_ok=True)
+        super().__init__(project=project, name=name, save_dir=save_dir, offline=not os.environ.get("WANDB_MODE"))
+
+
+class TrainingMonitor(Callback):
+    """Logs "train/pairs_per_second" per epoch and, of the first few validation pairs, "val/true_match_mass", the
+    probability that the assignment gives to their true matches, and "val/<estimate>_iterations" of each pose.
+
+    Every `every` epochs the same pairs are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
+    of the trainer's default_root_dir.
+
+    Args:
+        pairs: how many validation pairs are watched.
+        every: epochs between pictures; 0 for none.
+    """
+
+    def __init__(self, pairs: int = 4, every: int = 10) -> None:
+        if pairs < 1 or every < 0:
+            raise ValueError(f"expected pairs >= 1 and every >= 0, got {pairs} and {every}")
+        self.pairs = pairs
+        self.every = every
+        self.watched: Batch | None = None
+        self.started = 0.0
+        self.seen = 0
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.started, self.seen = time.perf_counter(), 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        self.seen += len(batch)
+        if trainer.is_last_batch:
+            # Before the validation that ends the epoch, which is no training.
+            seconds = time.perf_counter() - self.started
+            pairs = self.seen * trainer.world_size
+            pl_module.log("train/pairs_per_second", pairs / seconds, on_step=False, on_epoch=True, batch_size=1)
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        if batch_idx == 0 and self.watched is None:
+            self.watched = first_pairs(batch, self.pairs)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.watched is None or trainer.sanity_checking:
+            return
+        batch = self.watched.to(pl_module.device)
+        with torch.no_grad():
+            prediction = pl_module(batch)
+        values = {f"val/{key}": value for key, value in watched_values(prediction, batch).items()}
+        pl_module.log_dict(values, batch_size=len(batch), sync_dist=True)
+        if self.every and trainer.current_epoch % self.every == 0 and trainer.is_global_zero:
+            _draw(trainer, views_from(prediction, batch))
+
+
+def first_pairs(batch: Batch, count: int) -> Batch:
+    """The first pairs of a batch, on the CPU."""
+    parts: dict[str, Any] = {
+        name: value[:count].cpu() if isinstance(value, torch.Tensor) else value and value[:count]
+        for name, value in vars(batch).items()
+    }
+    return Batch(**parts)
+
+
+def watched_values(prediction: Prediction, batch: Batch) -> dict[str, torch.Tensor]:
+    """Mean over the pairs of the probability on true matches, and of the iterations of each pose."""
+    values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
+    if prediction.assignment is not None and batch.match3d is not None:
+        matched = batch.match3d >= 0
+        mass = prediction.assignment.gather(1, batch.match3d.clamp(min=0)[:, None]).squeeze(1)
+        values["true_match_mass"] = mass.where(matched, 0).sum(-1).mean()
+    return values
+
+
+def _draw(trainer: Trainer, views: list[PairView]) -> None:
+    drawn = False
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            logger.log_image("val/pairs", [image(plot_pair(view), caption=view.id) for view in views])
+            drawn = True
+        elif isinstance(logger, TensorBoardLogger):
+            for number, view in enumerate(views):
+                logger.experiment.add_figure(f"val/pair{number}", plot_pair(view), trainer.global_step)
+            drawn = True
+    if not drawn and trainer.loggers:
+        folder = os.path.join(trainer.default_root_dir, "pictures", f"epoch_{trainer.current_epoch:04d}")
+        for number, view in enumerate(views):
+            save_figure(plot_pair(view), os.path.join(folder, f"pair{number}.png"))

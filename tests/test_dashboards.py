@@ -1,0 +1,64 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_data import write_run
+
+from bpnp.report.dashboards import log_results, mode, scalars
+
+
+@pytest.fixture(autouse=True)
+def _offline(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+
+
+def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:
+    results = write_run(tmp_path, 20, 0)
+    summary = json.loads((tmp_path / "test" / "summary.json").read_text())
+    values = scalars(results)
+    for estimate, numbers in summary["estimates"].items():
+        assert {key: float(number) for key, number in numbers.items()} == {
+            key: values[f"test/{estimate}/{key}"] for key in numbers
+        }
+    assert values["test/rotation_q1_deg"] == summary["estimates"]["ransac"]["rotation_q1_deg"]
+    assert values["test/correspondence_loss"] == 0.25
+
+
+def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Path) -> None:
+    results = write_run(tmp_path, 20, 0)
+    run = log_results(tmp_path / "test", name="planted", directory=tmp_path / "wandb")
+    assert run.name.startswith("offline-run-")
+    media = run / "files" / "media"
+
+    def table(name: str) -> dict[str, list[object]]:
+        (path,) = (media / "table" / "test").glob(f"{name}*.json")
+        return json.loads(path.read_text())
+
+    pairs = table("pairs_")
+    column = pairs["columns"].index("rotation_error_deg")
+    assert [row[column] for row in pairs["data"]] == [row.rotation_error_deg for row in results.rows]  # type: ignore[index]
+    curve = table("recall_curve/rotation_error_deg")["data"]
+    for estimate in ("ransac", "pnp"):
+        errors = np.array([row.rotation_error_deg for row in results.rows if row.estimate == estimate])
+        drawn = [(row[0], row[2]) for row in curve if row[1] == estimate]  # type: ignore[index]
+        assert [share for _, share in drawn] == pytest.approx([(errors <= limit).mean() for limit, _ in drawn])
+    assert len(list((media / "images" / "test").glob("worst_pairs_*.png"))) == 2
+    assert len(list((media / "images" / "test").glob("recall_*.png"))) == 1
+    assert b"test/pnp/rotation_q2_deg" in next(run.glob("*.wandb")).read_bytes()
+
+
+def test_the_mode_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert mode() == "offline"
+    monkeypatch.setenv("WANDB_MODE", "disabled")
+    assert mode() == "disabled"
+
+
+def test_the_workspace_shows_what_is_logged() -> None:
+    pytest.importorskip("wandb_workspaces", reason="needs wandb-workspaces")
+    from bpnp.report.dashboards import workspace
+
+    shown = workspace("team", "bpnp")
+    metrics = {str(metric) for panel in shown.sections[0].panels[:2] for metric in panel.metrics}
+    known = {"rotation_q2_deg", "translation_q2", "reprojection_q2_deg", "recall_joint_15deg_0.5", "found"}
+    assert all(any(name in metric for metric in metrics) for name in known)
