@@ -1,0 +1,88 @@
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from planted import plant
+from scipy.spatial.transform import Rotation
+
+from bpnp.geometry import angle_between, bearings, camera_centre, hat, project, rotation_angle, transform
+
+
+def test_bearings_are_unit_rays_through_the_image_points() -> None:
+    points2d = torch.randn(3, 7, 2)
+    rays = bearings(points2d)
+    torch.testing.assert_close(torch.linalg.vector_norm(rays, dim=-1), torch.ones(3, 7))
+    torch.testing.assert_close(project(rays), points2d)
+    assert (rays[..., 2] > 0).all()
+    assert torch.equal(bearings(torch.zeros(2)), torch.tensor([0.0, 0.0, 1.0]))
+
+
+def test_projects_as_opencv_does() -> None:
+    planted = plant(1, 20)
+    seen = project(transform(*planted.pose, planted.points3d))[0]
+    vector = Rotation.from_matrix(planted.rotation[0].numpy()).as_rotvec()
+    expected, _ = cv2.projectPoints(
+        planted.points3d[0].numpy(), vector, planted.translation[0].numpy(), np.eye(3), np.zeros(4)
+    )
+    np.testing.assert_allclose(seen, expected[:, 0], atol=1e-12)
+
+
+def test_the_camera_centre_is_where_the_camera_frame_is_zero() -> None:
+    planted = plant(4, 5)
+    centre = camera_centre(*planted.pose)
+    assert transform(*planted.pose, centre.unsqueeze(1)).abs().max() < 1e-14
+
+
+def test_hat_is_the_cross_product() -> None:
+    a, b = torch.randn(2, 5, 3, dtype=torch.float64)
+    torch.testing.assert_close((hat(a) @ b.unsqueeze(-1)).squeeze(-1), torch.linalg.cross(a, b))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 1.0, math.pi / 2, 3.0, math.pi - 1e-9, math.pi])
+def test_angles_keep_their_digits(angle: float) -> None:
+    axis = np.array([0.48, 0.6, 0.64])
+    first = Rotation.from_rotvec([0.3, -0.2, 1.0])
+    second = first * Rotation.from_rotvec(angle * axis)
+    a, b = (torch.from_numpy(r.as_matrix()) for r in (first, second))
+    # Beyond a right angle the sine is found from a difference of entries of size one.
+    assert abs(float(rotation_angle(a, b)) - angle) < max(1e-15, 1e-15 * angle) * 4
+    x = torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)
+    y = torch.tensor([math.cos(angle), math.sin(angle), 0.0], dtype=torch.float64)
+    assert abs(float(angle_between(3 * x, 0.1 * y)) - angle) < 1e-15
+
+
+def test_rotation_angle_is_scipys_and_float32_resolves_small_ones() -> None:
+    generator = np.random.default_rng(0)
+    a, b = (Rotation.random(1000, rng=generator) for _ in range(2))
+    expected = (a.inv() * b).magnitude()
+    first, second = (torch.from_numpy(r.as_matrix()) for r in (a, b))
+    assert np.abs(rotation_angle(first, second).numpy() - expected).max() < 1e-12
+    near = Rotation.from_rotvec(1e-5 * generator.normal(size=(1000, 3)))
+    turned = torch.from_numpy((a * near).as_matrix())
+    assert np.abs(rotation_angle(first.float(), turned.float()).numpy() - near.magnitude()).max() < 1e-6
+
+
+def test_angle_between_broadcasts() -> None:
+    a, b = torch.randn(2, 5, 1, 3, dtype=torch.float64), torch.randn(2, 1, 4, 3, dtype=torch.float64)
+    angles = angle_between(a, b)
+    assert angles.shape == (2, 5, 4)
+    one = angle_between(a[1, 2, 0], b[1, 0, 3])
+    torch.testing.assert_close(angles[1, 2, 3], one)
+    cosine = torch.nn.functional.cosine_similarity(a, b, dim=-1)
+    torch.testing.assert_close(angles, torch.arccos(cosine))
+
+
+def test_gradients_are_finite_where_angles_end() -> None:
+    rotation = torch.eye(3).unsqueeze(0).repeat(3, 1, 1)
+    half_turn = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])
+    other = torch.stack([torch.eye(3), half_turn, half_turn.roll(1, 0).roll(1, 1)]).requires_grad_()
+    rotation_angle(rotation, other).sum().backward()
+    assert other.grad is not None
+    assert other.grad.isfinite().all()
+    x = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0.0, 0, 0]], requires_grad=True)
+    y = torch.tensor([[2.0, 0, 0], [-1.0, 0, 0], [1.0, 0, 0]])
+    angle_between(x, y).sum().backward()
+    assert x.grad is not None
+    assert x.grad.isfinite().all()

@@ -1,0 +1,193 @@
+import itertools
+import math
+from collections.abc import Callable
+
+import mpmath
+import pytest
+import torch
+from torch import Tensor
+from torch.autograd import gradcheck
+
+from bpnp.layers import sinkhorn
+from bpnp.layers.implicit import at_optimum
+
+EXACT = {"tolerance": 1e-14, "max_iterations": 5000}
+
+
+def uniform(*shape: int, seed: int = 0, low: float = 0.0, high: float = 1.0) -> Tensor:
+    return low + (high - low) * torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def marginals(logits: Tensor) -> Tensor:
+    """Totals stay one, whatever the logits."""
+    return torch.softmax(logits, -1)
+
+
+def gradient(of: Tensor, plan: Callable[[Tensor], Tensor], weights: Tensor) -> Tensor:
+    variable = of.detach().clone().requires_grad_()
+    (plan(variable) * weights).sum().backward()
+    assert variable.grad is not None
+    return variable.grad
+
+
+def projected(plan: Tensor, weights: Tensor, mu: float) -> Tensor:
+    """-P.(V - a1^T - 1b^T)/mu of one sample with the multipliers solved for in 150 digits."""
+    p, v = (mpmath.matrix(x.detach().double().tolist()) for x in (plan.clamp_min(1e-35), weights))
+    m, n = plan.shape
+    with mpmath.workdps(150):
+        rows, cols = [mpmath.fsum(p[i, :]) for i in range(m)], [mpmath.fsum(p[:, j]) for j in range(n)]
+        system, right = mpmath.diag(rows + cols), mpmath.zeros(m + n, 1)
+        for i, j in itertools.product(range(m), range(n)):
+            system[i, m + j] = system[m + j, i] = p[i, j]
+            right[i] += p[i, j] * v[i, j]
+            right[m + j] += p[i, j] * v[i, j]
+        k = m + n - 1  # the last multiplier is zero: only sums a + b count
+        x = [*mpmath.lu_solve(system[:k, :k], right[:k, 0]), mpmath.mpf(0)]
+        found = [[float(p[i, j] * (v[i, j] - x[i] - x[m + j]) / -mu) for j in range(n)] for i in range(m)]
+    return torch.tensor(found, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("shape", [(2, 5, 5), (2, 4, 7), (1, 1, 4), (1, 5, 1)])
+@pytest.mark.parametrize("mu", [0.5, 0.1])
+def test_gradcheck_cost_mu_and_marginals(shape: tuple[int, int, int], mu: float) -> None:
+    b, m, n = shape
+
+    def plan(cost: Tensor, mu: Tensor, rows: Tensor, cols: Tensor) -> Tensor:
+        return sinkhorn(cost, mu=mu, row_marginal=marginals(rows), col_marginal=marginals(cols), **EXACT)[0]
+
+    inputs = (uniform(*shape), torch.tensor(mu).double(), uniform(b, m, seed=1), uniform(b, n, seed=2))
+    assert gradcheck(plan, tuple(x.requires_grad_() for x in inputs), atol=1e-7)
+
+
+def test_gradcheck_dustbin_and_padding() -> None:
+    mask2d, mask3d = torch.tensor([[1, 1, 1, 1], [1, 1, 0, 0]]).bool(), torch.tensor([[1, 1, 1], [1, 1, 0]]).bool()
+
+    def plan(cost: Tensor, mu: Tensor, dustbin: Tensor) -> Tensor:
+        return sinkhorn(cost, mu=mu, dustbin=dustbin, mask2d=mask2d, mask3d=mask3d, **EXACT)[0]
+
+    inputs = (uniform(2, 4, 3), torch.tensor(0.2).double(), torch.tensor(0.4).double())
+    assert gradcheck(plan, tuple(x.requires_grad_() for x in inputs), atol=1e-7)
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.05, 0.02])
+def test_equals_autograd_through_a_long_plain_iteration(mu: float) -> None:
+    cost, weights = uniform(2, 6, 5), uniform(2, 6, 5, seed=3)
+    rows, cols = marginals(uniform(2, 6, seed=1)), marginals(uniform(2, 5, seed=2))
+
+    def unrolled(cost: Tensor) -> Tensor:
+        kernel, v = -cost / mu, torch.zeros_like(cols)
+        for _ in range(1500):
+            u = rows.log() - torch.logsumexp(kernel + v.unsqueeze(-2), -1)
+            v = cols.log() - torch.logsumexp(kernel + u.unsqueeze(-1), -2)
+        return (kernel + u.unsqueeze(-1) + v.unsqueeze(-2)).exp()
+
+    def implicit(cost: Tensor) -> Tensor:
+        accuracy = EXACT if cost.dtype == torch.float64 else {}
+        return sinkhorn(cost, mu=mu, row_marginal=rows, col_marginal=cols, **accuracy)[0]
+
+    expected = gradient(cost, unrolled, weights)
+    assert (gradient(cost, implicit, weights) - expected).abs().max() < 1e-10 * expected.abs().max()
+    rows, cols = rows.float(), cols.float()
+    single = gradient(cost.float(), implicit, weights.float())
+    assert (single - expected).abs().max() < 1e-4 * expected.abs().max()
+
+
+def test_short_of_convergence_it_is_the_gradient_of_the_problem_that_was_solved() -> None:
+    cost, weights = uniform(2, 8, 6), uniform(2, 8, 6, seed=3)
+    plan, stats = sinkhorn(cost, mu=0.03, max_iterations=2)
+    assert not stats.converged.any()
+    solved = {"row_marginal": plan.sum(-1), "col_marginal": plan.sum(-2)}
+    again, stats = sinkhorn(cost, mu=0.03, **solved, **EXACT)
+    assert stats.converged.all()
+    assert (again - plan).abs().max() < 1e-13
+    short = gradient(cost, lambda c: sinkhorn(c, mu=0.03, max_iterations=2)[0], weights)
+    expected = gradient(cost, lambda c: sinkhorn(c, mu=0.03, **solved, **EXACT)[0], weights)
+    assert (short - expected).abs().max() < 1e-11 * expected.abs().max()
+
+
+def test_the_envelope_theorem_holds() -> None:
+    """<P, cost> + mu sum P (log P - 1) is optimal in P: its derivative in the cost is P, in mu the entropy term."""
+    cost, mu = uniform(2, 5, 6).requires_grad_(), torch.tensor(0.1, dtype=torch.float64, requires_grad=True)
+    plan, _ = sinkhorn(cost, mu=mu, **EXACT)
+    ((plan * cost).sum() + mu * (plan * (plan.log() - 1)).sum()).backward()
+    assert cost.grad is not None
+    assert mu.grad is not None
+    assert (cost.grad - plan).abs().max() < 1e-12
+    assert abs(mu.grad - (plan * (plan.log() - 1)).sum()) < 1e-11
+
+
+def clusters(seed: int, n: int, *, groups: int = 4) -> Tensor:
+    """Distances between unit vectors in a few far groups: between them the plan falls to nothing."""
+    generator = torch.Generator().manual_seed(seed)
+    angle = torch.randint(0, groups, (n,), generator=generator) * (2 * math.pi / groups)
+    angle = angle + 0.15 * torch.randn(n, generator=generator)
+    other = angle + 0.05 * torch.randn(n, generator=generator)
+    return torch.cdist(*(torch.stack([a.cos(), a.sin()], -1) for a in (angle, other))).unsqueeze(0)
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.05, 0.02, 0.01, 0.005])
+@pytest.mark.parametrize(("dtype", "digits"), [(torch.float32, 4e-6), (torch.float64, 1e-10)])
+def test_weak_links_between_groups_spoil_no_gradient(mu: float, dtype: torch.dtype, digits: float) -> None:
+    for seed in range(4):
+        cost, weights = clusters(seed, 10).to(dtype), uniform(1, 10, 10, seed=seed, low=-1).to(dtype)
+        plan, stats = sinkhorn(cost, mu=mu)
+        assert stats.converged.all()
+        found = gradient(cost, lambda c: sinkhorn(c, mu=mu)[0], weights)[0].double()
+        scale = float((plan * weights).abs().max()) / mu
+        assert (found - projected(plan[0], weights[0], mu)).abs().max() < digits * scale
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("gap", [0.0, 1e-6, 0.3, 0.45, 1.0, 2.0, 4.0, 8.0, 100.0])
+def test_from_equal_costs_to_an_exact_permutation(dtype: torch.dtype, gap: float) -> None:
+    n, mu = 10, 0.05  # at 0.45, 99.9 % of the mass is on the diagonal; at 8 the rest underflows in float32
+    cost = (gap * (1 - torch.eye(n, dtype=dtype))).unsqueeze(0)
+    weights = uniform(1, n, n, low=-1).to(dtype)
+    plan, _ = sinkhorn(cost, mu=mu)
+    found = gradient(cost, lambda c: sinkhorn(c, mu=mu)[0], weights)[0].double()
+    scale = float((plan * weights).abs().max()) / mu
+    assert found.isfinite().all()
+    assert (found - projected(plan[0], weights[0], mu)).abs().max() < 32 * torch.finfo(dtype).eps * scale
+
+
+@pytest.mark.parametrize("size", [0, 1e-30, 1e30])
+def test_gradients_of_any_size_are_finite(size: float) -> None:
+    cost = uniform(2, 6, 6).float()
+    cost[1] = 3 * (1 - torch.eye(6))
+    found = gradient(cost, lambda c: sinkhorn(c, mu=0.05)[0], size * uniform(2, 6, 6, seed=1).float())
+    assert found.isfinite().all()
+
+
+def test_neighbours_and_padding_leave_gradients_alone() -> None:
+    cost, weights = uniform(3, 6, 7), uniform(3, 6, 7, seed=1)
+    cost[1] = 2 * (1 - torch.eye(7)[:6])
+    mask2d, mask3d = torch.ones(3, 6, dtype=torch.bool), torch.ones(3, 7, dtype=torch.bool)
+    mask2d[2, 4:], mask3d[2, 3:] = False, False
+    together = gradient(cost, lambda c: sinkhorn(c, mu=0.05, mask2d=mask2d, mask3d=mask3d)[0], weights)
+    first = gradient(cost[:1], lambda c: sinkhorn(c, mu=0.05)[0], weights[:1])
+    last = gradient(cost[2:, :4, :3], lambda c: sinkhorn(c, mu=0.05)[0], weights[2:, :4, :3])
+    assert (together[0] - first[0]).abs().max() < 1e-12 * first.abs().max()
+    assert (together[2, :4, :3] - last[0]).abs().max() < 1e-12 * last.abs().max()
+    assert not together[2, 4:].any()
+    assert not together[2, :, 3:].any()
+
+
+def test_at_optimum_differentiates_any_root() -> None:
+    """Ridge regression: y = (A^T A + s I)^-1 A^T x, from its optimality condition alone."""
+    design, target = uniform(1, 5, 3), uniform(1, 5, seed=1)
+
+    def solve(target: Tensor, strength: Tensor) -> Tensor:
+        def hessian(strength: Tensor) -> Tensor:
+            return design.mT @ design + strength * torch.eye(3).double()
+
+        def optimality(y: Tensor, x: Tensor, s: Tensor) -> Tensor:
+            return (hessian(s) @ y.unsqueeze(-1) - design.mT @ x.unsqueeze(-1)).squeeze(-1)
+
+        with torch.no_grad():
+            normal = hessian(strength)
+            y = torch.linalg.solve(normal, (design.mT @ target.unsqueeze(-1)).squeeze(-1))
+        return at_optimum(y, optimality, lambda v: torch.linalg.solve(normal, v), target, strength)
+
+    inputs = (target.requires_grad_(), torch.tensor(0.3, dtype=torch.float64, requires_grad=True))
+    assert gradcheck(solve, inputs)
+    assert gradcheck(lambda t: solve(t, inputs[1].detach()), inputs[:1])

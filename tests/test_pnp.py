@@ -1,0 +1,241 @@
+from typing import Any
+
+import jaxtyping
+import pytest
+import roma
+import torch
+from planted import Planted, plant
+from torch import Tensor
+
+from bpnp.geometry import camera_centre, hat, rotation_angle, transform
+from bpnp.layers import WeightedPnP, weighted_pnp
+from bpnp.layers.objective import aggregate, dense_objective, derivatives, pose_gradient
+from bpnp.types import SolveStats
+
+Solved = tuple[Tensor, Tensor, SolveStats]
+
+
+def solve(planted: Planted, assignment: Tensor, start: tuple[Tensor, Tensor], **options: Any) -> Solved:
+    return weighted_pnp(assignment, planted.bearings, planted.points3d, *start, **options)
+
+
+def apart(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> float:
+    """Largest angle in radians or distance between the poses of two lists."""
+    return torch.maximum(rotation_angle(a[0], b[0]), (a[1] - b[1]).norm(dim=-1)).max().item()
+
+
+def test_aggregated_objective_is_the_dense_one_up_to_the_total() -> None:
+    planted = plant(8, 30, outliers2d=20, seed=1)
+    assignment = planted.diffuse(0.3)
+    q = aggregate(assignment, planted.bearings)
+    for amount in (0, 0.3, 3):
+        rotation, translation = planted.near(amount)
+        dense = dense_objective(assignment, planted.bearings, planted.points3d, rotation, translation)
+        value = derivatives(q, planted.points3d, rotation, translation).value
+        assert (assignment.sum((-2, -1)) + value - dense).abs().max() < 1e-13
+
+
+def test_gradient_and_hessian_are_those_of_autograd() -> None:
+    planted = plant(3, 12, outliers2d=5, seed=2)
+    assignment = planted.diffuse(0.3)
+    rotation, translation = planted.near(0.4)
+    found = derivatives(aggregate(assignment, planted.bearings), planted.points3d, rotation, translation)
+    for i in range(3):
+
+        def value(step: Tensor, i: int = i) -> Tensor:
+            turn = torch.eye(3) + hat(step[:, :3]) + hat(step[:, :3]) @ hat(step[:, :3]) / 2  # exp to second order
+            moved = turn @ rotation[i : i + 1], translation[i : i + 1] + step[:, 3:]
+            some = (x[i : i + 1] for x in (assignment, planted.bearings, planted.points3d))
+            return dense_objective(*some, *moved).sum()
+
+        zero = torch.zeros(1, 6, dtype=torch.float64)
+        gradient = torch.autograd.functional.jacobian(value, zero)[0]
+        hessian = torch.autograd.functional.hessian(value, zero)[0, :, 0]
+        assert (found.gradient[i] - gradient).abs().max() < 1e-13
+        assert (found.hessian[i] - hessian).abs().max() < 1e-13
+    q = aggregate(assignment, planted.bearings)
+    assert torch.equal(pose_gradient(q, planted.points3d, rotation, translation), found.gradient)
+
+
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+def test_recovers_a_planted_pose(method: str) -> None:
+    planted = plant(12, 25, outliers2d=6, outliers3d=9)
+    *found, stats = solve(planted, planted.permutation(), planted.near(0.15), method=method, tolerance=1e-12)
+    assert stats.converged.all()
+    assert apart((found[0], found[1]), planted.pose) < (1e-9 if method == "newton" else 5e-6)
+    assert torch.linalg.det(found[0]).sub(1).abs().max() < 1e-11
+
+
+def test_newton_and_lbfgs_end_at_the_same_optimum() -> None:
+    for scale, outliers in ((0.02, 0), (0.05, 10), (0.1, 20)):
+        planted = plant(10, 40, outliers2d=outliers, noise=0.005, seed=4)
+        assignment = planted.diffuse(scale)
+        *newton, stats = solve(planted, assignment, planted.near(0.1))
+        *lbfgs, lbfgs_stats = solve(planted, assignment, planted.near(0.1), method="lbfgs", max_iterations=200)
+        assert stats.converged.all()
+        assert lbfgs_stats.converged.all()
+        assert stats.iterations.max() < 15
+        assert apart((newton[0], newton[1]), (lbfgs[0], lbfgs[1])) < 5e-6
+
+
+def test_float32_points_find_the_same_optimum() -> None:
+    planted = plant(6, 60, seed=5)
+    assignment = planted.diffuse(0.05)
+    *exact, _ = solve(planted, assignment, planted.near(0.1))
+    start = tuple(x.float() for x in planted.near(0.1))
+    single = weighted_pnp(assignment.float(), planted.bearings.float(), planted.points3d.float(), *start)
+    assert single[0].dtype == torch.float32
+    assert single[2].converged.all()
+    assert apart((single[0].double(), single[1].double()), (exact[0], exact[1])) < 1e-5
+
+
+def test_a_rounded_start_is_brought_to_a_rotation() -> None:
+    planted = plant(4, 20)
+    rotation, translation = planted.near(0.1)
+    found, _, stats = solve(planted, planted.permutation(), ((100 * rotation).round() / 100, translation))
+    assert stats.converged.all()
+    assert (found.mT @ found - torch.eye(3)).abs().max() < 1e-14
+    assert rotation_angle(found, planted.rotation).max() < 1e-7
+
+
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e3, 0.0), (1e-3, 0.0), (1.0, 1e4)])
+def test_gradients_are_finite_differences(method: str, scale: float, offset: float) -> None:
+    """All central differences are samples of one batch, solved by Newton to 1e-13; the gradient is either method's."""
+    planted = plant(1, 6, outliers2d=2, seed=7)
+    rotation, translation = planted.near(0.05)
+    start = rotation, scale * translation - offset * rotation.sum(-1)
+    sizes = [48, 24, 18]
+
+    def poses(inputs: Tensor, **options: Any) -> Tensor:
+        p, f, x = inputs.split(sizes, -1)
+        variables = p.unflatten(-1, (8, 6)), f.unflatten(-1, (8, 3)), scale * x.unflatten(-1, (6, 3)) + offset
+        r, t, stats = weighted_pnp(*variables, *(s.expand(len(p), *s.shape[1:]) for s in start), **options)
+        assert stats.converged.all()
+        return torch.cat([r.flatten(1), (camera_centre(r, t) - offset) / scale], -1)
+
+    at = torch.cat([x.flatten() for x in (planted.diffuse(0.2), planted.bearings, planted.points3d)])
+    step = 1e-5 * torch.eye(len(at), dtype=torch.float64)
+    exact = {"tolerance": 1e-13}
+    differences = (poses(at + step, **exact) - poses(at - step, **exact)) / 2e-5
+    options = exact if method == "newton" else {"method": "lbfgs", "max_iterations": 200}
+    jacobian = torch.autograd.functional.jacobian(lambda x: poses(x.unsqueeze(0), **options)[0], at)
+    for analytic, numeric in zip(jacobian.mT.split(sizes), differences.split(sizes), strict=True):
+        assert (analytic - numeric).abs().max() < (1e-5 if method == "newton" else 1e-4) * numeric.abs().max()
+
+
+def test_the_pose_moves_with_the_scene() -> None:
+    planted = plant(5, 30, noise=0.01, seed=8)
+    assignment = planted.diffuse(0.1)
+    rotation, translation = planted.near(0.1)
+    r, t, _ = solve(planted, assignment, (rotation, translation), tolerance=1e-12)
+    turn, shift = roma.random_rotmat(dtype=torch.float64), 100 * torch.randn(3, dtype=torch.float64)
+    for scale in (1e-3, 1.0, 1e3):
+        points3d = scale * planted.points3d @ turn.mT + shift  # p' = s A p + d
+        start_r = rotation @ turn.mT
+        start_t = scale * translation - start_r @ shift
+        found = weighted_pnp(assignment, planted.bearings, points3d, start_r, start_t, tolerance=1e-12)
+        assert found[2].converged.all()
+        assert rotation_angle(found[0], r @ turn.mT).max() < 1e-9
+        assert ((found[1] + found[0] @ shift) / scale - t).abs().max() < 1e-8
+
+
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+def test_padding_neighbours_and_batch_size_change_nothing(method: str) -> None:
+    planted = plant(4, 20, outliers2d=5, noise=0.01, seed=9)
+    assignment, start = planted.diffuse(0.1), planted.near(0.1)
+    r, t, stats = solve(planted, assignment, start, method=method)
+    pad = torch.nn.functional.pad
+    padded = weighted_pnp(
+        pad(assignment, (0, 7, 0, 4)),
+        pad(planted.bearings, (0, 0, 0, 4), value=0.6),
+        pad(planted.points3d, (0, 0, 0, 7), value=-30.0),
+        *start,
+        method=method,
+    )
+    assert apart((padded[0], padded[1]), (r, t)) < 1e-7
+    assert torch.equal(padded[2].converged, stats.converged)
+    for i in range(4):
+        some = [x[i : i + 1] for x in (assignment, planted.bearings, planted.points3d, *start)]
+        alone = weighted_pnp(*some, method=method)
+        assert apart((alone[0], alone[1]), (r[i : i + 1], t[i : i + 1])) < 1e-7
+
+
+def degenerate(kind: str, planted: Planted) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Assignment, 3D points and start whose first sample has no well-posed optimum."""
+    assignment, points3d = planted.permutation(), planted.points3d.clone()
+    rotation, translation = (x.clone() for x in planted.near(0.05))
+    if kind == "collinear":
+        points3d[0, :, 1:] = 0
+    elif kind == "one place":
+        points3d[0] = 0.5
+    elif kind in ("one point", "two points"):
+        assignment[0, :, ("one point", "two points").index(kind) + 1 :] = 0
+    elif kind == "nothing assigned":
+        assignment[0] = 0
+    elif kind == "no start":
+        rotation[0], translation[0] = torch.nan, torch.nan
+    elif kind == "start at infinity":
+        translation[0, 2] = 1e9
+    elif kind == "assignment NaN":
+        assignment[0, 0, 0] = torch.nan
+    return assignment, points3d, rotation, translation
+
+
+@pytest.mark.parametrize("method", ["newton", "lbfgs"])
+@pytest.mark.parametrize("kind", ["collinear", "one place", "one point", "two points", "nothing assigned", "no start",
+                                  "start at infinity", "assignment NaN"])  # fmt: skip
+def test_what_has_no_pose_is_flagged_and_spoils_nothing(method: str, kind: str) -> None:
+    planted = plant(3, 12, seed=10)
+    assignment, points3d, *start = degenerate(kind, planted)
+    variables = [x.clone().requires_grad_() for x in (assignment, planted.bearings, points3d)]
+    r, t, stats = weighted_pnp(*variables, *start, method=method)
+    assert stats.converged.tolist() == [False, True, True]
+    assert apart((r[1:], t[1:]), (planted.rotation[1:], planted.translation[1:])) < 1e-6
+    torch.nansum(r).add(torch.nansum(t)).backward()
+    if kind != "assignment NaN":  # NaN in, NaN out
+        assert all(x.grad is not None and not x.grad[0].any() for x in variables)
+    expected = [x[1:].detach().clone().requires_grad_() for x in variables]
+    alone = weighted_pnp(*expected, *(x[1:] for x in start), method=method)
+    alone[0].sum().add(alone[1].sum()).backward()
+    for x, y in zip(variables, expected, strict=True):
+        assert x.grad is not None
+        assert y.grad is not None
+        assert (x.grad[1:] - y.grad).abs().max() < 1e-4 * y.grad.abs().max()
+
+
+@pytest.mark.parametrize("kind", ["coplanar", "three points"])
+def test_minimal_and_flat_scenes_have_a_pose(kind: str) -> None:
+    planted = plant(4, 12, seed=11)
+    if kind == "coplanar":
+        points3d = planted.points3d * torch.tensor([1, 1, 0]).double()
+        camera = transform(*planted.pose, points3d)
+        seen = camera[..., :2] / camera[..., 2:]
+        points2d = torch.empty_like(seen).scatter_(1, planted.match3d.unsqueeze(-1).expand_as(seen), seen)
+        planted = Planted(points2d, points3d, *planted.pose, planted.match3d)
+    assignment = planted.permutation()
+    if kind == "three points":
+        assignment[:, :, 3:] = 0
+    *found, stats = solve(planted, assignment, planted.near(0.02), tolerance=1e-12)
+    assert stats.converged.all()
+    assert apart((found[0], found[1]), planted.pose) < 1e-5
+
+
+def test_from_behind_it_turns_round_or_says_so() -> None:
+    planted = plant(8, 30, seed=12)
+    r, t, stats = solve(planted, planted.permutation(), (planted.rotation, -planted.translation))
+    in_front = (transform(r, t, planted.points3d)[..., 2] > 0).all(-1)
+    assert (in_front | ~stats.converged).all()
+    assert stats.residual.isfinite().all()
+
+
+def test_module_and_method_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    planted = plant(2, 10)
+    inputs = (planted.permutation(), planted.bearings, planted.points3d, *planted.near(0.2))
+    r, _, stats = WeightedPnP(max_iterations=1)(*inputs)
+    assert stats.iterations.tolist() == [1, 1]
+    assert not stats.converged.any()
+    assert torch.equal(r, weighted_pnp(*inputs, max_iterations=1)[0])
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
+    with pytest.raises(ValueError, match="expected `method` 'newton' or 'lbfgs', got 'adam'"):
+        weighted_pnp(*inputs, method="adam")
