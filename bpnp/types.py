@@ -119,8 +119,8 @@ class Batch:
         """Pad and mask one pair, or lists of pairs of different sizes.
 
         points2d (m, 2) and points3d (n, 3) for one pair, or sequences of such arrays; rotation (3, 3), translation
-        (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D array is, else float32;
-        the batch is on the CPU.
+        (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D
+        array is, else float32; the batch is on the CPU.
 
         Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
         or a match3d index that is no 2D point.

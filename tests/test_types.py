@@ -1,0 +1,179 @@
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from bpnp import Batch, Pose, SolveStats
+from bpnp.types import Prediction
+
+
+def pair(m: int, n: int, *, seed: int = 0, dtype: Any = np.float32) -> dict[str, Any]:
+    rng = np.random.default_rng(seed)
+    return {
+        "points2d": rng.normal(size=(m, 2)).astype(dtype),
+        "points3d": rng.normal(size=(n, 3)).astype(dtype),
+        "rotation": np.eye(3),
+        "translation": rng.normal(size=3),
+        "match3d": rng.integers(-1, m, n),
+        "focal": 500.0 + seed,
+    }
+
+
+def lists(*pairs: dict[str, Any]) -> dict[str, Any]:
+    return {name: [p[name] for p in pairs] for name in pairs[0]}
+
+
+def test_one_pair() -> None:
+    given = pair(5, 7)
+    batch = Batch.from_arrays(**given)
+    assert len(batch) == 1
+    assert (batch.count2d.tolist(), batch.count3d.tolist()) == ([5], [7])
+    assert batch.ids == ("0",)
+    for name in ("points2d", "points3d", "rotation", "translation", "match3d"):
+        np.testing.assert_allclose(getattr(batch, name)[0].numpy(), given[name], rtol=1e-6)
+    assert batch.focal.tolist() == [500]
+    assert batch.match3d is not None
+    assert batch.match3d.dtype == torch.long
+
+
+def test_lists_of_pairs_are_padded_and_masked() -> None:
+    sizes = [(5, 7), (9, 2), (1, 1)]
+    given = [pair(m, n, seed=i) for i, (m, n) in enumerate(sizes)]
+    batch = Batch.from_arrays(**lists(*given), index=[4, 0, 9], ids=["a", "b", "c"])
+    assert (batch.points2d.shape, batch.points3d.shape) == ((3, 9, 2), (3, 7, 3))
+    assert (batch.index.tolist(), batch.ids) == ([4, 0, 9], ("a", "b", "c"))
+    assert batch.match3d is not None
+    for i, (m, n) in enumerate(sizes):
+        assert batch.mask2d[i].tolist() == [True] * m + [False] * (9 - m)
+        assert batch.mask3d[i].tolist() == [True] * n + [False] * (7 - n)
+        assert np.array_equal(batch.points2d[i, :m].numpy(), given[i]["points2d"])
+        assert np.array_equal(batch.points3d[i, :n].numpy(), given[i]["points3d"])
+        assert np.array_equal(batch.match3d[i, :n].numpy(), given[i]["match3d"])
+        assert not batch.points2d[i, m:].any()
+        assert not batch.points3d[i, n:].any()
+        assert (batch.match3d[i, n:] == -1).all()
+
+
+def test_numpy_torch_lists_and_stacks_give_the_same() -> None:
+    given = [pair(4, 6, seed=i) for i in range(2)]
+    arrays = lists(*given)
+    expected = Batch.from_arrays(**arrays)
+    forms = [
+        {name: [torch.as_tensor(x) for x in values] for name, values in arrays.items()},
+        {name: np.stack(values) for name, values in arrays.items()},
+        {name: torch.as_tensor(np.stack(values)) for name, values in arrays.items()},
+        {name: tuple(values) for name, values in arrays.items()},
+    ]
+    for form in forms:
+        batch = Batch.from_arrays(**form)
+        for name in ("points2d", "points3d", "mask2d", "mask3d", "rotation", "translation", "match3d", "focal"):
+            assert torch.equal(getattr(batch, name), getattr(expected, name))
+
+
+@pytest.mark.parametrize("points", [[[0.1, 0.2], [0.3, 0.4]], np.array([[0.1, 0.2], [0.3, 0.4]])[::-1],
+                                    np.array([[0.1, 0.2], [0.3, 0.4]], ">f8"), [[1, 2], [3, 4]]])  # fmt: skip
+def test_takes_what_numpy_takes(points: Any) -> None:
+    batch = Batch.from_arrays(points, np.zeros((3, 3)))
+    np.testing.assert_allclose(batch.points2d[0].numpy(), np.array(points, float))
+
+
+def test_is_a_copy_of_a_read_only_array() -> None:
+    points2d = np.zeros((4, 2), np.float32)
+    points2d.flags.writeable = False
+    batch = Batch.from_arrays(points2d, np.zeros((4, 3)))
+    batch.points2d.add_(1)
+    assert not points2d.any()
+
+
+def test_float64_is_kept_and_the_rest_is_float32() -> None:
+    batch = Batch.from_arrays(**pair(3, 4, dtype=np.float64))
+    assert batch.points3d.dtype == batch.rotation.dtype == batch.focal.dtype == torch.float64
+    assert Batch.from_arrays(np.zeros((3, 2), np.float16), np.zeros((3, 3))).points3d.dtype == torch.float32
+    assert Batch.from_arrays(np.zeros((3, 2), int), np.zeros((3, 3))).points2d.dtype == torch.float32
+
+
+def test_one_focal_serves_all() -> None:
+    arrays = lists(pair(3, 4), pair(5, 5))
+    assert Batch.from_arrays(**{**arrays, "focal": 800.0}).focal.tolist() == [800, 800]
+    assert Batch.from_arrays(arrays["points2d"], arrays["points3d"]).focal.tolist() == [1, 1]
+
+
+NAN = np.array([[0.0, 0.0], [np.nan, 1.0]])
+WRONG = {
+    r"`points2d` of shape \(k, 2\), got \(7, 3\) in pair 0 \(are points2d and points3d swapped\?\)": {
+        "points2d": np.zeros((7, 3)),
+        "points3d": np.zeros((7, 2)),
+    },
+    r"`points3d` of shape \(k, 3\), got \(5, 4\)": {"points3d": np.zeros((5, 4))},
+    r"finite `points2d`, got \[nan, 1.0\] at point 1 of pair 0": {"points2d": NAN, "match3d": None},
+    r"finite `points3d`": {"points3d": np.full((7, 3), np.inf)},
+    r"finite `rotation`": {"rotation": np.full((3, 3), np.nan)},
+    r"finite `translation`": {"translation": np.full(3, np.inf)},
+    r"at least one point in `points2d`, got none in pair 0": {"points2d": np.zeros((0, 2))},
+    r"at least one point in `points3d`, got none": {"points3d": np.zeros((0, 3))},
+    r"at least one pair, got an empty `points2d`": {"points2d": np.zeros((0, 5, 2))},
+    r"`points3d` for 1 pairs as in `points2d`, got 2": {"points3d": [np.zeros((7, 3))] * 2},
+    r"`rotation` for 1 pairs as in `points2d`, got 2": {"rotation": np.zeros((2, 3, 3))},
+    r"`focal` for 1 pairs": {"focal": [1.0, 2.0]},
+    r"`ids` for 1 pairs": {"ids": ["a", "b"]},
+    r"`index` for 1 pairs": {"index": [1, 2]},
+    r"`rotation` of shape \(3, 3\), got \(3, 4\)": {"rotation": np.zeros((3, 4))},
+    r"`translation` of shape \(3,\), got \(4,\)": {"translation": np.zeros(4)},
+    r"`match3d` of shape \(7,\), one entry a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
+    r"`match3d` between -1 and 4, got 0 to 5": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
+    r"`match3d` between -1 and 4, got -2": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
+    r"`points2d` as an array of numbers or a list of them, got None": {"points2d": None},
+    r"`points3d` as an array of numbers or a list of them, got 'scene.ply'": {"points3d": "scene.ply"},
+}
+
+
+@pytest.mark.parametrize("message", WRONG)
+def test_says_what_is_wrong(message: str) -> None:
+    with pytest.raises(ValueError, match="expected " + message):
+        Batch.from_arrays(**{**pair(5, 7), **WRONG[message]})
+
+
+def test_names_the_pair() -> None:
+    arrays = lists(pair(3, 4), pair(5, 5))
+    arrays["points2d"][1] = arrays["points2d"][1][:, :1]
+    with pytest.raises(ValueError, match="in pair 1"):
+        Batch.from_arrays(**arrays)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.bfloat16])
+def test_a_dtype_leaves_masks_and_indices_alone(dtype: torch.dtype) -> None:
+    batch = Batch.from_arrays(np.zeros((3000, 2)), np.zeros((3000, 3)), match3d=np.arange(3000), index=[70_001])
+    moved = batch.to(dtype)
+    assert moved.points2d.dtype == moved.points3d.dtype == moved.focal.dtype == dtype
+    assert moved.mask2d.dtype == torch.bool
+    assert moved.match3d is not None
+    assert batch.match3d is not None
+    assert torch.equal(moved.match3d, batch.match3d)
+    assert moved.index.tolist() == [70_001]
+    assert moved.ids == batch.ids
+    assert moved.rotation is None
+
+
+def test_a_batch_moves_and_pins_as_a_tensor_does() -> None:
+    batch = Batch.from_arrays(**pair(3, 4))
+    moved = batch.to("meta", non_blocking=True)
+    tensors = [x for x in vars(moved).values() if isinstance(x, torch.Tensor)]
+    assert {x.device.type for x in tensors} == {"meta"}
+    assert len(tensors) == len([x for x in vars(batch).values() if isinstance(x, torch.Tensor)]) == 9
+    if torch.cuda.is_available():
+        assert batch.pin_memory().points2d.is_pinned()
+    else:
+        assert callable(batch.pin_memory)
+
+
+def test_a_prediction_moves_with_its_poses() -> None:
+    stats = SolveStats(torch.ones(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
+    rotation = torch.eye(3).repeat(2, 1, 1)
+    rotation[1] = torch.nan
+    pose = Pose(rotation, torch.zeros(2, 3), stats)
+    assert pose.found.tolist() == [True, False]
+    moved = Prediction(poses={"pnp": pose}).to(torch.float64)
+    assert moved.poses["pnp"].rotation.dtype == moved.poses["pnp"].stats.residual.dtype == torch.float64
+    assert moved.poses["pnp"].stats.iterations.dtype == torch.long
+    assert moved.assignment is None
