@@ -74,11 +74,10 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
     def make(folder: Path) -> None:
         jobs = [(*model, min_points, clutter) for model in models]
         parts = make_parts(folder, jobs, read_part, processes=processes, label="reading COLMAP models")
-        stores = [PairStore(part) for part in parts]
-        skipped = {name: reason for store in stores for name, reason in store.skipped.items()}
-        if not any(len(store) for store in stores):
+        skipped = {name: reason for part in parts for name, reason in PairStore(part).skipped.items()}
+        if not any(len(PairStore(part)) for part in parts):
             raise nothing_usable("image", source, skipped)
-        write_pairs(folder / "store", _pairs_of(stores), parameters=parameters, skipped=skipped)
+        write_pairs(folder / "store", _pairs_of(parts), parameters=parameters, skipped=skipped)
 
     make_once(output, parameters, make)
     store = PairStore(output)
@@ -120,8 +119,9 @@ def _meshes_of(parts: Sequence[Path]) -> Iterator[tuple[str, NDArray[np.float32]
         yield from zip(store.names, store.points, strict=True)
 
 
-def _pairs_of(stores: Sequence[PairStore]) -> Iterator[tuple[str, Pair]]:
-    for store in stores:
+def _pairs_of(parts: Sequence[Path]) -> Iterator[tuple[str, Pair]]:
+    for part in parts:
+        store = PairStore(part)
         for i in range(len(store)):
             yield store.scenes[store.scene[i]], store.pair(i)
 

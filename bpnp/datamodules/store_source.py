@@ -81,11 +81,13 @@ class StoreSource:
         pair = self.store.pair(int(self.rows[index]))
         true3d = rng.permutation(np.flatnonzero(pair.match3d >= 0))
         true3d = true3d[: self._kept(len(true3d))]
-        free2d = np.setdiff1d(np.arange(len(pair.points2d)), pair.match3d)
-        free3d = np.flatnonzero(pair.match3d < 0)
         extra2d, extra3d = round(self.clutter2d * len(true3d)), round(self.clutter3d * len(true3d))
-        kept2d = np.concatenate([np.unique(pair.match3d[true3d]), rng.permutation(free2d)[:extra2d]])
-        kept3d = np.concatenate([true3d, rng.permutation(free3d)[:extra3d]])
+        chosen2d, matched2d = np.zeros((2, len(pair.points2d)), bool)  # masks: quicker than sets of indices
+        chosen2d[pair.match3d[true3d]] = True
+        matched2d[pair.match3d[pair.match3d >= 0]] = True
+        free2d = rng.permutation(np.flatnonzero(~matched2d))[:extra2d]
+        free3d = rng.permutation(np.flatnonzero(pair.match3d < 0))[:extra3d]
+        kept2d, kept3d = np.concatenate([np.flatnonzero(chosen2d), free2d]), np.concatenate([true3d, free3d])
         pair = select(pair, rng.permutation(kept2d), rng.permutation(kept3d))
         if not self.rotate:
             return pair
