@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_data import HOSTILE, view, write_run
+from report_data import HOSTILE, rows, view, write_run
 
-from bpnp.report import write_page
+from bpnp.report import write_page, write_results
 from bpnp.report.page import page_html, script_json
 
 
@@ -45,10 +45,10 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
     for run, results in zip(data["runs"], written, strict=True):
         assert unpacked(run["sizes"]["n"]).tolist() == [row.n for row in results.rows if row.estimate == "pnp"]
         for name, estimate in run["estimates"].items():
-            rows = [row for row in results.rows if row.estimate == name]
+            written_rows = [row for row in results.rows if row.estimate == name]
             for key in ("rotation_error_deg", "translation_error", "reprojection_error_deg", "seconds", "inliers"):
                 np.testing.assert_allclose(
-                    unpacked(estimate["columns"][key]), [getattr(row, key) for row in rows], rtol=1e-6
+                    unpacked(estimate["columns"][key]), [getattr(row, key) for row in written_rows], rtol=1e-6
                 )
             assert estimate["cells"][1][1] == results.estimates[name]["rotation_q2_deg"]
     assert [row["name"] for row in data["paper"]] == ["paper, MegaDepth: Lc Lp R", "paper, MegaDepth: Lc Lp"]
@@ -66,6 +66,15 @@ def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path:
     assert set(re.findall(r"https?://[^\"']*", page)) == {"http://www.w3.org/2000/svg"}
     policy = next(a["content"] or "" for tag, a in elements.tags if a.get("http-equiv") == "Content-Security-Policy")
     assert policy.startswith("default-src 'none';")
+
+
+def test_eight_runs_of_ten_thousand_pairs_stay_under_20_mb(tmp_path: Path) -> None:
+    sizes = []
+    for count in (200, 1200):
+        write_results(tmp_path / str(count), rows(count, 0))
+        sizes.append(len(page_html([tmp_path / str(count)]).encode()))
+    views = 24 * 1000 * 2 * (2 + 3 + 1 + 1) * 4 / 3
+    assert sizes[0] + 8 * (10_795 * (sizes[1] - sizes[0]) / 1000 + views) < 20e6
 
 
 @pytest.mark.parametrize("text", [HOSTILE, "<!--<script>", "]]>", "\u2028\u2029", "\\", '"', "\x00"])

@@ -58,7 +58,7 @@ def page(browser: Any, written: tuple[Path, dict[str, Results]]) -> Iterator[Cal
     assert browser.get_log("browser") == []
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    assert {url for url in asked if not url.startswith("data:")} == {address}
+    assert {url.split("#")[0] for url in asked if not url.startswith("data:")} == {address}
 
 
 def texts(page: Callable[..., Any], selector: str) -> list[str]:
@@ -184,6 +184,20 @@ def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., An
     assert page("return document.getElementById('scene').toDataURL()") != before
     press(page, "#pair-close")
     assert not page("return document.getElementById('pair').open")
+
+
+def test_a_pair_opens_from_the_keyboard_and_from_its_address(browser: Any, page: Callable[..., Any]) -> None:
+    from selenium.webdriver.common.keys import Keys
+
+    button = browser.find_element("css selector", "#pair-table tbody tr:nth-child(3) button")
+    name = button.text.removeprefix("◉ ")
+    button.send_keys(Keys.ENTER)
+    assert texts(page, "#pair-title") == [name]
+    browser.switch_to.active_element.send_keys(Keys.ESCAPE)
+    assert not page("return document.getElementById('pair').open || location.hash !== ''")
+    assert page("return document.activeElement === arguments[0]", button)
+    page("location.hash = 'pair=scene%2F0042'; location.reload()")
+    assert texts(page, "#pair-title") == ["scene/0042"]
 
 
 def test_the_pose_loss_is_marked_where_it_joins(page: Callable[..., Any]) -> None:

@@ -4,19 +4,21 @@ let open = null;
 
 function openPair(i) {
   const series = listedSeries();
-  open = { position: i, id: series.ids[i] };
+  // Runs on the same pairs share their list of names; in others the name is looked for.
+  const place = (other) => (other.ids === series.ids ? i : other.ids.indexOf(series.ids[i]));
+  open = { position: i, id: series.ids[i], place };
   byId("pair-title").textContent = open.id || "(no name)";
   drawNumbers();
-  const kept = [series, ...SERIES].find(({ run, ids }) => run.views[ids.indexOf(open.id)]);
+  const kept = [series, ...SERIES].find((other) => place(other) in other.run.views);
   byId("pair-views").hidden = kept === undefined;
   byId("pair-missing").hidden = kept !== undefined;
-  const place = listed.indexOf(i);
-  byId("pair-previous").disabled = place <= 0;
-  byId("pair-next").disabled = place < 0 || place === listed.length - 1;
+  const rank = listed.indexOf(i);
+  byId("pair-previous").disabled = rank <= 0;
+  byId("pair-next").disabled = rank < 0 || rank === listed.length - 1;
   if (!byId("pair").open) byId("pair").showModal();
   history.replaceState(null, "", `#pair=${encodeURIComponent(wellFormed(open.id))}`);
   if (kept === undefined) return;
-  open.view = unpackedView(kept.run.views[kept.ids.indexOf(open.id)]);
+  open.view = unpackedView(kept.run.views[place(kept)]);
   open.cameras = camerasOf(open.view, kept.run);
   const wanted = open.cameras.findIndex(({ name }) => name === series.estimate);
   byId("pair-estimate").replaceChildren(...open.cameras.map(({ name }, k) => element("option", { value: k }, name)));
@@ -25,7 +27,7 @@ function openPair(i) {
 }
 
 function drawNumbers() {
-  const rows = SERIES.map((series) => [series, series.ids.indexOf(open.id)]).filter(([, i]) => i >= 0);
+  const rows = SERIES.map((series) => [series, open.place(series)]).filter(([, i]) => i >= 0);
   const body = rows.map(([series, i]) =>
     element("tr", {}, element("th", { scope: "row" }, swatch(series), series.name),
       ...PAIR_COLUMNS.map(([key]) => element("td", {}, pairText(key, pairColumn(series, key)[i]))),

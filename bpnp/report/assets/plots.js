@@ -10,12 +10,12 @@ const RECALLS = [
 ];
 const POINTS = 160;
 const GROUPS = 8;
-const cached = new Map();
 
+// What is worked out from the columns of a series, and kept.
 function once(series, key, make) {
-  const name = `${series.name}\n${key}`;
-  if (!cached.has(name)) cached.set(name, make());
-  return cached.get(name);
+  series.kept ??= new Map();
+  if (!series.kept.has(key)) series.kept.set(key, make());
+  return series.kept.get(key);
 }
 
 const sortedColumn = (series, key) => once(series, key, () => series.get(key).filter((value) => !Number.isNaN(value)).sort());
