@@ -11,7 +11,7 @@ function drawTraining() {
     byId("training-charts").replaceChildren(element("p", { class: "note" }, "No training log beside these results."));
     return;
   }
-  const panels = TRAINING.map((panel) => ({ ...panel, lines: DATA.logs.flatMap((log, i) => curvesOf(log, i, panel.keys)) }));
+  const panels = TRAINING.map((panel) => ({ ...panel, lines: DATA.logs.flatMap((log) => curvesOf(log, panel.keys)) }));
   drawCharts(byId("training-charts"), panels.filter(({ lines }) => lines.length).map(({ title, lines, log }) => {
     const [steps, values] = [0, 1].map((axis) => lines.flatMap(({ points }) => points.map((point) => point[axis])));
     const marks = DATA.logs.filter((run) => run.switch_step !== null).map((run) => ({
@@ -22,16 +22,17 @@ function drawTraining() {
 }
 
 // Before the pose loss joins, the correspondence loss is the whole loss.
-function curvesOf({ name, curves, switch_step }, i, keys) {
+function curvesOf({ name, curves, switch_step }, keys) {
   const known = keys.filter((key, k) => key in curves && (k === 0 || switch_step !== null));
   const several = DATA.logs.length > 1;
+  const own = SERIES.find(({ run }) => run.name === name).colour;
   return known.map((key) => {
     const [steps, values] = [column(curves[key].steps), column(curves[key].values)];
     const points = [...steps].map((step, j) => [step, values[j]]).filter(([, value]) => Number.isFinite(value));
     const short = key.split("/")[1].replaceAll("_", " ");
     return {
       name: several ? `${name} ${short}` : short,
-      colour: `var(--c${several ? i % 8 : keys.indexOf(key)})`,
+      colour: several ? own : `var(--c${keys.indexOf(key)})`,
       dashes: ["", "6 3", "2 2"][keys.indexOf(key)],
       points,
     };
