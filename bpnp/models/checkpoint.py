@@ -22,7 +22,7 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
         )  # fmt: skip
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, UnicodeDecodeError, KeyError) as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError) as error:
         reason = str(error).splitlines()[0].split(". ")[0]
         raise ValueError(
             f"expected a checkpoint of `bpnp fit`, got a file that cannot be read: {file} ({reason})"

@@ -52,7 +52,7 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         enough = count > 1
         with torch.no_grad():
             assert self.momentum is not None
-            rate = self.momentum * enough
+            rate = self.momentum * enough.to(running_mean.dtype)
             running_mean.lerp_(mean.detach().to(running_mean.dtype), rate)
             running_var.lerp_((scatter / (count - 1).clamp_min(1)).detach().to(running_var.dtype), rate)
             if self.num_batches_tracked is not None:
