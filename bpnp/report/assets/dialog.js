@@ -32,9 +32,10 @@ function drawNumbers() {
     element("tr", {}, element("th", { scope: "row" }, swatch(series), series.name),
       ...PAIR_COLUMNS.map(([key]) => element("td", {}, pairText(key, pairColumn(series, key)[i]))),
       element("td", { class: "words" }, DATA.causes[series.get("cause")[i]])));
-  const heads = [...PAIR_COLUMNS.map(([, text]) => text), "cause"].map((text) => element("th", { scope: "col" }, text));
+  const heads = PAIR_COLUMNS.map(([, text]) => element("th", { scope: "col" }, text));
   byId("pair-numbers").replaceChildren(
-    element("thead", {}, element("tr", {}, element("th", { scope: "col" }, "estimate"), ...heads)),
+    element("thead", {}, element("tr", {}, element("th", { scope: "col" }, "estimate"), ...heads,
+      element("th", { scope: "col", class: "words" }, "cause"))),
     element("tbody", {}, ...body));
 }
 

@@ -68,7 +68,7 @@ function drawErrors() {
     const xs = lines.flatMap(({ points }) => points.map(([x]) => x));
     const ys = lines.flatMap(({ points, spread }) => [...points.map(([, y]) => y), ...(spread ?? []).flat()]);
     const counted = title === "Number of 3D points";
-    const x = { label, domain: counted ? padded(xs) : [0, 1], log: counted && Math.max(...xs) > 8 * Math.min(...xs) };
+    const x = { label, domain: counted ? padded(xs) : [0, Math.max(0.2, ...xs)], log: counted && Math.max(...xs) > 8 * Math.min(...xs) };
     const [low, high] = decades(ys);
     return { title, x, y: { label: "degrees", domain: [low, Math.min(high, 180)], log: true }, lines };
   }));
