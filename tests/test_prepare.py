@@ -21,7 +21,7 @@ from bpnp.datamodules.mesh_folder import folder_pools
 from bpnp.datamodules.outliers import Outliers
 from bpnp.datamodules.pair_store import PairStore
 from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
-from bpnp.datamodules.surface_store import SurfaceStore, open_surfaces
+from bpnp.datamodules.surface_store import SurfaceStore, open_surfaces, write_surfaces
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
@@ -311,3 +311,37 @@ def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="at least one usable image.*min_points"):
         prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=50, clutter=0.0, processes=1)
     assert not (tmp_path / "store").exists()
+
+
+@pytest.mark.parametrize("name", ["points.bin", "names.txt", "radii.bin", "manifest.json"])
+def test_a_damaged_surface_store_is_one_error(meshes: Path, tmp_path: Path, name: str) -> None:
+    run(meshes, tmp_path / "store")
+    path = tmp_path / "store" / name
+    whole = path.read_bytes()
+    flipped = bytearray(whole)
+    flipped[len(whole) // 2] ^= 1
+    for content in (whole[:-1], whole + b"0", bytes(flipped), b""):
+        path.write_bytes(content)
+        with pytest.raises(StoreError, match=str(tmp_path / "store")):
+            open_surfaces(tmp_path / "store")
+    path.write_bytes(whole)
+    assert len(open_surfaces(tmp_path / "store").names) == 12
+
+
+def test_parts_of_another_preparation_are_not_used(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    run(meshes, tmp_path / "whole")
+    monkeypatch.setattr(preparing, "write_surfaces", _write_parts_only)
+    with pytest.raises(KeyboardInterrupt):
+        run(meshes, tmp_path / "store", normalisation="none")
+    assert len(list((tmp_path / ".store.unfinished").iterdir())) == 3
+    monkeypatch.setattr(preparing, "write_surfaces", write_surfaces)
+    run(meshes, tmp_path / "store")
+    assert (tmp_path / "store" / "points.bin").read_bytes() == (tmp_path / "whole" / "points.bin").read_bytes()
+
+
+def _write_parts_only(folder: Path, *args: object, **options: object) -> None:
+    if folder.name == "store":
+        raise KeyboardInterrupt
+    write_surfaces(folder, *args, **options)

@@ -1,5 +1,6 @@
 """Where a data set of meshes comes from: a folder, a zip that stays packed, or HDF5 files of sampled points."""
 
+import importlib
 import re
 import zipfile
 import zlib
@@ -175,7 +176,6 @@ def _opened(path: Path, size: int, time: int) -> Any:
 
 def _h5py() -> ModuleType:
     try:
-        import h5py  # type: ignore[import-untyped]
+        return importlib.import_module("h5py")  # optional
     except ImportError as error:
         raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error
-    return h5py

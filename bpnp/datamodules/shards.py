@@ -2,7 +2,6 @@
 
 import fcntl
 import hashlib
-import json
 import multiprocessing
 import os
 import shutil
@@ -30,14 +29,14 @@ def workplace(output: Path, inputs: Mapping[str, Any]) -> Iterator[Path]:
     When the body ends it is removed; when it raises, or the process is killed, it stays for the next run to go on.
     Raises StoreError if another process is preparing the same output.
     """
-    folder = output.with_name(f".{output.name}.unfinished")
+    folder = _folder(output)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise StoreError(f"expected one process to prepare {output}, got another at work; try later") from error
-        key = hashlib.blake2b(json.dumps(inputs, sort_keys=True).encode()).hexdigest()
+        key = _digest(sorted(inputs.items()))
         key_file = folder / "key"
         if not key_file.exists() or key_file.read_text() != key:
             _empty(folder, keep=("lock",))
@@ -61,6 +60,7 @@ def make_once(output: Path, parameters: Mapping[str, Any], make: Callable[[Path]
                 f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
                 "try another --output, or remove it"
             )
+        shutil.rmtree(_folder(output), ignore_errors=True)  # of a run that was killed when it had all but finished
         return
     if output.exists():
         raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another name")
@@ -75,7 +75,7 @@ def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int,
     work and the jobs must be picklable if there are several processes; these end when this one does.
     Raises whatever `work` raises.
     """
-    paths = [folder / f"{i:06d}" for i in range(len(jobs))]
+    paths = [folder / f"{i:06d}-{_digest(job)}" for i, job in enumerate(jobs)]  # parts of other jobs do not count
     missing = [i for i, path in enumerate(paths) if not path.exists()]
     columns = (TextColumn(label), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
@@ -113,6 +113,14 @@ def _end_with_parent() -> None:
             os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+def _folder(output: Path) -> Path:
+    return output.with_name(f".{output.name}.unfinished")
+
+
+def _digest(job: Any) -> str:
+    return hashlib.blake2b(repr(job).encode(), digest_size=8).hexdigest()
 
 
 def _empty(folder: Path, *, keep: tuple[str, ...]) -> None:
