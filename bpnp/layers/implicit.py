@@ -61,7 +61,7 @@ class _AtOptimum(torch.autograd.Function):
 def entropic_plan(
     plan: Float[Tensor, "b m n"],
     cost: Float[Tensor, "b m n"],
-    mu: Tensor,
+    mu: float | Tensor,
     row_marginal: Float[Tensor, "b m"],
     col_marginal: Float[Tensor, "b n"],
 ) -> Float[Tensor, "b m n"]:
@@ -72,7 +72,8 @@ def entropic_plan(
     (up to the one constant that P cannot tell apart, chosen so that the mean of b, weighted by c, is zero).
     The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
     """
-    return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal)
+    mu_tensor = mu.to(cost) if isinstance(mu, Tensor) else cost.new_full((), mu)
+    return _EntropicPlan.apply(plan, cost, mu_tensor, row_marginal, col_marginal)
 
 
 class _EntropicPlan(torch.autograd.Function):

@@ -8,9 +8,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.layers.pacing import unfinished, waits
+
 CG_ITERATIONS = 30
 CG_TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-13}
+CG_TOLERANCE_PROMOTED = 1e-8  # in float64 for float32 data
 NEWTON_TOLERANCE = 1e-2
+SHARP = 16.0  # cols / degree beyond which float32 loses the gradient's sixth digit
 RIDGE = 1e-13
 
 
@@ -19,26 +23,37 @@ def solve_multipliers(
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]]:
     """Multipliers (a, b) of the projection of `gradient` onto plans with the marginals of `plan`; sum(P^T 1 . b) = 0.
 
-    Conjugate gradients, two products a step; samples where they stall are solved by one Cholesky factorisation. These
-    have groups of points with weak links, which magnify the rounding of the right-hand side: it is made in float64 too.
+    Conjugate gradients, two products a step. Samples whose plan is sharp, where differences of nearly equal numbers
+    decide, and samples that stall are solved in float64; what stalls there too by one Cholesky factorisation. A GPU
+    is not waited for: it solves all in float64, without a factorisation.
     """
-    rows, cols = plan.sum(-1), plan.sum(-2)
-    row_mean, rhs = _reduce(plan, gradient, rows)
-    b, solved = _conjugate_gradients(plan, rows, cols, rhs, CG_TOLERANCE[plan.dtype])
-    if not bool(solved.all()):
-        hard = (~solved).nonzero().squeeze(-1)
-        part = plan[hard].double()
-        part_rows, part_cols = part.sum(-1), part.sum(-2)
-        _, part_rhs = _reduce(part, gradient[hard].double(), part_rows)
-        b = b.index_copy(0, hard, _factorised(part, part_rows, part_cols, part_rhs).to(b.dtype))
-    return row_mean - _divide(_times(plan, b), rows), b
+    if plan.dtype == torch.float64:
+        return _solve(plan, gradient, CG_TOLERANCE[torch.float64])[:2]
+    if waits(plan.device):
+        a, b, _ = _solve(plan.double(), gradient.double(), CG_TOLERANCE_PROMOTED)
+        return a.to(plan.dtype), b.to(plan.dtype)
+    a, b, trusted = _solve(plan, gradient, CG_TOLERANCE[torch.float32])
+    if not bool(trusted.all()):
+        hard = (~trusted).nonzero().squeeze(-1)
+        exact_a, exact_b, _ = _solve(plan[hard].double(), gradient[hard].double(), CG_TOLERANCE_PROMOTED)
+        a, b = a.index_copy(0, hard, exact_a.to(a.dtype)), b.index_copy(0, hard, exact_b.to(b.dtype))
+    return a, b
 
 
-def _reduce(plan: Tensor, gradient: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean of `gradient` in each row, and the right-hand side that is left once the rows are eliminated."""
+def _solve(
+    plan: Tensor, gradient: Tensor, tolerance: float
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
+    """(a, b) in the precision of the plan, and whether that precision is enough."""
     weighted = plan * gradient
+    rows, cols = plan.sum(-1), plan.sum(-2)
     row_mean = _divide(weighted.sum(-1), rows)
-    return row_mean, weighted.sum(-2) - _transpose_times(plan, row_mean)
+    rhs = weighted.sum(-2) - _transpose_times(plan, row_mean)
+    degree = _degree(plan, rows, cols)
+    b, solved = _conjugate_gradients(plan, rows, cols, degree, rhs, tolerance)
+    if plan.dtype == torch.float64 and not waits(plan.device) and not bool(solved.all()):
+        b = _factorise_rest(plan, rows, cols, rhs, b, solved)
+    trusted = solved & (_divide(cols, degree).amax(-1) <= SHARP)
+    return row_mean - _divide(_times(plan, b), rows), b, trusted
 
 
 def newton_direction(
@@ -48,28 +63,36 @@ def newton_direction(
     rows, cols = plan.sum(-1), plan.sum(-2)
     row_error = _divide(row_marginal - rows, rows)
     rhs = col_marginal - cols - _transpose_times(plan, row_error)
-    y, solved = _conjugate_gradients(plan, rows, cols, rhs, NEWTON_TOLERANCE)
-    if not bool(solved.all()):
-        hard = (~solved).nonzero().squeeze(-1)
-        exact = _factorised(*(x[hard].double() for x in (plan, rows, cols, rhs)))
-        y = y.index_copy(0, hard, exact.to(y.dtype))
+    y, solved = _conjugate_gradients(plan, rows, cols, _degree(plan, rows, cols), rhs, NEWTON_TOLERANCE)
+    if not waits(plan.device) and not bool(solved.all()):
+        y = _factorise_rest(plan, rows, cols, rhs, y, solved)
     return row_error - _divide(_times(plan, y), rows), y
 
 
+def _degree(plan: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, "b n"]:
+    """Diagonal of S as a sum of positive terms: cols - sum P^2 / rows would be noise when P is nearly a permutation."""
+    degree = (plan * (1 - _divide(plan, rows.unsqueeze(-1)))).sum(-2)
+    # A column whose links are below rounding still has an equation, which zero would hide.
+    return torch.maximum(degree, torch.finfo(plan.dtype).eps * cols)
+
+
 def _conjugate_gradients(
-    plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor, tolerance: float
+    plan: Tensor, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: float
 ) -> tuple[Float[Tensor, "b n"], Bool[Tensor, " b"]]:
-    """Preconditioned by diag(cols), in the metric where S has eigenvalues in [0, 1]; each sample stops by itself."""
-    inverse = _divide(torch.ones_like(cols), cols)
+    """Preconditioned by the diagonal of S; each sample stops by itself, at a residual measured per unit of mass.
+
+    In the preconditioner's own measure columns with weak links would outweigh all others.
+    """
+    inverse, unit = _divide(torch.ones_like(cols), degree), _divide(torch.ones_like(cols), cols)
     x = torch.zeros_like(rhs)
     r = rhs
-    z = _centre(inverse * r, cols)
-    p = z
+    p = z = inverse * r
     rz = (r * z).sum(-1)
-    target = rz * tolerance**2
+    target = (unit * r * r).sum(-1) * tolerance**2
     active = rz > 0
+    solved = ~active
     for _ in range(CG_ITERATIONS):
-        if not bool(active.any()):
+        if not unfinished(active):
             break
         sp = cols * p - _transpose_times(plan, _divide(_times(plan, p), rows))
         curvature = (p * sp).sum(-1)
@@ -77,13 +100,22 @@ def _conjugate_gradients(
         alpha = torch.where(active & (curvature > 0), rz / curvature, 0).unsqueeze(-1)
         x = x + alpha * p
         r = r - alpha * sp
-        z = _centre(inverse * r, cols)
+        solved = solved | (active & ((unit * r * r).sum(-1) <= target))
+        z = inverse * r
         rz_new = (r * z).sum(-1)
         beta = torch.where(active & (rz > 0), rz_new / rz, 0).unsqueeze(-1)
         p = torch.where(active.unsqueeze(-1), z + beta * p, p)
         rz = torch.where(active, rz_new, rz)
-        active = active & (rz > target) & (curvature > 0)
-    return x, rz <= target
+        active = active & ~solved & (curvature > 0)
+    return _centre(x, cols), solved
+
+
+def _factorise_rest(
+    plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor, b: Tensor, solved: Bool[Tensor, " b"]
+) -> Float[Tensor, "b n"]:
+    hard = (~solved).nonzero().squeeze(-1)
+    exact = _factorised(*(x[hard].double() for x in (plan, rows, cols, rhs)))
+    return b.index_copy(0, hard, exact.to(b.dtype))
 
 
 def _factorised(plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor) -> Tensor:

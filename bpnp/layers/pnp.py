@@ -15,12 +15,14 @@ from torch import Tensor, nn
 from bpnp.geometry import hat
 from bpnp.layers.implicit import at_optimum
 from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient, retract
+from bpnp.layers.pacing import steps, unfinished
 from bpnp.types import SolveStats
 
 Method = Literal["newton", "lbfgs"]
 FAR = 1e4  # scene radii; a pose beyond has run away to where every point is seen in one direction
 LINE_SEARCH_TOLERANCE = 1e-7  # a line search on values in float64 resolves no gradient much smaller than this
-WELL_POSED = 1e-9  # smallest to largest Hessian eigenvalue for which a derivative is given
+WELL_POSED = 1e-9  # smallest Hessian eigenvalue, per trace, for which a derivative is given
+STEPS_ON_GPU = 12
 
 
 def weighted_pnp(
@@ -119,9 +121,9 @@ def _newton(
     damping = torch.zeros_like(weight)
     iterations = torch.zeros(len(q), dtype=torch.long, device=q.device)
     eye = torch.eye(6, dtype=q.dtype, device=q.device)
-    for _ in range(max_iterations):
+    for _ in range(steps(max_iterations, q.device, STEPS_ON_GPU)):
         active = current.gradient.norm(dim=-1) > tolerance * weight
-        if not bool(active.any()):
+        if not unfinished(active):
             break
         iterations += active
         factor, info = torch.linalg.cholesky_ex(current.hessian + damping[:, None, None] * eye)
@@ -189,10 +191,13 @@ def _judge(
     end = derivatives(q, points, r, t)
     weight = torch.linalg.vector_norm(q, dim=-1).sum(-1).clamp_min(torch.finfo(q.dtype).tiny)
     residual = end.gradient.norm(dim=-1) / weight
-    spectrum = torch.linalg.eigvalsh(torch.nan_to_num(end.hessian))
-    definite = spectrum[:, 0] > WELL_POSED * spectrum[:, -1].clamp_min(torch.finfo(q.dtype).tiny)
-    converged = found & (residual <= tolerance) & definite & (t.norm(dim=-1) < FAR)
     eye = torch.eye(6, dtype=q.dtype, device=q.device)
+    trace = end.hessian.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # A Cholesky factor of H - c I exists when every eigenvalue exceeds c; eigenvalues would make the host wait.
+    margin = (WELL_POSED * trace)[:, None, None] * eye
+    _, info = torch.linalg.cholesky_ex(torch.nan_to_num(end.hessian) - margin)
+    definite = (info == 0) & (trace > 0) & end.hessian.isfinite().all((-2, -1))
+    converged = found & (residual <= tolerance) & definite & (t.norm(dim=-1) < FAR)
     factor, _ = torch.linalg.cholesky_ex(torch.where(converged[:, None, None], end.hessian, eye))
     residual = torch.where(found, residual, torch.inf)
     return SolveStats(iterations, residual, converged), factor

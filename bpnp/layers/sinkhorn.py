@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.layers.implicit import entropic_plan
+from bpnp.layers.pacing import waits
 from bpnp.layers.transport import solve_plan
 from bpnp.types import SolveStats
 
@@ -48,15 +49,16 @@ def sinkhorn(
     b, m, n = cost.shape
     real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
-    if not bool((real2d.any(-1) & real3d.any(-1)).all()):
+    if not waits(cost.device) and not bool((real2d.any(-1) & real3d.any(-1)).all()):
         raise ValueError("expected at least one real point on each side of every sample, got an empty mask")
     rows = _uniform(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
     cols = _uniform(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
     if dustbin is not None:
         cost, rows, cols = _with_dustbin(cost, dustbin, rows, cols, real2d, real3d)
+    fixed_mu = mu.detach().to(cost) if isinstance(mu, Tensor) else mu
     with torch.no_grad():
-        plan, stats = solve_plan(cost, rows, cols, mu=mu_tensor, tolerance=tolerance, max_iterations=max_iterations)
-    plan = entropic_plan(plan, cost, mu_tensor, rows, cols)
+        plan, stats = solve_plan(cost, rows, cols, mu=fixed_mu, tolerance=tolerance, max_iterations=max_iterations)
+    plan = entropic_plan(plan, cost, mu, rows, cols)
     return (plan if dustbin is None else plan[:, :m, :n]), stats
 
 
@@ -68,7 +70,7 @@ def _with_dustbin(
     cost: Tensor, dustbin: float | Tensor, rows: Tensor, cols: Tensor, real2d: Tensor, real3d: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Append a bin to each side; point marginals scale to m/(m+n) and n/(m+n), the bins take the other side's share."""
-    bin_cost = torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device)
+    bin_cost = dustbin.to(cost) if isinstance(dustbin, Tensor) else cost.new_full((), dustbin)
     m, n = (real.sum(-1, keepdim=True).to(cost.dtype) for real in (real2d, real3d))
     share2d, share3d = m / (m + n), n / (m + n)
     cost = torch.cat([cost, bin_cost.expand(*cost.shape[:2], 1)], -1)
