@@ -47,7 +47,7 @@ def projected(plan: Tensor, weights: Tensor, mu: float) -> Tensor:
     return torch.tensor(found, dtype=torch.float64)
 
 
-@pytest.mark.parametrize("shape", [(2, 5, 5), (2, 4, 7), (1, 1, 4), (1, 5, 1)])
+@pytest.mark.parametrize("shape", [(1, 4, 4), (1, 3, 5), (1, 1, 4), (2, 3, 1)])
 @pytest.mark.parametrize("mu", [0.5, 0.1])
 def test_gradcheck_cost_mu_and_marginals(shape: tuple[int, int, int], mu: float) -> None:
     b, m, n = shape
