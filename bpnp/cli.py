@@ -1,11 +1,10 @@
-"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, `bpnp report` prints results."""
+"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, the other commands are plain ones."""
 
-import argparse
 import logging
 import os
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +14,25 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 
 from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
-from bpnp.report import report
+from bpnp.commands import convert_weights, prepare
+from bpnp.report import report_command, view_command
+from bpnp.report.dashboards import wandb_command
 from bpnp.task import BlindPnPTask, TrainingDivergedError
 
 DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
 
 Train and evaluate:      bpnp {fit,validate,test,predict} --config configs/quickstart.yaml
-Read results:            bpnp report RUN...
+Read results:            bpnp report RUN..., bpnp view RUN PAIR, bpnp wandb RUN...
+Prepare data:            bpnp prepare DATASET SOURCE
+Released weights:        bpnp convert-weights FILE OUT
 """
+COMMANDS: dict[str, Callable[[list[str]], None]] = {
+    "report": report_command,
+    "view": view_command,
+    "wandb": wandb_command,
+    "prepare": prepare,
+    "convert-weights": convert_weights,
+}
 
 
 class BpnpCLI(LightningCLI):
@@ -63,7 +73,7 @@ class BpnpCLI(LightningCLI):
         return parser
 
     def _parse_ckpt_path(self) -> None:
-        """Nothing to take from a checkpoint: ours hold no settings of the trainer's. It is read once, by the trainer."""
+        """Nothing to do: our checkpoints hold no settings of the trainer's. The trainer reads them, once."""
 
 
 def _checkpoint_folder(root: str) -> str:
@@ -76,8 +86,8 @@ def main(args: Sequence[str] | None = None) -> None:
     logging.captureWarnings(True)
     _quieten()
     try:
-        if arguments[:1] == ["report"]:
-            _report(arguments[1:])
+        if arguments and arguments[0] in COMMANDS:
+            COMMANDS[arguments[0]](arguments[1:])
         else:
             _lightning(arguments)
     except (ValueError, OSError, TrainingDivergedError) as error:
@@ -105,17 +115,6 @@ def _lightning(arguments: list[str]) -> None:
     )
 
 
-def _report(arguments: list[str]) -> None:
-    parser = argparse.ArgumentParser(prog="bpnp report", description="Print the tables of one or several test results.")
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder that `bpnp test` wrote")
-    parser.add_argument(
-        "--paper", choices=("modelnet40", "megadepth"), help="the paper's rows beneath, for orientation"
-    )
-    parser.add_argument("--untrained", type=Path, metavar="RUN", help="the same test before training, to compare with")
-    chosen = parser.parse_args(arguments)
-    report(chosen.runs, paper=chosen.paper, untrained=chosen.untrained)
-
-
 def _quieten() -> None:
     """Third-party advice that does not apply here."""
     logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(
@@ -125,3 +124,4 @@ def _quieten() -> None:
     warnings.filterwarnings("ignore", message=".*Using `DistributedSampler` with the dataloaders.*")
     warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
     warnings.filterwarnings("ignore", message=".*LeafSpec.*")
+    warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")

@@ -16,6 +16,7 @@ from bpnp.models.checkpoint import check_solver
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["train", "val", "test"]
+CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
 
 
 class TrainingDivergedError(RuntimeError):
@@ -59,9 +60,9 @@ class BlindPnPTask(LightningModule):
         self.pose_bounds = RELEASED_BOUNDS if bounded_pose_loss else None
         self.correspondence_angle = correspondence_angle
         self.max_skipped_steps = max_skipped_steps
-        self.skipped_steps = 0
-        self.skipped_in_a_row = 0
-        self.loss_is_finite = True
+        # Steps left out in all, and in a row: on the device, so that counting them never waits for it.
+        self.skipped: Tensor
+        self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
         self.estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         self.pose_metrics = nn.ModuleDict(
             {
@@ -78,9 +79,9 @@ class BlindPnPTask(LightningModule):
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         prediction = self.solver(batch, poses=self.pose_weight > 0)
         loss = self.losses(prediction, batch, "train").mean()
-        self.loss_is_finite = self.trainer.strategy.reduce_boolean_decision(bool(loss.isfinite()), all=True)
-        self._log_train(loss=loss, skipped_steps=float(self.skipped_steps))
-        return loss
+        self._log_train(loss=loss, skipped_steps=self.skipped[0].float())
+        # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
+        return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         self._evaluate(batch, "val")
@@ -103,18 +104,14 @@ class BlindPnPTask(LightningModule):
             return matching
         pose = prediction.poses[self.pose_estimate]
         solved = pose.stats.converged
-        errors = pose_loss(
-            pose.rotation[solved],
-            pose.translation[solved],
-            _known(batch.rotation, "rotation")[solved],
-            _known(batch.translation, "translation")[solved],
-            bounds=self.pose_bounds,
-        )
+        rotation_gt, translation_gt = _known(batch.rotation, "rotation"), _known(batch.translation, "translation")
+        # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
+        rotation = torch.where(solved[:, None, None], pose.rotation, rotation_gt)
+        translation = torch.where(solved[:, None], pose.translation, translation_gt)
+        errors = pose_loss(rotation, translation, rotation_gt, translation_gt, bounds=self.pose_bounds) * solved
         if stage == "train":
-            self._log_train(without_pose=1 - solved.float().mean())
-            if len(errors):
-                self._log_train(pose_loss=errors.mean())
-        return matching.index_add(0, solved.nonzero().squeeze(-1), self.pose_weight * errors)
+            self._log_train(without_pose=1 - solved.float().mean(), pose_loss=errors.sum() / solved.sum())
+        return matching + self.pose_weight * errors
 
     def correspondence_losses(self, prediction: Prediction, batch: Batch) -> Tensor | None:
         """L_c per sample; None if the solver has no assignment or the batch nothing to compare it with."""
@@ -132,35 +129,35 @@ class BlindPnPTask(LightningModule):
         )
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Without a finite loss and gradient the step is left out: Adam passes over parameters without a gradient."""
+        """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
         gradients = [p.grad for p in self.parameters() if p.grad is not None]
         norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in gradients]))
-        if self.loss_is_finite and bool(norm.isfinite()):
-            self.skipped_in_a_row = 0
-            self._log_train(gradient_norm=norm)
-            return
-        optimizer.zero_grad(set_to_none=True)
-        self.skipped_steps += 1
-        self.skipped_in_a_row += 1
-        if self.skipped_in_a_row >= self.max_skipped_steps:
+        broken = ~norm.isfinite()
+        optimizer.found_inf = broken.float()  # type: ignore[attr-defined]
+        self.skipped += broken
+        self.skipped[1] *= broken
+        self._log_train(gradient_norm=norm)
+        if (self.device.type == "cpu" or self.global_step % CHECK_EVERY == 0) and (
+            int(self.skipped[1]) >= self.max_skipped_steps
+        ):
             raise TrainingDivergedError(
-                f"expected finite losses and gradients, got {self.skipped_in_a_row} steps in a row without, at step "
+                f"expected finite losses and gradients, got {int(self.skipped[1])} steps in a row without, at step "
                 f"{self.global_step}; try a lower model.learning_rate or trainer.gradient_clip_val"
             )
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         parameters = [p for p in self.parameters() if p.requires_grad]
-        return torch.optim.Adam(parameters, lr=self.learning_rate, weight_decay=self.weight_decay)
+        return torch.optim.Adam(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
         settings = getattr(self.solver, "settings", {})
         checkpoint["solver"] = {"class": type(self.solver).__name__, "settings": dict(settings)}
-        checkpoint["skipped_steps"] = (self.skipped_steps, self.skipped_in_a_row)
+        checkpoint["skipped_steps"] = self.skipped.tolist()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         check_solver(checkpoint.get("solver", {}), type(self.solver).__name__, getattr(self.solver, "settings", {}))
-        self.skipped_steps, self.skipped_in_a_row = checkpoint.get("skipped_steps", (0, 0))
+        self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val")
