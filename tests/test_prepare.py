@@ -313,6 +313,27 @@ def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     assert not (tmp_path / "store").exists()
 
 
+def test_what_is_left_of_removed_parts_is_not_used(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    """A kill while the parts are removed, after the store has got its name."""
+    run(meshes, tmp_path / "whole")
+    monkeypatch.setattr(preparing, "MESHES_A_PART", 2)
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", _remove_one_file_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            run(meshes, tmp_path / "store")
+    shutil.rmtree(tmp_path / "store")
+    run(meshes, tmp_path / "store")
+    assert (tmp_path / "store" / "points.bin").read_bytes() == (tmp_path / "whole" / "points.bin").read_bytes()
+
+
+def _remove_one_file_and_stop(folder: Path, *, ignore_errors: bool = False) -> None:
+    if folder.name.startswith("0"):
+        (folder / "points.bin").unlink()
+        raise KeyboardInterrupt
+
+
 @pytest.mark.parametrize("name", ["points.bin", "names.txt", "radii.bin", "manifest.json"])
 def test_a_damaged_surface_store_is_one_error(meshes: Path, tmp_path: Path, name: str) -> None:
     run(meshes, tmp_path / "store")

@@ -124,6 +124,7 @@ def _digest(job: Any) -> str:
 
 
 def _empty(folder: Path, *, keep: tuple[str, ...]) -> None:
+    (folder / "key").unlink(missing_ok=True)  # first: without it, what a kill leaves of the rest is not used
     for path in folder.iterdir():
         if path.name in keep:
             continue
