@@ -7,6 +7,7 @@ from planted import plant
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
+from bpnp.layers import sinkhorn
 from bpnp.losses import correspondence_loss, pose_loss
 from bpnp.models.bpnpnet import pairwise_distance
 
@@ -229,3 +230,16 @@ def test_says_that_a_file_is_no_checkpoint_and_runs_no_code(tmp_path: Path) -> N
     for name in ("text.ckpt", "code.ckpt"):
         with pytest.raises(ValueError, match=f"expected a checkpoint.*{name}"):
             BPnPNet.from_checkpoint(tmp_path / name)
+
+
+def test_autocast_reaches_the_nets_and_not_the_layers() -> None:
+    torch.manual_seed(0)
+    net = BPnPNet(channels=16, blocks=2)
+    batch = Batch.from_arrays(torch.rand(2, 30, 2), torch.rand(2, 30, 3))
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert net.features2d.enter(batch.points2d).dtype == torch.bfloat16
+        cost = net.cost(batch)
+        prediction = net(batch)
+    expected, _ = sinkhorn(cost.float())
+    assert torch.equal(prediction.assignment, expected)
+    assert (prediction.assignment.double().sum(-1) - 1 / 30).abs().sum(-1).max() < 2e-6

@@ -25,7 +25,7 @@ def data_for(recipe: str, folder: Path) -> list[str]:
 
 @pytest.mark.parametrize("recipe", RECIPES)
 def test_every_recipe_trains_and_tests(recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WANDB_MODE", "disabled")
+    monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.chdir(tmp_path)
     arguments = [f"--config={CONFIGS / recipe}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
     arguments += [a for a in SMALL_NET if "=bpnp" not in a]

@@ -16,6 +16,7 @@ from bpnp.geometry import hat
 from bpnp.layers.implicit import at_optimum
 from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient, retract
 from bpnp.layers.pacing import steps, unfinished
+from bpnp.layers.precision import full_precision
 from bpnp.types import SolveStats
 
 Method = Literal["newton", "lbfgs"]
@@ -25,6 +26,7 @@ WELL_POSED = 1e-9  # smallest Hessian eigenvalue, per trace, for which a derivat
 STEPS_ON_GPU = 12
 
 
+@full_precision
 def weighted_pnp(
     assignment: Float[Tensor, "b m n"],
     bearings: Float[Tensor, "b m 3"],

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from bpnp.layers.consensus import consensus
 from bpnp.layers.estimators import MIN_INLIERS, Estimator, mean_residual, opencv_ransac, poselib_ransac
+from bpnp.layers.precision import full_precision
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]
@@ -44,6 +45,7 @@ def top_pairs(
     return PairList(flat // n, flat % n, probability, mask)
 
 
+@full_precision
 def ransac_pnp(
     assignment: Float[Tensor, "b m n"],
     points2d: Float[Tensor, "b m 2"],

@@ -12,10 +12,12 @@ from torch import Tensor, nn
 
 from bpnp.layers.implicit import entropic_plan
 from bpnp.layers.pacing import waits
+from bpnp.layers.precision import full_precision
 from bpnp.layers.transport import solve_plan
 from bpnp.types import SolveStats
 
 
+@full_precision
 def sinkhorn(
     cost: Float[Tensor, "b m n"],
     *,

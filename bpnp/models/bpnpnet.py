@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import Method, WeightedPnP
+from bpnp.layers.precision import full_precision
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.sinkhorn import Sinkhorn
 from bpnp.models.checkpoint import read_checkpoint
@@ -121,6 +122,7 @@ class BPnPNet(nn.Module):
         return net.eval()
 
 
+@full_precision
 def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> Float[Tensor, "b m n"]:
     """||a_i - b_j||_2 of unit vectors from one matrix product.
 
