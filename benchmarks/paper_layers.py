@@ -1,0 +1,167 @@
+"""The method of Campbell, Liu and Gould (ECCV 2020), written plainly from its formulas: what ours is measured against.
+
+Sinkhorn: scalings of exp(-lambda M), lambda = 1/mu, and the gradient of Lemma 2 through the inverse of the system of
+its m + n - 1 independent constraints, by blocks. RANSAC: OpenCV's P3P and EPnP on the top-k pairs. PnP: L-BFGS on Eq. 7
+over all m n pairs for the whole batch at once, and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian
+from automatic differentiation. Everything stays in the dtype of its input.
+
+The inverse is by Cholesky: the block that is left of the symmetric system is positive definite, and in torch 2.13 on
+the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail inside oneMKL.
+"""
+
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import roma
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from bpnp.geometry import bearings, transform
+from bpnp.models.bpnpnet import BPnPNet
+from bpnp.types import Batch
+
+MU, SINKHORN_ITERATIONS, SINKHORN_TOLERANCE = 0.1, 100, 1e-9
+PNP_ITERATIONS = 75
+THRESHOLD, RANSAC_ITERATIONS = 0.01, 1000
+
+
+def sinkhorn_forward(
+    cost: Tensor, *, mu: float = MU, iterations: int = SINKHORN_ITERATIONS, tolerance: float = SINKHORN_TOLERANCE
+) -> Tensor:
+    """P = diag(u) exp(-M / mu) diag(v) with uniform marginals, until no row sum is off by more than `tolerance`."""
+    b, m, n = cost.shape
+    kernel = torch.exp(-cost / mu)
+    # As row vectors: in torch 2.13 on the CPU a batched product with a column on the right is ten times slower.
+    v = cost.new_full((b, 1, n), 1 / n)
+    for _ in range(iterations):
+        u = 1 / (m * (v @ kernel.mT))
+        v = 1 / (n * (u @ kernel))
+        if tolerance > 0 and float((u * (v @ kernel.mT) - 1 / m).abs().max()) <= tolerance:
+            break
+    return u.mT * kernel * v
+
+
+def sinkhorn_backward(plan: Tensor, gradient: Tensor, *, mu: float = MU) -> Tensor:
+    """dL/dM = -P (V - a 1^T - 1 b^T)/mu with [a; b] from the inverse of [diag(r) P; P^T diag(c)] less its last column.
+
+    With D = diag(r), Q = P without its last column and S = diag(c) - Q^T D^-1 Q the inverse has the blocks
+    [D^-1 + D^-1 Q S^-1 Q^T D^-1, -D^-1 Q S^-1; ., S^-1]. NaN where S has no Cholesky factor.
+    """
+    rows, cols, weighted = plan.sum(-1), plan.sum(-2)[:, :-1], plan * gradient
+    reduced = plan[..., :-1]
+    scaled = reduced / rows.unsqueeze(-1)
+    factor, info = torch.linalg.cholesky_ex(torch.diag_embed(cols) - reduced.mT @ scaled)
+    positive = (info == 0)[:, None, None]
+    corner = torch.cholesky_inverse(torch.where(positive, factor, torch.eye(factor.shape[-1]).to(factor)))
+    corner = torch.where(positive, corner, torch.nan)
+    side = -scaled @ corner
+    top = torch.diag_embed(1 / rows) - side @ scaled.mT
+    row_term, col_term = weighted.sum(-1, keepdim=True), weighted.sum(-2).unsqueeze(-1)[:, :-1]
+    a = top @ row_term + side @ col_term
+    b = side.mT @ row_term + corner @ col_term
+    return -plan * (gradient - a - nn.functional.pad(b, (0, 0, 0, 1)).mT) / mu
+
+
+def ransac(assignment: Tensor, points2d: Tensor, points3d: Tensor) -> tuple[Tensor, Tensor]:
+    """P3P-RANSAC and EPnP (OpenCV) on the 1.5 min(m, n) most probable pairs; the identity where there is no pose."""
+    n = assignment.shape[2]
+    best = assignment.flatten(1).topk(int(1.5 * min(assignment.shape[1:])), dim=-1).indices
+    poses = np.tile(np.eye(3, 4), (len(best), 1, 1))
+    for i, pairs in enumerate(best.numpy()):
+        found, rotvec, translation, _ = cv2.solvePnPRansac(
+            points3d[i].double().numpy()[pairs % n], points2d[i].double().numpy()[pairs // n], np.eye(3), None,
+            iterationsCount=RANSAC_ITERATIONS, reprojectionError=THRESHOLD, flags=cv2.SOLVEPNP_P3P,
+        )  # fmt: skip
+        if found:
+            poses[i] = np.hstack([cv2.Rodrigues(rotvec)[0], translation])
+    solved = torch.as_tensor(poses).to(assignment)
+    return solved[..., :3], solved[..., 3]
+
+
+def objective(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor) -> Tensor:
+    """Eq. 7 over all m n pairs, for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
+    camera = transform(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], points3d)
+    return (assignment * (1 - rays @ nn.functional.normalize(camera, dim=-1).mT)).sum((-2, -1))
+
+
+def pnp_forward(assignment: Tensor, rays: Tensor, points3d: Tensor, start: Tensor) -> Tensor:
+    """Pose (b, 6) by one L-BFGS for the batch, 75 iterations or until the line search finds nothing lower.
+
+    The tolerances are off: torch's default ones, not relative to anything, end it where it starts if that is RANSAC's
+    pose. In float32 the line search ends it soon, for the values of Eq. 7 have too few digits; in float64 it gets on.
+    """
+    pose, assignment = start.clone().requires_grad_(), assignment.detach()
+    solver = torch.optim.LBFGS(
+        [pose], max_iter=PNP_ITERATIONS, tolerance_grad=0.0, tolerance_change=0.0, line_search_fn="strong_wolfe"
+    )
+
+    def evaluate() -> Tensor:
+        solver.zero_grad()
+        with torch.enable_grad():
+            value = objective(pose, assignment, rays, points3d).mean()
+            value.backward()
+        return value
+
+    solver.step(evaluate)
+    return pose.detach()
+
+
+def pnp_backward(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor, gradient: Tensor) -> Tensor:
+    """dL/dP = dL/dpose D, D = -H^-1 B (b, 6, m n) (Lemma 1)."""
+    pose, assignment = pose.detach().requires_grad_(), assignment.detach().requires_grad_()
+    with torch.enable_grad():
+        value = objective(pose, assignment, rays, points3d).sum()
+        (slope,) = torch.autograd.grad(value, pose, create_graph=True)
+        pulled = [torch.autograd.grad(x.sum(), (pose, assignment), retain_graph=True) for x in slope.unbind(-1)]
+    hessian = torch.stack([row for row, _ in pulled], 1)
+    mixed = torch.stack([row.flatten(1) for _, row in pulled], 1)
+    factor, _ = torch.linalg.cholesky_ex(hessian)
+    jacobian = -torch.cholesky_solve(mixed, factor)
+    return (gradient.unsqueeze(1) @ jacobian).view_as(assignment)
+
+
+class PaperSinkhorn(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, cost: Tensor) -> Tensor:
+        plan = sinkhorn_forward(cost)
+        ctx.save_for_backward(plan)
+        return plan
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (plan,) = ctx.saved_tensors
+        return sinkhorn_backward(plan, gradient)
+
+
+class PaperPnP(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, assignment: Tensor, rays: Tensor, points3d: Tensor, start: Tensor) -> Tensor:
+        pose = pnp_forward(assignment, rays, points3d, start)
+        ctx.save_for_backward(pose, assignment, rays, points3d)
+        return pose
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        pose, assignment, rays, points3d = ctx.saved_tensors
+        return pnp_backward(pose, assignment, rays, points3d, gradient), None, None, None
+
+
+class PaperPrediction(NamedTuple):
+    assignment: Tensor
+    rotation: Tensor | None = None
+    translation: Tensor | None = None
+
+
+def paper_network(net: BPnPNet, batch: Batch, *, poses: bool) -> PaperPrediction:
+    """The paper's layers around the feature nets of `net`."""
+    assignment = PaperSinkhorn.apply(net.cost(batch))
+    if not poses:
+        return PaperPrediction(assignment)
+    rotation, translation = ransac(assignment.detach(), batch.points2d, batch.points3d)
+    start = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1)
+    pose = PaperPnP.apply(assignment, bearings(batch.points2d), batch.points3d, start)
+    return PaperPrediction(assignment, roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:])

@@ -1,0 +1,104 @@
+"""Planted scenes with features of a chosen sharpness: what the benchmarks run on.
+
+A camera of the paper's protocol (focal length 800, noise 2 pixels, Euler angles up to 45 degrees, distance 4.5) sees
+points in the unit ball. Two kinds of features lead to two kinds of assignments:
+
+- smooth: random waves of a point's place in the image (noisy on the 2D side, exact on the 3D side). Points that lie
+  close together look alike, as they do to a trained network, and share their probability. `level` is the wave number.
+- independent: a random unit vector for each point and the same with noise of relative size `level` on the other side.
+  A wrong pair is as unlikely as any other; the easy case for every iterative solver.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from torch import Tensor, nn
+
+from bpnp.models.bpnpnet import BPnPNet, pairwise_distance
+from bpnp.models.features import PointFeatures
+from bpnp.types import Batch
+
+Kind = Literal["smooth", "independent"]
+
+FOCAL, NOISE_PX, DISTANCE, CHANNELS = 800.0, 2.0, 4.5, 128
+NET_SHARE = 0.02  # of the real network's features beside the planted ones
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A batch in which 3D point j was seen as 2D point j, and unit features of both sides."""
+
+    batch: Batch
+    features2d: Tensor
+    features3d: Tensor
+
+    @property
+    def cost(self) -> Tensor:
+        return pairwise_distance(self.features2d, self.features3d)
+
+
+def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float = 0.0, seed: int = 0) -> Problem:
+    """Scenes of `points` points on each side. The features of a share `clutter` of them have no counterpart."""
+    generator = torch.Generator().manual_seed(seed)
+    scene = nn.functional.normalize(torch.randn(batch, points, 3, generator=generator), dim=-1)
+    scene = scene * torch.rand(batch, points, 1, generator=generator) ** (1 / 3)
+    x, y, z = (torch.rand(3, batch, generator=generator) * torch.pi / 4).unbind()
+    rotation = _axis_rotation(z, 0, 1) @ _axis_rotation(y, 2, 0) @ _axis_rotation(x, 1, 2)
+    translation = torch.rand(batch, 3, generator=generator) - 0.5 + torch.tensor([0, 0, DISTANCE])
+    camera = scene @ rotation.mT + translation.unsqueeze(1)
+    exact = camera[..., :2] / camera[..., 2:]
+    noisy = exact + NOISE_PX / FOCAL * torch.randn(batch, points, 2, generator=generator)
+    pair = Batch.from_arrays(
+        list(noisy), list(scene), list(rotation), list(translation), [torch.arange(points)] * batch, focal=FOCAL
+    )
+    if kind == "smooth":
+        directions = level * DISTANCE * torch.randn(2, CHANNELS // 2, generator=generator)
+        features2d, features3d = ((x @ directions) for x in (noisy, exact))
+        features2d, features3d = (torch.cat([x.cos(), x.sin()], -1) for x in (features2d, features3d))
+    else:
+        features3d = torch.randn(batch, points, CHANNELS, generator=generator)
+        features2d = features3d + level * torch.randn(batch, points, CHANNELS, generator=generator)
+    lost = round(clutter * points)
+    features2d[:, :lost] = torch.randn(batch, lost, CHANNELS, generator=generator)
+    return Problem(pair, nn.functional.normalize(features2d, dim=-1), nn.functional.normalize(features3d, dim=-1))
+
+
+def diagonal_mass(assignment: Tensor) -> float:
+    """Share of the assignment on the true pairs, the mean over the batch."""
+    return float(assignment.diagonal(dim1=-2, dim2=-1).sum(-1).mean())
+
+
+def planted_network(problem: Problem, *, autocast: torch.dtype | None = None) -> BPnPNet:
+    """BPnPNet whose nets do all their work, forward and backward, but leave the assignment as sharp as planted.
+
+    autocast: dtype of the nets' products, none for float32; features and layers stay in float32.
+    """
+    net = BPnPNet(centre_features=True, image_scale=4.0)
+    net.features2d = _PlantedFeatures(net.features2d, problem.features2d, autocast)
+    net.features3d = _PlantedFeatures(net.features3d, problem.features3d, autocast)
+    return net
+
+
+class _PlantedFeatures(PointFeatures):
+    """Unit vector of a planted feature and a small part of that of the network."""
+
+    def __init__(self, inner: PointFeatures, planted: Tensor, autocast: torch.dtype | None) -> None:
+        nn.Module.__init__(self)
+        self.enter, self.blocks, self.centre = inner.enter, inner.blocks, inner.centre
+        self.autocast = autocast
+        self.register_buffer("planted", planted)
+
+    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
+        with torch.autocast(points.device.type, dtype=self.autocast, enabled=self.autocast is not None):
+            z = super().forward(points, mask)
+        return nn.functional.normalize(self.get_buffer("planted") + NET_SHARE * z.to(self.enter.weight.dtype), dim=-1)
+
+
+def _axis_rotation(angle: Tensor, i: int, j: int) -> Tensor:
+    """Rotation that turns axis i towards axis j."""
+    rotation = torch.eye(3).repeat(len(angle), 1, 1)
+    rotation[:, i, i] = rotation[:, j, j] = angle.cos()
+    rotation[:, j, i] = angle.sin()
+    rotation[:, i, j] = -angle.sin()
+    return rotation

@@ -1,0 +1,105 @@
+"""How the benchmarks measure: candidates take turns in one process, and what was measured is kept with its machine."""
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+SHORTEST = 0.05  # seconds; a faster call is repeated within a round, so that the clock and its neighbours matter less
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Median and quartiles over the rounds."""
+
+    median: float
+    low: float
+    high: float
+
+    @classmethod
+    def of(cls, values: list[float]) -> "Spread":
+        low, median, high = np.quantile(values, [0.25, 0.5, 0.75])
+        return cls(float(median), float(low), float(high))
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds a call: by the clock, and of this process' processor time, which other programs hardly change."""
+
+    wall: Spread
+    cpu: Spread
+
+
+@dataclass(frozen=True)
+class Race:
+    """Times of two candidates, and how many times longer the second took, round by round."""
+
+    ours: Timing
+    baseline: Timing
+    ratio: Spread
+    cpu_ratio: Spread
+
+
+def race(ours: Callable[[], object], baseline: Callable[[], object], *, rounds: int) -> Race:
+    """Time both in turns, `rounds` times after one call of each to warm up."""
+    candidates = [ours, baseline]
+    repeats = [_repeats(candidate) for candidate in candidates]
+    samples = [[_measure(c, n) for c, n in zip(candidates, repeats, strict=True)] for _ in range(rounds)]
+    (wall, cpu), (baseline_wall, baseline_cpu) = (
+        ([pair[i][0] for pair in samples], [pair[i][1] for pair in samples]) for i in range(2)
+    )
+    return Race(
+        Timing(Spread.of(wall), Spread.of(cpu)),
+        Timing(Spread.of(baseline_wall), Spread.of(baseline_cpu)),
+        Spread.of([b / a for a, b in zip(wall, baseline_wall, strict=True)]),
+        Spread.of([b / a for a, b in zip(cpu, baseline_cpu, strict=True)]),
+    )
+
+
+def _repeats(candidate: Callable[[], object]) -> int:
+    candidate()
+    milliseconds, _ = _measure(candidate, 1)
+    return max(1, round(1000 * SHORTEST / milliseconds))
+
+
+def _measure(candidate: Callable[[], object], repeats: int) -> tuple[float, float]:
+    """Milliseconds a call by the clock and of processor time."""
+    start, cpu_start = time.perf_counter(), time.process_time()
+    for _ in range(repeats):
+        candidate()
+    wall, cpu = time.perf_counter() - start, time.process_time() - cpu_start
+    return 1000 * wall / repeats, 1000 * cpu / repeats
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on, and how busy it was."""
+    return {
+        "kind": f"cpu-{os.cpu_count()}core",
+        "cpu": _cpu_model(),
+        "cores": os.cpu_count(),
+        "threads": torch.get_num_threads(),
+        "load_average": [round(x, 2) for x in os.getloadavg()],
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }
+
+
+def _cpu_model() -> str:
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor()
+
+
+def write_json(path: Path, record: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_suffix(".partial")
+    temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
+    os.replace(temporary, path)
