@@ -128,13 +128,16 @@ POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "fou
 
 
 def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], list[Any]]:
-    """World-to-camera quaternion and translation in COLMAP's order; empty where there is no pose."""
+    """World-to-camera quaternion and translation in COLMAP's order, in the scene's own coordinates; empty if none."""
     rows: dict[tuple[int, str], list[Any]] = {}
     for name, pose in prediction.poses.items():
         found = pose.found
         rotation = pose.rotation.double().where(found[:, None, None], torch.eye(3, device=found.device).double())
         xyzw = roma.rotmat_to_unitquat(rotation)
-        numbers = torch.cat([xyzw[:, 3:], xyzw[:, :3], pose.translation.double()], -1).tolist()
+        translation = pose.translation.double()
+        if batch.origin is not None:
+            translation = translation - (rotation @ batch.origin.double().unsqueeze(-1)).squeeze(-1)
+        numbers = torch.cat([xyzw[:, 3:], xyzw[:, :3], translation], -1).tolist()
         for i, (is_found, converged) in enumerate(zip(found.tolist(), pose.stats.converged.tolist(), strict=True)):
             values = numbers[i] if is_found else [""] * 7
             rows[int(batch.index[i]), name] = [batch.ids[i], name, *values, is_found, converged]

@@ -73,6 +73,7 @@ class Batch:
     index: (b,) position of each pair in its data set; a pair that appears twice (a padded distributed epoch) is
         counted once.
     ids: a name for each pair.
+    origin: (b, 3) what was subtracted from the scene's coordinates; written poses have it undone.
     """
 
     points2d: Float[Tensor, "b m 2"]
@@ -85,6 +86,7 @@ class Batch:
     rotation: Float[Tensor, "b 3 3"] | None = None
     translation: Float[Tensor, "b 3"] | None = None
     match3d: Int[Tensor, "b n"] | None = None
+    origin: Float[Tensor, "b 3"] | None = None
 
     def __len__(self) -> int:
         return self.points2d.shape[0]

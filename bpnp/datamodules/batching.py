@@ -1,7 +1,7 @@
 """From pairs of point sets to padded batches: what a source must offer, and how its pairs are put together."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -22,7 +22,8 @@ class Pair:
     """One image's points and the scene's points; see `bpnp.types` for the conventions.
 
     points2d (m, 2) normalised, points3d (n, 3), rotation (3, 3), translation (3,), match3d (n,) index into points2d
-    or -1, focal pixels per unit of normalised coordinates.
+    or -1, focal pixels per unit of normalised coordinates. origin (3,): what was subtracted from the scene's
+    coordinates, for scenes so far from theirs that float32 would lose digits; None for nothing.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Pair:
     translation: NDArray[np.float64]
     match3d: NDArray[np.int64]
     focal: float
+    origin: NDArray[np.float64] | None = None
 
 
 @runtime_checkable
@@ -47,7 +49,7 @@ class PairSource(Protocol):
 
 def collate(pairs: Sequence[Pair], index: Sequence[int]) -> Batch:
     """Pad and mask pairs into one float32 batch; `index` is the position of each in its data set."""
-    return Batch.from_arrays(
+    batch = Batch.from_arrays(
         [pair.points2d for pair in pairs],
         [pair.points3d for pair in pairs],
         [pair.rotation for pair in pairs],
@@ -57,6 +59,8 @@ def collate(pairs: Sequence[Pair], index: Sequence[int]) -> Batch:
         index=index,
         ids=[pair.name for pair in pairs],
     )
+    origins = np.stack([np.zeros(3) if pair.origin is None else pair.origin for pair in pairs])
+    return replace(batch, origin=torch.as_tensor(origins))
 
 
 class PairDataset(Dataset[Batch]):

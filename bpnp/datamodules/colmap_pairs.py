@@ -124,6 +124,7 @@ class ColmapSource:
             translation=image.translation + image.rotation @ origin,
             match3d=match3d[order3d],
             focal=image.focal,
+            origin=turn @ origin,
         )
 
     def _rng(self, index: int, epoch: int, stream: int) -> np.random.Generator:
