@@ -33,12 +33,14 @@ def sinkhorn_forward(
     """P = diag(u) exp(-M / mu) diag(v) with uniform marginals, until no row sum is off by more than `tolerance`."""
     b, m, n = cost.shape
     kernel = torch.exp(-cost / mu)
-    # As row vectors: in torch 2.13 on the CPU a batched product with a column on the right is ten times slower.
     v = cost.new_full((b, 1, n), 1 / n)
+    # As row vectors: in torch 2.13 on the CPU a batched product with a column on the right is ten times slower.
+    row_sums = v @ kernel.mT
     for _ in range(iterations):
-        u = 1 / (m * (v @ kernel.mT))
+        u = 1 / (m * row_sums)
         v = 1 / (n * (u @ kernel))
-        if tolerance > 0 and float((u * (v @ kernel.mT) - 1 / m).abs().max()) <= tolerance:
+        row_sums = v @ kernel.mT
+        if tolerance > 0 and float((u * row_sums - 1 / m).abs().max()) <= tolerance:
             break
     return u.mT * kernel * v
 
