@@ -212,7 +212,7 @@ class PairLoader(DataLoader[Batch]):
 
 
 def pair_loader(
-    source: PairSource,
+    source: PairSource | PairDataset,
     *,
     batch_size: int,
     shuffle: bool,
@@ -227,7 +227,7 @@ def pair_loader(
     max_cells: evaluation only; bounds b * m * n of the padded batch over all processes, and so the memory.
     """
     group = distributed.is_available() and distributed.is_initialized()
-    dataset = PairDataset(source)
+    dataset = source if isinstance(source, PairDataset) else PairDataset(source)
     sampler = BucketSampler(
         dataset,
         batch_size=batch_size,

@@ -1,14 +1,15 @@
 """Meshes seen by virtual cameras: ModelNet40, any folder in its layout, or procedural shapes."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import PairSource, pair_loader
+from bpnp.datamodules.batching import PairDataset, PairSource, pair_loader
+from bpnp.datamodules.device_views import DeviceViews, KeyDataset, ViewKeys
 from bpnp.datamodules.manifest import StoreError, is_store
 from bpnp.datamodules.mesh_folder import folder_pools
 from bpnp.datamodules.mesh_source import MeshSource, hold_out
@@ -35,6 +36,8 @@ class MeshDataModule(LightningDataModule):
             <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
         train_pairs: training pairs; pair i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed pairs of the paper.
+        views_on_device: let a Trainer make the fresh training views in batches on its device; none for wherever that is
+            not a CPU. They have the distribution of the views that the loader draws, but are others.
         val_fraction: share of the training meshes that is held out for validation.
         val_pairs: validation pairs, fixed; none for one per held-out mesh.
         test_pairs: test pairs, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
@@ -68,6 +71,7 @@ class MeshDataModule(LightningDataModule):
         *,
         train_pairs: int = 40_000,
         fresh_views: bool = False,
+        views_on_device: bool | None = None,
         val_fraction: float = 0.05,
         val_pairs: int | None = None,
         test_pairs: int | None = None,
@@ -104,10 +108,13 @@ class MeshDataModule(LightningDataModule):
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
         self.outliers = {"train": train_outliers, "val": train_outliers, "test": test_outliers}
         self.fresh_views, self.val_fraction, self.seed = fresh_views, val_fraction, seed
+        self.views_on_device = views_on_device
         self.batch_size = batch_size
         self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
         self.num_workers = num_workers
         self.sources: dict[str, PairSource] = {}
+        self._viewed: MeshSource | None = None
+        self._device_views: DeviceViews | None = None
 
     def prepare_data(self) -> None:
         """Build the caches in one process, for `setup` to open in all."""
@@ -118,7 +125,8 @@ class MeshDataModule(LightningDataModule):
         self.sources |= self._open(stage)
 
     def train_dataloader(self) -> DataLoader[Batch]:
-        return self._loader("train", batch_size=self.batch_size)
+        dataset = KeyDataset(self._viewed) if self._viewed and self._makes_views() else None
+        return self._loader("train", batch_size=self.batch_size, dataset=dataset)
 
     def val_dataloader(self) -> DataLoader[Batch]:
         return self._loader("val", batch_size=self.eval_batch_size)
@@ -129,11 +137,35 @@ class MeshDataModule(LightningDataModule):
     def predict_dataloader(self) -> DataLoader[Batch]:
         return self.test_dataloader()
 
-    def _loader(self, split: str, *, batch_size: int) -> DataLoader[Batch]:
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """The views of a batch of keys; other batches as they are."""
+        if not isinstance(batch, ViewKeys) or self._viewed is None:
+            return batch
+        if self._device_views is None or self._device_views.samples.device != batch.row.device:
+            self._device_views = DeviceViews(self._viewed, self.outliers["train"], device=batch.row.device)
+        return self._device_views.batch(batch)
+
+    def teardown(self, stage: str) -> None:
+        """Free the samples on the device."""
+        self._device_views = None
+
+    def _makes_views(self) -> bool:
+        """Whether the Trainer, which hands each batch to `on_after_batch_transfer`, is to make the fresh views."""
+        if self.trainer is None or self._viewed is None:
+            return False
+        if self.views_on_device is not None:
+            return self.views_on_device
+        # A batch made at once has no room for points that a camera misses.
+        whole = self._viewed.views.sees_all(self._viewed.pools.radius)
+        return whole and self.trainer.strategy.root_device.type != "cpu"
+
+    def _loader(
+        self, split: str, *, batch_size: int, dataset: PairDataset | None = None
+    ) -> DataLoader[Batch]:  # fmt: skip
         if split not in self.sources:
             raise ValueError(f"expected `setup` before the {split} loader, got no call; try `setup()`")
         return pair_loader(
-            self.sources[split],
+            self.sources[split] if dataset is None else dataset,
             batch_size=batch_size,
             shuffle=split == "train",
             seed=self.seed,
@@ -156,6 +188,7 @@ class MeshDataModule(LightningDataModule):
             split=split,
             fresh_views=fresh,
         )
+        self._viewed = source if fresh else self._viewed
         return harder(source, self.outliers[split], seed=self.seed, fresh=fresh)
 
     def _meshes(self, split: str) -> tuple[SurfacePools, NDArray[np.int64]]:
