@@ -19,6 +19,7 @@ from bpnp.models.checkpoint import read_checkpoint
 from bpnp.report import report
 from bpnp.report.results import PairRow, write_results
 from bpnp.report.rows import rows_from
+from bpnp.report.sketches import Sketches, joined, sketches_of, write_sketches
 from bpnp.report.views import PairView, select_views, views_from, write_views
 from bpnp.types import Batch, Prediction
 
@@ -63,7 +64,8 @@ class PoseLossWarmup(Callback):
 
 
 class ResultsWriter(Callback):
-    """Writes `pairs.csv`, `summary.json` and the points of some pairs after a test, `poses.csv` after a prediction.
+    """Writes `pairs.csv`, `summary.json`, the points of some pairs and a few points of every pair after a test, and
+    `poses.csv` after a prediction.
 
     Args:
         folder: where; null for `test` and `predict` in the trainer's default_root_dir.
@@ -76,10 +78,11 @@ class ResultsWriter(Callback):
         self.rows: list[PairRow] = []
         self.losses: dict[int, float] = {}
         self.views: Sequence[PairView] = ()
+        self.sketches: list[Sketches] = []
         self.poses: dict[tuple[int, str], list[Any]] = {}
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.rows, self.losses, self.views = [], {}, ()
+        self.rows, self.losses, self.views, self.sketches = [], {}, (), []
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
@@ -88,19 +91,22 @@ class ResultsWriter(Callback):
             outputs["prediction"], batch, outputs["seconds"], inlier_threshold=self.inlier_threshold
         )  # fmt: skip
         self.rows += rows
-        self.views = select_views([*self.views, *views_from(outputs["prediction"], batch)])
+        views = views_from(outputs["prediction"], batch)
+        self.views = select_views([*self.views, *views])
+        self.sketches.append(sketches_of(views))
         if outputs["losses"] is not None:
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather((self.rows, self.losses, self.views))
+        gathered = _gather((self.rows, self.losses, self.views, self.sketches))
         if trainer.is_global_zero:
-            rows = [row for part, _, _ in gathered for row in part]
-            losses = {index: loss for _, part, _ in gathered for index, loss in part.items()}
+            rows = [row for part, _, _, _ in gathered for row in part]
+            losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer, "test")
             write_results(folder, rows, correspondence_loss=mean, settings={"checkpoint": _checkpoint(trainer)})
-            write_views(folder, select_views([view for _, _, part in gathered for view in part]))
+            write_views(folder, select_views([view for _, _, part, _ in gathered for view in part]))
+            write_sketches(folder, joined([sketches for *_, part in gathered for sketches in part]))
             report([folder])
             rank_zero_info(f"results of {len({row.index for row in rows})} pairs in {folder}")
 

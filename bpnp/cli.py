@@ -5,6 +5,7 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,21 +16,25 @@ from lightning.pytorch.loggers import CSVLogger
 
 from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
 from bpnp.commands import convert_weights, prepare
+from bpnp.datamodules.photos import photo_finder
 from bpnp.report import report_command, view_command
 from bpnp.report.dashboards import wandb_command
+from bpnp.table import table_command
 from bpnp.task import BlindPnPTask, TrainingDivergedError
 
 DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
 
 Train and evaluate:      bpnp {fit,validate,test,predict} --config configs/quickstart.yaml
 Read results:            bpnp report RUN..., bpnp view RUN PAIR, bpnp wandb RUN...
+Compare methods:         bpnp table --data configs/psb.yaml --methods METHOD...
 Prepare data:            bpnp prepare DATASET SOURCE
 Released weights:        bpnp convert-weights FILE OUT
 """
 COMMANDS: dict[str, Callable[[list[str]], None]] = {
-    "report": report_command,
-    "view": view_command,
+    "report": partial(report_command, photos=photo_finder),
+    "view": partial(view_command, photos=photo_finder),
     "wandb": wandb_command,
+    "table": table_command,
     "prepare": prepare,
     "convert-weights": convert_weights,
 }

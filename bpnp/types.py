@@ -125,7 +125,7 @@ class Batch:
         array is, else float32; the batch is on the CPU.
 
         Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
-        or a match3d index that is no 2D point.
+        or a match3d that holds no integers or an index that is no 2D point.
         """
         sets2d, sets3d = _as_list("points2d", points2d, 2), _as_list("points3d", points3d, 2)
         size = len(sets2d)
@@ -218,6 +218,10 @@ def _match(i: int, match: Tensor, m: int, n: int) -> Tensor:
     if match.shape != (n,):
         raise ValueError(
             f"expected `match3d` of shape ({n},), one entry a 3D point, got {tuple(match.shape)} in pair {i}"
+        )
+    if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
+        raise ValueError(
+            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in pair {i}; try .astype(int)"
         )
     if int(match.min()) < -1 or int(match.max()) >= m:
         raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")

@@ -13,7 +13,7 @@ RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 def data_for(recipe: str, folder: Path) -> list[str]:
     """Where the recipe's data are, in small."""
     small = ["--data.batch_size=2"]
-    if recipe.startswith("colmap"):
+    if recipe.startswith(("colmap", "megadepth")):
         for i in range(5):
             plant_model(folder / "scenes" / f"scene{i}" / "sparse" / "0", seed=i)
         return [*small, f"--data.root={folder / 'scenes'}"]

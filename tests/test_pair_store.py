@@ -57,6 +57,38 @@ def test_round_trip(store: PairStore) -> None:
         assert store.matched[i] == (pair.match3d >= 0).sum()
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in 'a/1'; try .astype"),
+        ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in 'a/1'"),
+        ({"match3d": np.arange(3)}, r"`match3d` \(n,\), got .* in 'a/1'"),
+        ({"points2d": np.full((4, 2), np.nan, "f4")}, "finite points, pose and focal.*'a/1'"),
+        ({"translation": np.full(3, np.inf)}, "finite points, pose and focal.*'a/1'"),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(tmp_path: Path, change: dict[str, np.ndarray], message: str) -> None:
+    points = np.ones((4, 3), "f4")
+    pair = Pair("a/1", points[:, :2], points, np.eye(3), np.zeros(3), np.arange(4), 1.0)
+    vars(pair).update(change)  # past the type checks of the tests, which users do not have
+    with pytest.raises(ValueError, match=message):
+        write_pairs(tmp_path / "store", [("a", pair)], parameters={}, skipped={})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_origin_is_kept_and_turns_with_the_points(tmp_path: Path) -> None:
+    """The pose in the scene, camera = R (p + origin) + t - R origin, is that of the pair however it is turned."""
+    points = np.random.default_rng(0).normal(size=(6, 3)).astype("f4")
+    origin, rotation = np.array([5e5, -3e6, 40.0]), np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    pair = Pair("a/1", points[:, :2], points, rotation, np.ones(3), np.arange(6), 1.0, origin)
+    write_pairs(tmp_path / "store", [("a", pair)], parameters={}, skipped={})
+    store = PairStore(tmp_path / "store")
+    assert np.array_equal(store.pair(0).origin, origin)
+    turned = StoreSource(store, np.arange(1), rotate=True).pair(0, 0)
+    assert not np.allclose(turned.origin, origin)
+    np.testing.assert_allclose(turned.rotation @ turned.origin, rotation @ origin, rtol=1e-12)
+
+
 def test_a_store_may_be_empty(tmp_path: Path) -> None:
     write_pairs(tmp_path / "none", [], parameters={}, skipped={"s0": "bad"})
     assert len(PairStore(tmp_path / "none")) == 0

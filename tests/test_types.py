@@ -134,6 +134,12 @@ def test_says_what_is_wrong(message: str) -> None:
         Batch.from_arrays(**{**pair(5, 7), **WRONG[message]})
 
 
+@pytest.mark.parametrize("match", [np.array([0.0, 1.7]), torch.tensor([0.0, 1.0]), [True, False]])
+def test_match3d_is_never_rounded(match: Any) -> None:
+    with pytest.raises(ValueError, match="expected `match3d` as integers.*in pair 0; try .astype"):
+        Batch.from_arrays(np.zeros((2, 2)), np.zeros((2, 3)), match3d=match)
+
+
 def test_names_the_pair() -> None:
     arrays = lists(pair(3, 4), pair(5, 5))
     arrays["points2d"][1] = arrays["points2d"][1][:, :1]

@@ -177,7 +177,11 @@ def _match3d(value: Any, m: int, n: int, *, by_2d: bool) -> NDArray[np.int64]:
     index = np.asarray(value).reshape(-1)[:length]
     if len(index) < length or not np.issubdtype(index.dtype, np.number):
         raise SampleError(f"expected {length} indices in W_gt, got {len(index)}")
-    index = index.astype(np.int64)
+    with np.errstate(invalid="ignore"):
+        whole = index.astype(np.int64)
+    if (whole != index).any():
+        raise SampleError("expected W_gt as integers, got fractions or NaN")
+    index = whole
     if index.min() < -1 or index.max() > other:
         raise SampleError(f"expected W_gt between -1 and {other}, got {index.min()} to {index.max()}")
     index = np.where(index == other, -1, index)

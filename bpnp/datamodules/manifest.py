@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 NAME = "manifest.json"
-FORMAT = 1  # raised whenever a file of a store changes its meaning
+FORMAT = 2  # raised whenever a file of a store changes its meaning
 
 
 class StoreError(ValueError):

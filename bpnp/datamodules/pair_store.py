@@ -27,6 +27,7 @@ RECORD = np.dtype(
         ("focal", "<f8"),
         ("rotation", "<f8", (3, 3)),
         ("translation", "<f8", 3),
+        ("origin", "<f8", 3),
     ]
 )
 
@@ -83,6 +84,7 @@ class PairStore:
             translation=record["translation"],
             match3d=match3d.astype(np.int64),
             focal=float(record["focal"]),
+            origin=record["origin"],
         )
 
     def _map(self, name: str, dtype: np.dtype) -> NDArray[Any]:
@@ -105,7 +107,7 @@ def write_pairs(
     """Pack (scene, pair) after (scene, pair) into the new `folder`, in constant memory; complete or not there at all.
 
     parameters: kept in the manifest, must be JSON. skipped: what could not be used, and why.
-    Raises StoreError if the folder exists.
+    Raises StoreError if the folder exists, ValueError for a pair whose arrays do not fit each other.
     """
     with new_store(folder) as unfinished:
         totals = Counter[str]()
@@ -115,6 +117,7 @@ def write_pairs(
         files = [(unfinished / name).open("wb") for name in names]
         try:
             for scene, pair in pairs:
+                _check(pair)
                 arrays = (
                     np.ascontiguousarray(pair.points2d, "<f4"),
                     np.ascontiguousarray(pair.points3d, "<f4"),
@@ -130,6 +133,7 @@ def write_pairs(
                 record["crc32"] = _checksum(*arrays)
                 record["focal"], record["rotation"] = pair.focal, pair.rotation
                 record["translation"] = pair.translation
+                record["origin"] = 0 if pair.origin is None else pair.origin
                 for file, part in zip(files, (*(a.tobytes() for a in arrays), record.tobytes(), name), strict=True):
                     file.write(part)
                 per_scene[scene] += 1
@@ -147,6 +151,28 @@ def write_pairs(
             "parameters": dict(parameters),
         }
         write_manifest(unfinished, content, digested=("index.bin", "names.bin"))
+
+
+def _check(pair: Pair) -> None:
+    """What nobody would notice later: other shapes, indices that are no integers or no 2D points, NaN."""
+    m, n, match = len(pair.points2d), len(pair.points3d), np.asarray(pair.match3d)
+    shapes = np.shape(pair.points2d), np.shape(pair.points3d), match.shape
+    if shapes != ((m, 2), (n, 3), (n,)):
+        raise ValueError(
+            f"expected `points2d` (m, 2), `points3d` (n, 3) and `match3d` (n,), got {shapes} in {pair.name!r}"
+        )
+    if not np.issubdtype(match.dtype, np.integer):
+        raise ValueError(
+            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in {pair.name!r}; try "
+            ".astype(int)"
+        )
+    if n and not -1 <= match.min() <= match.max() < m:
+        raise ValueError(
+            f"expected `match3d` between -1 and {m - 1}, got {match.min()} to {match.max()} in {pair.name!r}"
+        )
+    numbers = (pair.points2d, pair.points3d, pair.rotation, pair.translation, pair.focal)
+    if not all(np.isfinite(values).all() for values in numbers):
+        raise ValueError(f"expected finite points, pose and focal, got NaN or infinity in {pair.name!r}")
 
 
 def _checksum(points2d: NDArray[Any], points3d: NDArray[Any], match3d: NDArray[Any]) -> int:

@@ -5,7 +5,7 @@ import logging
 # zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
 import zlib  # noqa: F401
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -95,6 +95,17 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
     if notable:
         logger.warning("not used in %s: %s", path, ", ".join(notable))
     return Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(lost))
+
+
+def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
+    """By image name, the function from rays (k, 3) in camera coordinates to pixels (k, 2), distortion included.
+
+    Raises ColmapError as `read_reconstruction`.
+    """
+    records = read_records(folder, camera_models=CAMERA_MODELS)
+    cameras = {image.camera_id: image for image in records.images}
+    lenses = {key: _camera(folder, image, records.cameras.get(key)) for key, image in cameras.items()}
+    return {image.name: lenses[image.camera_id].img_from_cam for image in records.images}
 
 
 def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> pycolmap.Camera:

@@ -93,8 +93,11 @@ class StoreSource:
             return pair
         turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix()  # a normal 4-vector has a uniform direction
         return replace(
-            pair, points3d=(pair.points3d @ turn.T).astype(np.float32), rotation=pair.rotation @ turn.T
-        )  # fmt: skip
+            pair,
+            points3d=(pair.points3d @ turn.T).astype(np.float32),
+            rotation=pair.rotation @ turn.T,
+            origin=None if pair.origin is None else turn @ pair.origin,
+        )
 
     def _kept(self, matched: NDArray[np.int64] | int) -> NDArray[np.int64]:
         return np.asarray(matched if self.max_points is None else np.minimum(matched, self.max_points))

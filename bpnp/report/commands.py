@@ -8,15 +8,23 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bpnp.report.figures import plot_pair, recall_curve, save_figure
+from bpnp.report.figures import Lines, plot_pair, recall_curve, save_figure
 from bpnp.report.page import write_page
+from bpnp.report.photos import PhotoFinder, Photos, box_of
+from bpnp.report.results import read_results
 from bpnp.report.runs import named_runs
+from bpnp.report.sketches import read_sketches
+from bpnp.report.solutions import read_solution
 from bpnp.report.tables import report
 from bpnp.report.views import PairView, read_views
 
 
-def report_command(arguments: Sequence[str], console: Console | None = None) -> None:
-    """`bpnp report RUN... [--paper SET] [--untrained RUN] [--html FILE] [--recall FILE]`.
+def report_command(
+    arguments: Sequence[str], console: Console | None = None, *, photos: Photos | None = None
+) -> None:  # fmt: skip
+    """`bpnp report RUN... [--paper SET] [--untrained RUN] [--html FILE] [--photos SCENES] [--recall FILE]`.
+
+    photos: what finds the photos of the pairs below a folder of scenes; see `bpnp.report.photos`.
 
     Raises ValueError for what cannot be read, OSError for what cannot be written.
     """
@@ -29,18 +37,25 @@ def report_command(arguments: Sequence[str], console: Console | None = None) -> 
     )
     parser.add_argument("--untrained", type=Path, metavar="RUN", help="results of the untrained weights, to compare")
     parser.add_argument("--html", type=Path, metavar="FILE", help="write a page that needs no network")
+    parser.add_argument(
+        "--photos", type=Path, metavar="SCENES", help="the COLMAP scenes, to put the images under the page's 2D views"
+    )
     parser.add_argument("--recall", type=Path, metavar="FILE", help="write the recall curves as .png, .svg or .pdf")
     chosen = parser.parse_args(arguments)
     paths = list(named_runs(chosen.runs).values())
     if chosen.html is not None:
-        _say(console, write_page(paths, chosen.html, paper=chosen.paper))
+        photo = None if chosen.photos is None else _finder(chosen.photos, photos)
+        _say(console, write_page(paths, chosen.html, paper=chosen.paper, photo=photo))
     if chosen.recall is not None:
         _say(console, save_figure(recall_curve(paths), chosen.recall))
     report(paths, console, paper=chosen.paper, untrained=chosen.untrained)
 
 
-def view_command(arguments: Sequence[str], console: Console | None = None) -> None:
-    """`bpnp view RUN [PAIR] [--output FILE] [--estimate NAME] [--lines WHICH] [--open]`.
+def view_command(
+    arguments: Sequence[str], console: Console | None = None, *, photos: Photos | None = None
+) -> None:  # fmt: skip
+    """`bpnp view RUN [PAIR...]` or `bpnp view SOLUTION.json`; `--output FILE`, `--estimate NAME`, `--lines WHICH`,
+    `--photos SCENES`, `--open`.
 
     Raises ValueError if the run kept no points, or none of that pair; OSError for what cannot be written.
     """
@@ -48,34 +63,71 @@ def view_command(arguments: Sequence[str], console: Console | None = None) -> No
         prog="bpnp view",
         description="Draw a pair of a test: points and cameras in space, and what is seen in the image.",
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="folder that `bpnp test` wrote, or its run")
-    parser.add_argument("pair", nargs="?", help="name of the pair, or part of it; the worst by default")
+    parser.add_argument(
+        "run", type=Path, metavar="RUN", help="folder that `bpnp test` wrote, or its run; or the JSON of a solution"
+    )
+    parser.add_argument("pairs", nargs="*", metavar="PAIR", help="name of a pair, or part of it; the worst by default")
     parser.add_argument("--output", type=Path, metavar="FILE", help=".png, .svg or .pdf; RUN/views/PAIR.png by default")
     parser.add_argument("--estimate", help="whose pose reprojects the 3D points; the first by default")
     parser.add_argument("--lines", choices=("true", "assigned", "none"), default="true", help="which matches to draw")
+    parser.add_argument("--photos", type=Path, metavar="SCENES", help="the COLMAP scenes, with the images beside them")
     parser.add_argument("--open", action="store_true", help="show the file with the system's viewer")
     chosen = parser.parse_args(arguments)
-    (folder,) = named_runs([chosen.run]).values()
-    view = _chosen_view(folder, chosen.pair)
-    lines = {"true": "match3d", "assigned": "assigned3d", "none": None}[chosen.lines]
-    output = chosen.output or folder / "views" / f"{re.sub(r'[^A-Za-z0-9._-]+', '_', view.id) or view.index}.png"
-    written = save_figure(plot_pair(view, estimate=chosen.estimate, lines=lines), output)  # type: ignore[arg-type]
-    _say(console, written)
-    if chosen.open:
-        webbrowser.open(written.absolute().as_uri())
+    if chosen.output is not None and len(chosen.pairs) > 1:
+        raise ValueError(f"expected one pair with --output, got {len(chosen.pairs)}; try without --output")
+    if chosen.run.is_file() and chosen.pairs:
+        raise ValueError(f"expected no pair beside the solution {chosen.run}, got {chosen.pairs[0]!r}")
+    photo = None if chosen.photos is None else _finder(chosen.photos, photos)
+    which: dict[str, Lines | None] = {"true": "match3d", "assigned": "assigned3d", "none": None}
+    lines = which[chosen.lines]
+    if chosen.run.is_file():
+        views, folder = [read_solution(chosen.run)], chosen.run.absolute().parent
+    else:
+        (folder,) = named_runs([chosen.run]).values()
+        views = chosen_views(folder, chosen.pairs)
+    for view in views:
+        name = chosen.run.stem if chosen.run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", view.id) or str(view.index)
+        output = chosen.output or folder / "views" / f"{name}.png"
+        figure = plot_pair(view, estimate=chosen.estimate, lines=lines, photo=photo and photo(view.id, box_of(view)))
+        written = save_figure(figure, output)
+        _say(console, written)
+        if chosen.open:
+            webbrowser.open(written.absolute().as_uri())
 
 
-def _chosen_view(folder: Path, wanted: str | None) -> PairView:
-    views = read_views(folder)
-    if not views:
+def chosen_views(folder: Path, wanted: Sequence[str]) -> list[PairView]:
+    """The views of the named pairs, with up to a thousand points if they were kept, else with two dozen; the worst if
+    none is named."""
+    views, sketches = {view.id: view for view in read_views(folder)}, read_sketches(folder)
+    if not views and sketches is None:
         raise ValueError(f"expected views.npz in {folder}, got none; try `bpnp test` again, which keeps some pairs")
-    if wanted is None:
-        return max(views, key=lambda view: view.error)
-    named = [view for view in views if view.id == wanted] or [view for view in views if wanted in view.id]
-    if len(named) != 1:
-        known = ", ".join(view.id for view in named or views)
-        raise ValueError(f"expected the name of one pair kept in {folder}, got {wanted!r}; try one of {known}")
-    return named[0]
+    if not wanted and views:
+        return [max(views.values(), key=lambda view: view.error)]
+    rows: dict[str, int] = {}
+    if sketches is not None:
+        ids = {row.index: row.id for row in read_results(folder).rows}
+        rows = {ids[int(index)]: row for row, index in enumerate(sketches.index) if int(index) in ids}
+        if not wanted:
+            wanted = [ids[int(sketches.index[sketches.error.argmax()])]]
+    found = []
+    for name in wanted:
+        known = list(dict.fromkeys([*views, *rows]))
+        named = [id for id in known if id == name] or [id for id in known if name in id]
+        if len(named) != 1:
+            some = ", ".join((named or known)[:20])
+            raise ValueError(f"expected the name of one pair kept in {folder}, got {name!r}; try one of {some}")
+        (id,) = named
+        if id in views:
+            found.append(views[id])
+        elif sketches is not None:
+            found.append(sketches.view(rows[id], id))
+    return found
+
+
+def _finder(scenes: Path, photos: Photos | None) -> PhotoFinder:
+    if photos is None:
+        raise ValueError("expected a reader of photos for --photos, got none; try the command `bpnp`")
+    return photos(scenes)
 
 
 def _say(console: Console | None, path: Path) -> None:

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bpnp.report.palette import DASHES, LIGHT, styles
+from bpnp.report.photos import box_of
 from bpnp.report.results import Results, read_results
 from bpnp.report.runs import named_runs
+from bpnp.report.solutions import Solved, solution_view
 from bpnp.report.views import Array, PairView
 
 if TYPE_CHECKING:
@@ -61,15 +63,24 @@ def recall_curve(
     return figure
 
 
-def plot_pair(view: PairView, *, estimate: str | None = None, lines: Lines | None = "match3d") -> "Figure":
+def plot_pair(
+    view: PairView | Solved,
+    *,
+    estimate: str | None = None,
+    lines: Lines | None = "match3d",
+    photo: Array | None = None,
+) -> "Figure":
     """A pair in space, points with true and estimated cameras, and in the image, seen and reprojected points.
 
-    estimate: the pose that reprojects, the first by default. lines: join each image point with its true match
-    ("match3d") or with the one assigned by the solver ("assigned3d"); of a pair without known matches, always the
-    latter. Raises ValueError for an unknown estimate.
+    view: of a test, or the solution of `bpnp.solve`. estimate: the pose that reprojects, the first by default. lines:
+    join each image point with its true match ("match3d") or with the one assigned by the solver ("assigned3d"); of a
+    pair without known matches, always the latter. photo: (h, w, 3) uint8 under the image points, undistorted, that
+    fills `bpnp.report.photos.box_of(view)`. Raises ValueError for an unknown estimate.
     """
     from matplotlib.figure import Figure
 
+    if not isinstance(view, PairView):
+        view = solution_view(view)
     if estimate is not None and estimate not in view.estimates:
         raise ValueError(f"expected an estimate among {list(view.estimates)}, got {estimate!r}")
     estimate = estimate or next(iter(view.estimates), None)
@@ -83,6 +94,9 @@ def plot_pair(view: PairView, *, estimate: str | None = None, lines: Lines | Non
     axes = figure.add_subplot(1, 2, 2)
     axes.plot(*view.points2d.T, "o", mfc="none", mec="black", ms=5, label="image points", zorder=3)
     limits = axes.axis()
+    if photo is not None:
+        left, top, right, bottom = box_of(view)
+        axes.imshow(photo, extent=(left, right, bottom, top), alpha=0.75, zorder=0)
     if estimate in poses:
         _draw_reprojection(axes, view, poses[estimate], colours[estimate], lines)
         axes.plot([], [], "x", color=colours[estimate], label=_text(f"3D points, {estimate}"))

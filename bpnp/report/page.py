@@ -4,7 +4,6 @@ The numbers travel as JSON inside the file, long columns as base64 of little-end
 pairs stay under 20 MB. What is drawn from them is in `assets`.
 """
 
-import base64
 import html
 import json
 import os
@@ -14,18 +13,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bpnp.report.causes import CAUSES, SOLVED_DEG, cause_of
+from bpnp.report.page_views import packed, page_sketches, page_view
 from bpnp.report.palette import DARK, DARK_BACKGROUND, DASHES, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import PairRow, Results, read_results
 from bpnp.report.runs import named_runs
+from bpnp.report.sketches import read_sketches
 from bpnp.report.tables import PAPER, RESULT_COLUMNS, Paper, cell
 from bpnp.report.training_log import TrainingLog, read_training_log
 from bpnp.report.views import PairView, read_views
 
 SCRIPTS = (
     "data.js",
+    "sketches.js",
     "chart.js",
     "quartiles.js",
     "plots.js",
@@ -36,19 +38,22 @@ SCRIPTS = (
     "dialog.js",
     "main.js",
 )
-FORMATS = {"f4": "<f4", "i4": "<i4", "u2": "<u2", "i2": "<i2", "u1": "u1"}
+MOST_BYTES = 19_500_000
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "iterations")
 SIZES = ("m", "n", "true_pairs")
 
 
-def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
+def write_page(
+    paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None, photo: PhotoFinder | None = None
+) -> Path:
     """Write the page of one or several results folders, whole or not at all, and return where it is.
 
+    photo: what finds the photo of a pair, to lie under its 2D view; see `bpnp.report.photos`.
     Raises ValueError if a folder, its views or its training log cannot be read.
     """
     output = Path(output)
-    text = page_html(paths, paper=paper)
+    text = page_html(paths, paper=paper, photo=photo)
     output.parent.mkdir(parents=True, exist_ok=True)
     temporary = output.with_name(f".{output.name}.{os.getpid()}")
     try:
@@ -59,17 +64,25 @@ def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper 
     return output
 
 
-def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str:
+def page_html(
+    paths: Sequence[Path | str], *, paper: Paper | None = None, photo: PhotoFinder | None = None
+) -> str:  # fmt: skip
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
     views = {name: read_views(path) for name, path in folders.items()}
+    data = page_data(runs, views, _logs(folders), paper=paper) | {"photos": page_photos(views, photo)}
+    text = script_json(data)
+    places = {name: _places(results) for name, results in runs.items()}
+    sketches = {name: read_sketches(path) for name, path in folders.items()}
+    own, groups = page_sketches(sketches, places, room=MOST_BYTES - len(text))
     assets = files("bpnp.report") / "assets"
     scripts = "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS)
     parts = {
         "style": _colours() + (assets / "page.css").read_text(encoding="utf-8"),
         "script": f"(() => {{\n{scripts}}})();\n",
-        "data": script_json(page_data(runs, views, _logs(folders), paper=paper)),
+        "data": text,
+        "sketches": script_json({"runs": own, "groups": groups}),
         "title": html.escape("bpnp: " + ", ".join(runs)),
     }
     pieces = (assets / "page.html").read_text(encoding="utf-8").split("%%")
@@ -93,7 +106,7 @@ def page_data(
         own = [row.id for row in pairs]
         if own not in ids:
             ids.append(own)
-        position = {row.index: i for i, row in enumerate(pairs)}
+        position = _places(results)
         shown.append(
             {
                 "name": name,
@@ -102,13 +115,13 @@ def page_data(
                 "settings": results.settings,
                 "correspondence_loss": results.correspondence_loss,
                 "ids": ids.index(own),
-                "sizes": {key: packed([getattr(row, key) for row in pairs], "i4") for key in SIZES},
+                "sizes": {key: _whole([getattr(row, key) for row in pairs]) for key in SIZES},
                 "estimates": {
                     key: _estimate([row for row in results.rows if row.estimate == key], results.estimates[key])
                     | {"colour": shapes[name, key][0], "dashes": DASHES[shapes[name, key][1]]}
                     for key in estimates
                 },
-                "views": {str(position[v.index]): _view(v) for v in views.get(name, ()) if v.index in position},
+                "views": {str(position[v.index]): page_view(v) for v in views.get(name, ()) if v.index in position},
             }
         )
     return {
@@ -122,15 +135,16 @@ def page_data(
     }
 
 
-def packed(values: npt.ArrayLike, kind: str) -> dict[str, str]:
-    """Numbers as {kind: base64}; kinds as in `FORMATS`."""
-    return {kind: base64.b64encode(np.asarray(values, dtype=FORMATS[kind]).tobytes()).decode()}
-
-
 def script_json(value: Any) -> str:
     """JSON that can stand in a script element: no name in it can close the element or open another."""
     text = json.dumps(value, allow_nan=False, separators=(",", ":"))
     return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
+
+
+def _places(results: Results) -> dict[int, int]:
+    """The place of each pair's index in the page's lists."""
+    first = next(iter(results.estimates))
+    return {row.index: i for i, row in enumerate(row for row in results.rows if row.estimate == first)}
 
 
 def _estimate(rows: Sequence[PairRow], values: Mapping[str, float]) -> dict[str, Any]:
@@ -140,29 +154,13 @@ def _estimate(rows: Sequence[PairRow], values: Mapping[str, float]) -> dict[str,
     return {
         "cells": list(zip(texts, finite, strict=True)),
         "columns": {key: packed([getattr(row, key) for row in rows], "f4") for key in ERRORS}
-        | {key: packed([getattr(row, key) for row in rows], "i4") for key in COUNTS}
+        | {key: _whole([getattr(row, key) for row in rows]) for key in COUNTS}
         | {"cause": packed([CAUSES.index(cause_of(row)) for row in rows], "u1")},
     }
 
 
-def _view(view: PairView) -> dict[str, Any]:
-    """Coordinates in steps of 1/65535 of their box: finer than a screen shows."""
-    shown: dict[str, Any] = {
-        "match3d": packed(view.match3d, "i2"),
-        "assigned3d": packed(view.assigned3d, "i2"),
-        "pose": None if view.pose is None else _numbers(view.pose),
-        "estimates": {name: _numbers(pose) for name, pose in view.estimates.items()},
-    }
-    for name, points in (("points2d", view.points2d), ("points3d", view.points3d)):
-        low, size = points.min(0), np.ptp(points, axis=0)
-        steps = np.round((points - low) / np.where(size > 0, size, 1) * 65535)
-        shown[name] = {"low": low.tolist(), "size": size.tolist(), **packed(steps.ravel(), "u2")}
-    return shown
-
-
-def _numbers(pose: tuple[Any, Any]) -> list[float] | None:
-    values = [*np.asarray(pose[0], float).ravel().tolist(), *np.asarray(pose[1], float).tolist()]
-    return values if np.isfinite(values).all() else None
+def _whole(values: Sequence[int]) -> dict[str, str]:
+    return packed(values, "u2" if min(values) >= 0 and max(values) < 2**16 else "i4")
 
 
 def _paper(paper: Paper | None) -> list[dict[str, Any]]:

@@ -6,7 +6,7 @@ A test of ten thousand pairs keeps a few dozen. Which ones does not depend on th
 import io
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -110,6 +110,18 @@ def select_views(views: Iterable[PairView], *, worst: int = 12, others: int = 12
     spread = sorted(once.values(), key=lambda view: (view.index * 2654435769) % 2**32)
     chosen = {view.index: view for view in [*by_error[:worst], *spread[:others]]}
     return tuple(chosen[index] for index in sorted(chosen))
+
+
+def thin(view: PairView, most: int) -> PairView:
+    """The view with at most `most` points on each side, matched ones first."""
+    keep2d, keep3d = _kept(len(view.points2d), view.match3d, most)
+    return replace(
+        view,
+        points2d=view.points2d[keep2d],
+        points3d=view.points3d[keep3d],
+        match3d=_renumbered(view.match3d[keep3d], keep2d),
+        assigned3d=_renumbered(view.assigned3d[keep3d], keep2d),
+    )
 
 
 def write_views(folder: Path | str, views: Iterable[PairView]) -> None:

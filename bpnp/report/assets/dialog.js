@@ -9,7 +9,8 @@ function openPair(i) {
   open = { position: i, id: series.ids[i], place };
   byId("pair-title").textContent = open.id || "(no name)";
   drawNumbers();
-  const kept = [series, ...SERIES].find((other) => place(other) in other.run.views);
+  const all = [series, ...SERIES];
+  const kept = all.find((other) => place(other) in other.run.views) ?? all.find((other) => hasPoints(other.run, place(other)));
   byId("pair-views").hidden = kept === undefined;
   byId("pair-missing").hidden = kept !== undefined;
   const rank = listed.indexOf(i);
@@ -18,7 +19,11 @@ function openPair(i) {
   if (!byId("pair").open) byId("pair").showModal();
   history.replaceState(null, "", `#pair=${encodeURIComponent(wellFormed(open.id))}`);
   if (kept === undefined) return;
-  open.view = unpackedView(kept.run.views[place(kept)]);
+  const own = kept.run.views[place(kept)];
+  open.view = own ? unpackedView(own) : sketchedView(kept.run, place(kept));
+  byId("pair-lines").querySelector("[value=assigned3d]").disabled = !own;
+  if (!own && byId("pair-lines").value === "assigned3d") byId("pair-lines").value = "match3d";
+  loadPhoto(open);
   open.cameras = camerasOf(open.view, kept.run);
   const wanted = open.cameras.findIndex(({ name }) => name === series.estimate);
   byId("pair-estimate").replaceChildren(...open.cameras.map(({ name }, k) => element("option", { value: k }, name)));
@@ -67,7 +72,7 @@ function redrawViews() {
   if (!byId("pair").open || !open?.view || byId("pair-views").hidden) return;
   const camera = open.cameras[byId("pair-estimate").value];
   drawScene(open.view, open.cameras);
-  if (camera) drawImage(open.view, camera, byId("pair-lines").value);
+  if (camera) drawImage(open.view, camera, byId("pair-lines").value, byId("pair-photo").checked ? open.photo : null);
 }
 
 function prepareDialog() {
@@ -76,7 +81,21 @@ function prepareDialog() {
   byId("pair-next").addEventListener("click", step(1));
   byId("pair-close").addEventListener("click", () => byId("pair").close());
   byId("pair").addEventListener("close", () => history.replaceState(null, "", location.pathname + location.search));
-  for (const id of ["pair-estimate", "pair-lines"]) byId(id).addEventListener("input", redrawViews);
+  for (const id of ["pair-estimate", "pair-lines", "pair-photo"]) byId(id).addEventListener("input", redrawViews);
+}
+
+// The undistorted photo of a pair, where the page has one; drawn again when it is decoded.
+function loadPhoto(pair) {
+  const kept = Object.hasOwn(DATA.photos, pair.id) ? DATA.photos[pair.id] : null;
+  byId("pair-photo-label").hidden = kept === null;
+  pair.photo = null;
+  if (kept === null) return;
+  const image = new Image();
+  image.addEventListener("load", () => {
+    pair.photo = { image, box: kept.box };
+    if (pair === open) redrawViews();
+  });
+  image.src = `data:image/jpeg;base64,${kept.jpeg}`;
 }
 
 // Names that are not UTF-8 hold lone surrogates, which addresses cannot.

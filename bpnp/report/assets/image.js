@@ -1,11 +1,17 @@
 // What the camera saw, circles, and what a pose says it should have seen, crosses, with lines between matches.
 
-function drawImage(view, { name, pose, colour }, lines) {
+function drawImage(view, { name, pose, colour }, lines, photo) {
   const canvas = byId("image");
   const { pen, width, height } = fitted(canvas);
   const { low, size } = view.box2d;
   const zoom = Math.min(width / (size[0] || 1e-9), height / (size[1] || 1e-9)) / 1.3;
   const place = ([x, y]) => [width / 2 + (x - low[0] - size[0] / 2) * zoom, height / 2 + (y - low[1] - size[1] / 2) * zoom];
+  if (photo) {
+    const [[left, top], [right, bottom]] = [place(photo.box.slice(0, 2)), place(photo.box.slice(2))];
+    pen.globalAlpha = 0.75;
+    pen.drawImage(photo.image, left, top, right - left, bottom - top);
+    pen.globalAlpha = 1;
+  }
   const seen = view.points2d.map(place);
   const projected = view.points3d.map((point) => {
     const [x, y, z] = toCamera(pose, point);
@@ -22,19 +28,28 @@ function drawImage(view, { name, pose, colour }, lines) {
     stroke(pen, [seen[i], projected[j]]);
   });
   pen.setLineDash([]);
-  pen.strokeStyle = resolved("--text");
-  for (const [x, y] of seen) {
-    pen.beginPath();
-    pen.arc(x, y, 3, 0, 2 * Math.PI);
-    pen.stroke();
-  }
-  pen.strokeStyle = resolved(colour);
-  pen.lineWidth = 1.5;
-  for (const point of projected.filter(inside)) {
-    const [x, y] = point;
-    stroke(pen, [[x - 3, y - 3], [x + 3, y + 3]]);
-    stroke(pen, [[x - 3, y + 3], [x + 3, y - 3]]);
-  }
+  const circles = () => {
+    for (const [x, y] of seen) {
+      pen.beginPath();
+      pen.arc(x, y, 3, 0, 2 * Math.PI);
+      pen.stroke();
+    }
+  };
+  const crosses = () => {
+    for (const [x, y] of projected.filter(inside)) {
+      stroke(pen, [[x - 3, y - 3], [x + 3, y + 3]]);
+      stroke(pen, [[x - 3, y + 3], [x + 3, y - 3]]);
+    }
+  };
+  // Over a photo of any brightness every mark has a rim of the other brightness.
+  const rimmed = (draw, colour, width) => {
+    for (const [style, own] of photo ? [[resolved("--background"), width + 2], [colour, width]] : [[colour, width]]) {
+      [pen.strokeStyle, pen.lineWidth] = [style, own];
+      draw();
+    }
+  };
+  rimmed(circles, resolved("--text"), 1);
+  rimmed(crosses, resolved(colour), 1.5);
   const outside = projected.length - projected.filter(inside).length;
   canvas.setAttribute("aria-label", `Image points and 3D points reprojected by the pose ${name}`);
   byId("image-text").replaceChildren(`○ ${seen.length} of the image points, `,

@@ -36,7 +36,7 @@ function selectPairs() {
   series.ids.forEach((id, i) => {
     if (wanted && !id.toLowerCase().includes(wanted.toLowerCase())) return;
     if (cause !== "" && causes[i] !== Number(cause)) return;
-    if (drawn && !(i in series.run.views)) return;
+    if (drawn && !hasPoints(series.run, i)) return;
     chosen.push(i);
   });
   if (pairSort.column === "id") {
@@ -58,7 +58,7 @@ function drawPairs() {
   pairPage = Math.min(pairPage, pages - 1);
   const rows = listed.slice(pairPage * ROWS, (pairPage + 1) * ROWS).map((i) =>
     element("tr", {}, element("th", { scope: "row" },
-      element("button", { type: "button", class: i in series.run.views ? "link drawn" : "link", onclick: () => openPair(i) },
+      element("button", { type: "button", class: hasPoints(series.run, i) ? "link drawn" : "link", onclick: () => openPair(i) },
         series.ids[i] || "(no name)")),
       ...PAIR_COLUMNS.map(([key]) => element("td", {}, pairText(key, pairColumn(series, key)[i]))),
       element("td", { class: "words" }, DATA.causes[series.get("cause")[i]])));
@@ -72,6 +72,9 @@ function drawPairs() {
       element("th", { scope: "col", class: "words" }, "cause"))),
     element("tbody", {}, ...rows));
   drawPager(pages);
+  const kept = series.ids.reduce((sum, _, i) => sum + hasPoints(series.run, i), 0);
+  byId("pair-kept").textContent = `Points to look at (◉): of ${kept === series.ids.length ? "all" : kept} of the `
+    + `${series.ids.length} pairs; of ${Object.keys(series.run.views).length} up to 300 a side, of the others up to 24.`;
 }
 
 function drawPager(pages) {

@@ -1,0 +1,63 @@
+"""Photos under the 2D views: undistorted crops in normalised image coordinates, small enough for a page."""
+
+import base64
+import io
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from bpnp.report.views import Array, PairView
+
+MARGIN = 0.15  # of the extent of the image points, around them
+MOST_BYTES = 3_000_000  # of all photos of a page
+
+
+class Box(NamedTuple):
+    """Part of the normalised image plane."""
+
+    left: float
+    top: float
+    right: float
+    bottom: float
+
+
+PhotoFinder = Callable[[str, Box], Array | None]  # (id of a pair, box) to (h, w, 3) uint8 that fills the box, or None
+Photos = Callable[[Path], PhotoFinder]  # from a folder of scenes
+
+
+def box_of(view: PairView) -> Box:
+    """What the image points of a pair span, and a little more."""
+    low, high = view.points2d.min(0).astype(float), view.points2d.max(0).astype(float)
+    margin = MARGIN * np.maximum(high - low, 1e-6)
+    return Box(*(low - margin).tolist(), *(high + margin).tolist())
+
+
+def jpeg(photo: Array, *, quality: int = 70) -> bytes:
+    """The photo as JPEG."""
+    from PIL import Image
+
+    content = io.BytesIO()
+    Image.fromarray(photo).save(content, format="JPEG", quality=quality)
+    return content.getvalue()
+
+
+def page_photos(runs: Mapping[str, Sequence[PairView]], photo: PhotoFinder | None) -> dict[str, dict[str, object]]:
+    """By pair, {"box", "jpeg"} as the page reads them, the worst pairs first while there is room."""
+    if photo is None:
+        return {}
+    views = sorted((view for views in runs.values() for view in views), key=lambda view: -view.error)
+    found: dict[str, dict[str, object]] = {}
+    left = MOST_BYTES
+    for view in {view.id: view for view in views}.values():
+        box = box_of(view)
+        pixels = photo(view.id, box)
+        if pixels is None:
+            continue
+        content = base64.b64encode(jpeg(pixels)).decode()
+        left -= len(content)
+        if left < 0:
+            break
+        found[view.id] = {"box": list(box), "jpeg": content}
+    return found
