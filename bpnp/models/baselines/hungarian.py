@@ -1,0 +1,61 @@
+"""BPnPNet's features with a hard assignment: the Hungarian algorithm in the place of the transport, at test time."""
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor, nn
+
+from bpnp.geometry import bearings
+from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.models.bpnpnet import BPnPNet
+from bpnp.types import Batch, Pose, Prediction
+
+
+class Hungarian(nn.Module):
+    """min(m, n) one-to-one pairs of least total feature distance, RANSAC on all of them, the weighted PnP layer.
+
+    A variant for evaluation: the assignment has no gradient. All its pairs weigh the same.
+
+    Args:
+        checkpoint: of a BPnPNet, as `bpnp fit` wrote it; null for `net`.
+        net: the network; null for untrained weights with the default settings where there is no checkpoint either.
+        ransac_backend: as in BPnPNet; opencv is the paper's.
+    """
+
+    estimates = ("ransac", "pnp")
+
+    def __init__(
+        self, *, checkpoint: str | None = None, net: BPnPNet | None = None, ransac_backend: Backend = "poselib"
+    ) -> None:
+        super().__init__()
+        if checkpoint is not None and net is not None:
+            raise ValueError("expected `checkpoint` or `net`, got both")
+        self.net = BPnPNet.from_checkpoint(checkpoint) if checkpoint is not None else net or BPnPNet()
+        self.ransac = RansacPnP(
+            backend=ransac_backend,
+            pairs_factor=1.0,
+            threshold=self.net.ransac.threshold,
+            max_iterations=self.net.ransac.max_iterations,
+        )
+
+    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+        with torch.no_grad():
+            assignment = hungarian(self.net.cost(batch), batch)
+        if not poses:
+            return Prediction(assignment)
+        masks = batch.mask2d, batch.mask3d
+        start = Pose(*self.ransac(assignment, batch.points2d, batch.points3d, *masks))
+        rays = bearings(batch.points2d)
+        final = Pose(*self.net.pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
+        return Prediction(assignment, None, {"ransac": start, "pnp": final})
+
+
+def hungarian(cost: Float[Tensor, "b m n"], batch: Batch) -> Float[Tensor, "b m n"]:
+    """The permutation of least cost between the real points, as a joint probability: equal entries of sum one."""
+    assignment = torch.zeros_like(cost)
+    for i, (m, n) in enumerate(zip(batch.count2d.tolist(), batch.count3d.tolist(), strict=True)):
+        real = cost[i][batch.mask2d[i]][:, batch.mask3d[i]].cpu().numpy()
+        rows, columns = (torch.as_tensor(side, device=cost.device) for side in linear_sum_assignment(real))
+        places = batch.mask2d[i].nonzero().squeeze(-1), batch.mask3d[i].nonzero().squeeze(-1)
+        assignment[i, places[0][rows], places[1][columns]] = 1 / min(m, n)
+    return assignment

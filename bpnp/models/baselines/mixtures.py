@@ -1,0 +1,95 @@
+"""Mixtures that stand for the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from bpnp.geometry import angle_between
+
+ROUNDS = 100
+
+
+class RayMixture(NamedTuple):
+    """von Mises-Fisher components on the unit sphere."""
+
+    weights: Float[Tensor, " c"]
+    directions: Float[Tensor, "c 3"]
+    concentrations: Float[Tensor, " c"]
+
+
+class SceneMixture(NamedTuple):
+    """Isotropic Gaussian components."""
+
+    weights: Float[Tensor, " a"]
+    means: Float[Tensor, "a 3"]
+    variances: Float[Tensor, " a"]
+
+
+def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
+    """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF that fits each.
+
+    The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and no more than that of a cluster with
+    a quarter of the angle as its spread, which single points would exceed.
+    """
+    labels = _means(rays, angle, spherical=True)
+    weights, sums = _totals(rays, labels)
+    length = torch.linalg.vector_norm(sums, dim=-1) / weights
+    concentration = length * (3 - length.square()) / (1 - length.square()).clamp_min(1e-12)
+    directions = torch.nn.functional.normalize(sums, dim=-1)
+    return RayMixture(weights / len(rays), directions, concentration.clamp_max((4 / angle) ** 2))
+
+
+def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
+    """DP-means: clusters within `radius` of their mean, and the isotropic Gaussian of each, no narrower than a quarter
+    of the radius."""
+    labels = _means(points, radius, spherical=False)
+    weights, sums = _totals(points, labels)
+    means = sums / weights.unsqueeze(-1)
+    squared = (points - means[labels]).square().sum(-1, keepdim=True)
+    variances = _totals(squared, labels)[1].squeeze(-1) / (3 * weights)
+    return SceneMixture(weights / len(points), means, variances.clamp_min((radius / 4) ** 2))
+
+
+def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
+    """DP-means: Lloyd's rounds, with a new cluster at the farthest point while one is beyond `limit` of every mean.
+
+    The result does not depend on the order of the points.
+    """
+    centres = _centre(points.sum(0, keepdim=True), len(points), spherical)
+    labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for _ in range(ROUNDS):
+        nearest, assigned = _distances(points, centres, spherical).min(-1)
+        far = int(nearest.argmax())
+        if float(nearest[far]) > limit:
+            assigned[far] = len(centres)
+        elif bool((assigned == labels).all()):
+            break
+        labels = assigned.unique(return_inverse=True)[1]
+        weights, sums = _totals(points, labels)
+        centres = _centre(sums, weights.unsqueeze(-1), spherical)
+    return labels
+
+
+def _distances(points: Tensor, centres: Tensor, spherical: bool) -> Tensor:
+    if spherical:
+        return angle_between(points.unsqueeze(1), centres.unsqueeze(0))
+    return torch.cdist(points, centres)
+
+
+def _centre(sums: Tensor, weights: Tensor | int, spherical: bool) -> Tensor:
+    return torch.nn.functional.normalize(sums, dim=-1) if spherical else sums / weights
+
+
+def _totals(values: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Number and sum of the values of each label."""
+    members = torch.nn.functional.one_hot(labels).to(values.dtype)
+    return members.sum(0), members.mT @ values
+
+
+def spread(distances: Float[Tensor, " k"]) -> float:
+    """Root mean square distance; 1 where it is zero."""
+    value = float(distances.square().mean().sqrt())
+    return value if value > 0 and math.isfinite(value) else 1.0
