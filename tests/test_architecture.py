@@ -18,10 +18,12 @@ ROWS = [
     ["bpnp.models"],
     ["bpnp.report"],
     ["bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.api"],
-    ["bpnp.cli", "bpnp.commands", "bpnp.__main__"],
+    ["bpnp.cli", "bpnp.commands", "bpnp.table", "bpnp.__main__"],
 ]
 ROW = {part: i for i, row in enumerate(ROWS) for part in row}
-MAY_IMPORT_LIGHTNING = ("bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.datamodules", "bpnp.cli", "bpnp.commands")
+MAY_IMPORT_LIGHTNING = (
+    "bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.datamodules", "bpnp.cli", "bpnp.commands", "bpnp.table",
+)  # fmt: skip
 ONE_FILE_EACH = ("cv2", "poselib", "pycolmap", "trimesh")
 
 

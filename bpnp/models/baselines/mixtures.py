@@ -9,7 +9,7 @@ from torch import Tensor
 
 from bpnp.geometry import angle_between
 
-ROUNDS = 100
+ROUNDS = 300
 
 
 class RayMixture(NamedTuple):
@@ -54,7 +54,7 @@ def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
 
 
 def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
-    """DP-means: Lloyd's rounds, with a new cluster at the farthest point while one is beyond `limit` of every mean.
+    """DP-means: Lloyd's rounds, and once they settle a new cluster at the farthest point that is beyond `limit` of all.
 
     The result does not depend on the order of the points.
     """
@@ -62,11 +62,11 @@ def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"
     labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
     for _ in range(ROUNDS):
         nearest, assigned = _distances(points, centres, spherical).min(-1)
-        far = int(nearest.argmax())
-        if float(nearest[far]) > limit:
+        if bool((assigned == labels).all()):
+            far = int(nearest.argmax())
+            if float(nearest[far]) <= limit:
+                break
             assigned[far] = len(centres)
-        elif bool((assigned == labels).all()):
-            break
         labels = assigned.unique(return_inverse=True)[1]
         weights, sums = _totals(points, labels)
         centres = _centre(sums, weights.unsqueeze(-1), spherical)
