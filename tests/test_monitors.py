@@ -116,3 +116,20 @@ def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: p
     assert len(list(run.glob("files/media/images/val/pairs_*.png"))) == 2
     assert b"val/true_match_mass" in next(run.glob("*.wandb")).read_bytes()
     assert not (tmp_path / "pictures").exists()
+
+
+def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="needs tensorboard")
+    from lightning.pytorch.loggers import TensorBoardLogger
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    fit(tmp_path, TrainingMonitor(pairs=2, every=2), TensorBoardLogger(tmp_path, name="board"))
+    events = EventAccumulator(str(tmp_path / "board" / "version_0"), size_guidance={"images": 0})
+    events.Reload()
+    assert [event.value for event in events.Scalars("val/true_match_mass")] == pytest.approx([0.25] * 3)
+    assert len(events.Scalars("train/pairs_per_second")) == 3
+    for name in ("val/pair0", "val/pair1"):
+        pictures = events.Images(name)
+        assert len(pictures) == 2
+        assert min(picture.width for picture in pictures) > 300
+    assert not (tmp_path / "pictures").exists()

@@ -4,15 +4,18 @@ import json
 import re
 import shutil
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from report_data import HOSTILE, write_run
+from report_data import HOSTILE, rows, view, write_run
 
-from bpnp.report import Results, write_page
+from bpnp.report import Results, write_page, write_results
+from bpnp.report.sketches import sketches_of, write_sketches
 from bpnp.report.tables import number
+from bpnp.report.views import write_views
 
 pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
 FLAGS = (
@@ -184,6 +187,43 @@ def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., An
     assert page("return document.getElementById('scene').toDataURL()") != before
     press(page, "#pair-close")
     assert not page("return document.getElementById('pair').open")
+
+
+def test_other_pairs_open_as_sketches_and_photos_lie_under_the_points(browser: Any, tmp_path: Path) -> None:
+    """Of a page with three estimates; pixels of the photo's red shine through the canvas."""
+    planted = rows(30, 0, ("ransac", "pnp", "refined"))
+    write_results(tmp_path / "test", planted)
+    names = {row.index: row.id for row in planted}
+    views = [
+        replace(view(i, names[i]), estimates=dict.fromkeys(("ransac", "pnp", "refined"), view(i, "").pose))
+        for i in range(30)
+    ]
+    write_views(tmp_path / "test", [views[3]])
+    write_sketches(tmp_path / "test", sketches_of(views))
+    red = np.broadcast_to(np.array([255, 0, 0], np.uint8), (30, 40, 3))
+    page = write_page([tmp_path], tmp_path / "r.html", photo=lambda id, box: red if id == names[3] else None)
+    browser.get("about:blank")
+    for index, points, lines in ((3, "30 of the image", False), (11, "24 of the image", True)):
+        browser.get(f"{page.as_uri()}#pair={names[index].replace('/', '%2F')}")
+        browser.refresh()
+        assert points in browser.find_element("id", "image-text").text
+        assert browser.find_element("css selector", "#pair-lines [value=assigned3d]").get_property("disabled") == lines
+        assert len(browser.find_elements("css selector", "#pair-numbers tbody tr")) == 3
+        options = [option.text for option in browser.find_elements("css selector", "#pair-estimate option")]
+        assert options == ["true pose", "ransac", "pnp", "refined"]
+        assert "outside" not in browser.find_element("id", "image-text").text
+        reds = (
+            "const c = document.getElementById('image');"
+            "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 0; i < d.length; i += 4) n += d[i] > 200 && d[i + 1] < 60; return n"
+        )
+        assert (browser.execute_script(reds) > 1000) == (index == 3)
+        assert browser.find_element("id", "pair-photo").is_displayed() == (index == 3)
+    assert "all of the 30 pairs" in browser.execute_script("return document.getElementById('pair-kept').textContent")
+    shown = browser.execute_script(
+        "return [...document.querySelectorAll('#quartile-table tbody th')].map((e) => e.textContent)"
+    )
+    assert shown == ["ransac", "pnp", "refined"]
+    assert browser.get_log("browser") == []
 
 
 def test_a_pair_opens_from_the_keyboard_and_from_its_address(browser: Any, page: Callable[..., Any]) -> None:

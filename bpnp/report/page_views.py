@@ -90,7 +90,7 @@ def _points(own: Sketches, rows: Array) -> dict[str, Any]:
     boxes = []
     for name, count in (("points2d", own.count2d[rows]), ("points3d", own.count3d[rows])):
         values = getattr(own, name)[rows]
-        real: Array = np.asarray(np.arange(POINTS) < count[:, None])[..., None]
+        real = np.arange(POINTS)[:, None] < count[:, None, None]
         low = np.where(real, values, np.inf).min(1, keepdims=True)
         size = np.where(real, values, -np.inf).max(1, keepdims=True) - low
         steps = np.round((values - low) / np.where(size > 0, size, 1) * 255)
@@ -102,7 +102,7 @@ def _points(own: Sketches, rows: Array) -> dict[str, Any]:
 
 def _poses(matrices: Array) -> dict[str, dict[str, str]]:
     """Quaternions (x, y, z, w) in steps of 1/32767, all zero without a pose, and translations."""
-    known = np.isfinite(matrices).all((1, 2))
+    known: Array = np.asarray(np.isfinite(matrices).all((1, 2)))
     rotation = np.where(known[:, None, None], matrices[:, :, :3], np.eye(3))
     quaternion = Rotation.from_matrix(rotation).as_quat() if len(rotation) else np.empty((0, 4))
     steps = np.round(quaternion * 32767) * known[:, None]

@@ -71,11 +71,11 @@ function drawChart(picture, readout, chart) {
     shape("path", { class: "frame", d: `M${MARGIN.left},${MARGIN.top}V${bottom}H${width - MARGIN.right}` }),
   );
   for (const line of chart.lines) drawLine(picture, line, x, y);
-  for (const mark of chart.marks ?? []) {
+  for (const [row, mark] of (chart.marks ?? []).entries()) {
     const right = x(mark.x) > middle;
     picture.append(
       shape("line", { class: "mark", x1: x(mark.x), x2: x(mark.x), y1: MARGIN.top, y2: bottom }),
-      shape("text", { class: "mark-text", x: x(mark.x) + (right ? -4 : 4), y: MARGIN.top + 11,
+      shape("text", { class: "mark-text", x: x(mark.x) + (right ? -4 : 4), y: MARGIN.top + 11 + 12 * row,
         "text-anchor": right ? "end" : "start" }, mark.label),
     );
   }

@@ -57,7 +57,8 @@ function drawScene(view, cameras) {
       const [x, y] = place(point);
       pen.fillRect(x - 1.2, y - 1.2, 2.4, 2.4);
     }
-    for (const { corners, colour, name } of shapes) drawCamera(pen, corners.map(place), resolved(colour), name);
+    const taken = [];
+    for (const { corners, colour, name } of shapes) drawCamera(pen, corners.map(place), resolved(colour), name, taken);
   };
   turning.draw();
   const absent = cameras.filter((camera) => !drawn.includes(camera)).map(({ name }) => name);
@@ -66,7 +67,8 @@ function drawScene(view, cameras) {
     absent.length ? `; too far away to show: ${absent.join(", ")}` : "", ". Drag or arrow keys turn, wheel or + and − zoom.");
 }
 
-function drawCamera(pen, [centre, ...corners], colour, name) {
+// taken: the boxes [left, right, y] of the names drawn so far, which this one evades downwards.
+function drawCamera(pen, [centre, ...corners], colour, name, taken) {
   pen.strokeStyle = pen.fillStyle = colour;
   pen.lineWidth = 1.8;
   pen.beginPath();
@@ -81,8 +83,13 @@ function drawCamera(pen, [centre, ...corners], colour, name) {
   const back = centre.map((value, i) => value - corners.reduce((sum, corner) => sum + corner[i], 0) / 4);
   const size = Math.hypot(...back) || 1;
   const half = pen.measureText(name).width / 2;
-  const x = centre[0] + ((12 + half) * back[0]) / size - half;
-  pen.fillText(name, Math.min(Math.max(x, 2), pen.canvas.clientWidth - 2 * half - 2), centre[1] + (14 * back[1]) / size + 4);
+  const wanted = centre[0] + ((12 + half) * back[0]) / size - half;
+  const x = Math.min(Math.max(wanted, 2), pen.canvas.clientWidth - 2 * half - 2);
+  let y = centre[1] + (14 * back[1]) / size + 4;
+  const over = () => taken.find(([left, right, other]) => left < x + 2 * half + 4 && x < right + 4 && Math.abs(other - y) < 13);
+  for (let hit = over(); hit; hit = over()) y = hit[2] + 13;
+  taken.push([x, x + 2 * half, y]);
+  pen.fillText(name, x, y);
 }
 
 function turned([x, y, z]) {
