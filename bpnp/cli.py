@@ -100,6 +100,9 @@ def main(args: Sequence[str] | None = None) -> None:
             raise
         print(f"bpnp: error: {error}", file=sys.stderr)
         raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("bpnp: interrupted", file=sys.stderr)
+        raise SystemExit(130) from None
 
 
 def _lightning(arguments: list[str]) -> None:

@@ -2,7 +2,9 @@
 
 import argparse
 import logging
+import math
 import os
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -89,17 +91,23 @@ def _prepare_parser() -> argparse.ArgumentParser:
     )
     datasets = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     meshes = datasets.add_parser("modelnet40", help="ModelNet40, or any folder or zip of meshes in its layout")
-    meshes.add_argument("--points", type=_positive, default=2048, help="surface samples of a mesh (default: 2048)")
+    meshes.add_argument(
+        "--points", type=partial(_at_least, 4), default=2048, help="surface samples of a mesh (default: 2048)"
+    )
     meshes.add_argument("--normalisation", choices=("unit_sphere", "unit_cube", "none"), default="unit_sphere")
     colmap = datasets.add_parser("megadepth", help="MegaDepth, or any folder of COLMAP models")
-    colmap.add_argument("--min-points", type=_positive, default=4, help="fewest true pairs of an image (default: 4)")
     colmap.add_argument(
-        "--clutter", type=float, default=0.0, help="natural clutter to keep, as a ratio to the true pairs (default: 0)"
+        "--min-points", type=partial(_at_least, 4), default=4, help="fewest true pairs of an image (default: 4)"
+    )
+    colmap.add_argument(
+        "--clutter", type=_ratio, default=0.0, help="natural clutter to keep, as a ratio to the true pairs (default: 0)"
     )
     pickles = datasets.add_parser("preprocessed", help="the pickles that the authors of BPnPNet published")
     pickles.add_argument("--dataset", dest="name", help="where there are several, such as data61_2d3d")
     for command in (meshes, colmap):
-        command.add_argument("--processes", type=_positive, default=os.cpu_count() or 1, help="(default: %(default)s)")
+        command.add_argument(
+            "--processes", type=partial(_at_least, 1), default=os.cpu_count() or 1, help="(default: %(default)s)"
+        )
     for name, command, what in (
         ("modelnet40", meshes, "ModelNet40.zip, its folder, or the folder of ply_data_*.h5"),
         ("megadepth", colmap, "the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin"),
@@ -112,11 +120,20 @@ def _prepare_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _positive(text: str) -> int:
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"expected a number of 1 or more, got {number}")
-    return number
+def _at_least(least: int, text: str) -> int:
+    if not text.isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"expected a whole number of {least} or more, got {text}")
+    return int(text)
+
+
+def _ratio(text: str) -> float:
+    try:
+        ratio = float(text)
+    except ValueError:
+        ratio = math.nan
+    if not 0 <= ratio < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a ratio of 0 or more, 0.5 adds half as many points; got {text}")
+    return ratio
 
 
 def _show(prepared: Prepared) -> None:

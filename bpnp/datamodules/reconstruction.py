@@ -1,6 +1,8 @@
 """From COLMAP models to the 2D and 3D points of every image, as numpy arrays. The only file that imports pycolmap."""
 
 import logging
+import signal
+import threading
 
 # zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
 import zlib  # noqa: F401
@@ -15,6 +17,10 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.colmap_format import CameraRecord, ColmapError, ImageRecord, read_records
+
+if threading.current_thread() is threading.main_thread():
+    # Whoever ends a process wants no stack trace, which pycolmap prints: back to what Python had set.
+    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
 
 CAMERA_MODELS: Mapping[int, tuple[str, int]] = {
     int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))

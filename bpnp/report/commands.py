@@ -75,6 +75,10 @@ def view_command(
     chosen = parser.parse_args(arguments)
     if chosen.output is not None and len(chosen.pairs) > 1:
         raise ValueError(f"expected one pair with --output, got {len(chosen.pairs)}; try without --output")
+    if not chosen.run.exists():
+        raise ValueError(
+            f"expected the folder of a test or the JSON of a solution, got {chosen.run}, which is not there"
+        )
     if chosen.run.is_file() and chosen.pairs:
         raise ValueError(f"expected no pair beside the solution {chosen.run}, got {chosen.pairs[0]!r}")
     photo = None if chosen.photos is None else _finder(chosen.photos, photos)
