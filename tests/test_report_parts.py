@@ -112,7 +112,9 @@ def test_long_curves_are_thinned_without_moving_their_mean(tmp_path: Path) -> No
 
 def test_the_table_has_a_row_per_run_and_estimate(tmp_path: Path) -> None:
     results = write_run(tmp_path / "run", 9, 0)
-    by_path, by_name = table([tmp_path / "run"]), table({"mine": results})
+    by_path, by_name = (
+        table(runs).to_dict("records") for runs in ([tmp_path / "run"], {"mine": results})
+    )  # fmt: skip
     assert [(row["run"], row["estimate"]) for row in by_path] == [("test", "ransac"), ("test", "pnp")]
     errors = [row.rotation_error_deg for row in results.rows if row.estimate == "pnp"]
     assert by_name[1]["rotation_q2_deg"] == by_path[1]["rotation_q2_deg"] == pytest.approx(np.median(errors))

@@ -3,9 +3,12 @@
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 from bpnp.report.results import Results, read_results
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
@@ -24,16 +27,19 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
     return {os.path.relpath(path, shared): path for path in folders}
 
 
-def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> list[dict[str, Any]]:
-    """Aggregates of one or several results for notebooks: a dict per run and estimate, "run", "estimate",
-    "correspondence_loss" and all numbers of `summarise`. `pandas.DataFrame(table([...]))` makes a dataframe of it.
+def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
+    """Aggregates of one or several results for notebooks: a dataframe with a row per run and estimate and the columns
+    "run", "estimate", "correspondence_loss" and all numbers of `summarise`.
 
     runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
     """
+    from pandas import DataFrame
+
     if not isinstance(runs, Mapping):
         runs = {name: read_results(path) for name, path in named_runs(runs).items()}
-    return [
+    rows = [
         {"run": name, "estimate": estimate, "correspondence_loss": results.correspondence_loss, **values}
         for name, results in runs.items()
         for estimate, values in results.estimates.items()
     ]
+    return DataFrame(rows)
