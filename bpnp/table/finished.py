@@ -22,6 +22,7 @@ class Finished:
     def claim(self, identity: dict[str, Any]) -> None:
         """Start or resume. Raises ValueError if the folder holds pairs of another method or of other data."""
         path = self.folder / IDENTITY
+        identity = json.loads(json.dumps(identity, default=str))
         if path.is_file():
             kept = json.loads(path.read_text(encoding="utf-8"))
             differing = sorted(key for key in identity.keys() | kept.keys() if identity.get(key) != kept.get(key))

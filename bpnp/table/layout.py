@@ -57,7 +57,8 @@ def note(paper: Paper | None) -> str:
 
 
 def terminal(lines: Sequence[Line], paper: Paper | None) -> Table:
-    table = Table(title="Pose errors", caption=CAPTION, box=box.SIMPLE_HEAD, padding=0, caption_justify="left")
+    caption = CAPTION if paper is None else f"{CAPTION} paper: {note(paper)}."
+    table = Table(title="Pose errors", caption=caption, box=box.SIMPLE_HEAD, padding=0, caption_justify="left")
     table.add_column("", overflow="fold", min_width=9)
     for header in headers():
         table.add_column(header, justify="right", no_wrap=True)
@@ -65,9 +66,8 @@ def terminal(lines: Sequence[Line], paper: Paper | None) -> Table:
         table.add_row(Text(line.name), *line.cells)
     if paper is not None:
         table.add_section()
-        table.add_row(Text(note(paper), "dim"))
         for name, cells in published_lines(paper):
-            table.add_row(Text(name, "dim"), *(Text(shown, "dim") for shown in cells))
+            table.add_row(Text(f"paper: {name}", "dim"), *(Text(shown, "dim") for shown in cells))
     return table
 
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from jsonargparse import ArgumentParser
 from torch import nn
 
 from bpnp.models import BPnPNet
+from bpnp.table.settings import build
 
 SHORT_NAMES = {
     "softposit": "bpnp.models.baselines.SoftPOSIT",
@@ -19,7 +19,7 @@ SHORT_NAMES = {
     "gopac": "bpnp.models.baselines.GOPAC",
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
-    "search": "bpnp.models.baselines.TrainingFreeSearch",
+    "search": "bpnp.layers.Search",
 }
 
 
@@ -43,18 +43,11 @@ class Method:
         return dict(json.loads(json.dumps(described, default=str)))
 
     def build(self) -> nn.Module:
-        """The solver in evaluation mode. Raises ValueError, naming the method, for settings that it does not have."""
+        """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
         if self.class_path == SHORT_NAMES["bpnpnet"] and self.checkpoint is not None:
             return BPnPNet.from_checkpoint(self.checkpoint)
         given = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
-        parser = ArgumentParser(exit_on_error=False)
-        parser.add_subclass_arguments(nn.Module, "solver")
-        try:
-            chosen = parser.parse_object({"solver": {"class_path": self.class_path, "init_args": given}})
-        except Exception as error:
-            reason = str(error).strip().splitlines()[-1].strip()
-            raise ValueError(f"expected settings of {self.class_path} for {self.label!r}, got {reason}") from error
-        solver: nn.Module = parser.instantiate_classes(chosen).solver
+        solver: nn.Module = build(nn.Module, "solver", {"class_path": self.class_path, "init_args": given})
         if self.time_limit is not None and "time_limit" in vars(solver):
             vars(solver)["time_limit"] = self.time_limit
         return solver.eval()

@@ -9,13 +9,22 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bpnp.geometry import bearings
-from bpnp.models.baselines.boxes import Boxes, join, rotation_uncertainty, split, translation_uncertainty
+from bpnp.models.baselines.boxes import (
+    Boxes,
+    distance_range,
+    join,
+    rotation_uncertainty,
+    split,
+    translation_uncertainty,
+)
 from bpnp.models.baselines.mixture_distance import distance, lower_bound, squared_norm
 from bpnp.models.baselines.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture, spread
 from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair
 from bpnp.models.baselines.starts import weak_perspective_distance
 
 POLISH_STEPS = 50
+DESCENTS = 32  # centres of a round that descend
+DESCENT_STEPS = 30
 
 
 class Aligned(NamedTuple):
@@ -36,15 +45,17 @@ def align_mixtures(
     domain: Boxes,
     *,
     gap: float = 0.1,
+    closest: float = 0.0,
     batch: int = 512,
     max_boxes: int | None = None,
     clock: Clock | None = None,
 ) -> Aligned:
-    """Smallest d(R, c) over a domain (boxes, usually one), to within `gap` of the image mixture's squared norm.
+    """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
+    squared norm.
 
     Best first: the `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the
-    less certain; every better centre is polished by L-BFGS. Ends with the certificate, or with the best pose so far
-    after about `max_boxes` boxes or at the clock's limit.
+    less certain; of every round the best centres descend, and a better pose is polished by L-BFGS. Ends with the
+    certificate, or with the best pose so far after about `max_boxes` boxes or at the clock's limit.
     """
     norm = float(squared_norm(rays))
     pending, bounds = domain, lower_bound(scene, rays, domain)
@@ -60,9 +71,12 @@ def align_mixtures(
         parents = pending.pick(chosen)
         moving = translation_uncertainty(parents, scene.means).amax(-1)
         children = split(parents, rotation_uncertainty(parents) >= moving)
+        _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
+        children = children.pick(farthest.squeeze(-1) >= closest)
         children_bounds = torch.maximum(lower_bound(scene, rays, children), bounds[chosen].min())
         done += len(children_bounds)
-        best, rotation, place = _best_centre(scene, rays, children, best, (rotation, place))
+        allowed = children.pick(children.place.norm(dim=-1) >= closest)
+        best, rotation, place = _best_centre(scene, rays, allowed, best, (rotation, place))
         pending, bounds = join([pending.pick(rest), children]), torch.cat([bounds[rest], children_bounds])
         promising = bounds < best - gap * norm
         # What is left out cannot beat the best by more than the gap.
@@ -75,13 +89,40 @@ def align_mixtures(
 def _best_centre(
     scene: SceneMixture, rays: RayMixture, boxes: Boxes, best: float, pose: tuple[Tensor, Tensor] | None
 ) -> tuple[float, Tensor, Tensor]:
-    """The pose of lowest distance: the one given, or the best of the boxes' centres, polished."""
-    rotations = boxes.rotation
-    values = distance(scene, rays, rotations, boxes.place)
+    """The pose of lowest distance: the one given, or one that descends from the best of the boxes' centres.
+
+    The few best centres descend together, also where they are worse than the pose: a local optimum hides between them.
+    The lowest of their ends, if it beats the pose, is polished.
+    """
+    if len(boxes.turn) == 0 and pose is not None:
+        return best, *pose
+    values = distance(scene, rays, boxes.rotation, boxes.place)
+    chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
+    rotations, places = descend(scene, rays, chosen.rotation, chosen.place)
+    values = distance(scene, rays, rotations, places)
     i = int(values.argmin())
     if pose is not None and float(values[i]) >= best:
         return best, *pose
-    return polish(scene, rays, rotations[i], boxes.place[i])
+    return polish(scene, rays, rotations[i], places[i])
+
+
+def descend(
+    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "b 3 3"], place: Float[Tensor, "b 3"]
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """Adam's steps from several poses, each for itself, from a tenth of a radian down to a thousandth."""
+    reach = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    step = torch.zeros(len(place), 6, dtype=place.dtype, device=place.device, requires_grad=True)
+    optimiser = torch.optim.Adam([step], lr=0.1)
+    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.01 ** (1 / DESCENT_STEPS))
+    with torch.enable_grad():
+        for _ in range(DESCENT_STEPS):
+            optimiser.zero_grad()
+            turned = roma.rotvec_to_rotmat(step[:, :3]) @ rotation
+            distance(scene, rays, turned, place + reach * step[:, 3:]).sum().backward()
+            optimiser.step()
+            schedule.step()
+    found = step.detach()
+    return roma.rotvec_to_rotmat(found[:, :3]) @ rotation, place + reach * found[:, 3:]
 
 
 def polish(
@@ -129,6 +170,8 @@ class GOSMA(PairSolver):
         spread2d: reach of an image cluster, in root mean square angles of the rays to their mean.
         spread3d: reach of a scene cluster, in root mean square distances of the points to their mean.
         domain: half side of the cube of camera centres, in weak-perspective distances.
+        closest: least distance of the camera centre from the scene's, in weak-perspective distances; 0 for cameras
+            among the points.
         gap: share of the image mixture's squared norm by which the answer may miss the optimum.
         batch: boxes split together.
         max_boxes: most boxes; null for as many as the time allows.
@@ -143,6 +186,7 @@ class GOSMA(PairSolver):
         spread2d: float = 0.8,
         spread3d: float = 0.8,
         domain: float = 1.5,
+        closest: float = 0.5,
         gap: float = 0.1,
         batch: int = 512,
         max_boxes: int | None = None,
@@ -153,7 +197,7 @@ class GOSMA(PairSolver):
             if not value > 0:
                 raise ValueError(f"expected `{name}` > 0, got {value}")
         self.spread2d, self.spread3d, self.domain = spread2d, spread3d, domain
-        self.gap, self.batch, self.max_boxes = gap, batch, max_boxes
+        self.closest, self.gap, self.batch, self.max_boxes = closest, gap, batch, max_boxes
 
     def solve(self, pair: SinglePair, clock: Clock) -> Found:
         rays, centre = bearings(pair.points2d), pair.points3d.mean(0)
@@ -161,12 +205,13 @@ class GOSMA(PairSolver):
         angle = spread(torch.acos((rays @ mean_ray).clamp(-1, 1)))
         radius = spread((pair.points3d - centre).norm(dim=-1))
         points = (pair.points3d - centre) / radius
-        half = self.domain * weak_perspective_distance(pair.points2d, points)
+        distance_away = weak_perspective_distance(pair.points2d, points)
         aligned = align_mixtures(
             scene_mixture(points, self.spread3d),
             ray_mixture(rays, self.spread2d * angle),
-            whole_domain(points, half),
+            whole_domain(points, self.domain * distance_away),
             gap=self.gap,
+            closest=self.closest * distance_away,
             batch=self.batch,
             max_boxes=self.max_boxes,
             clock=clock,

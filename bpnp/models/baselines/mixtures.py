@@ -32,25 +32,25 @@ def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
     """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF that fits each.
 
     The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and no more than that of a cluster with
-    a quarter of the angle as its spread, which single points would exceed.
+    a tenth of the angle as its spread, which single points would exceed.
     """
     labels = _means(rays, angle, spherical=True)
     weights, sums = _totals(rays, labels)
     length = torch.linalg.vector_norm(sums, dim=-1) / weights
     concentration = length * (3 - length.square()) / (1 - length.square()).clamp_min(1e-12)
     directions = torch.nn.functional.normalize(sums, dim=-1)
-    return RayMixture(weights / len(rays), directions, concentration.clamp_max((4 / angle) ** 2))
+    return RayMixture(weights / len(rays), directions, concentration.clamp_max((10 / angle) ** 2))
 
 
 def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
-    """DP-means: clusters within `radius` of their mean, and the isotropic Gaussian of each, no narrower than a quarter
+    """DP-means: clusters within `radius` of their mean, and the isotropic Gaussian of each, no narrower than a tenth
     of the radius."""
     labels = _means(points, radius, spherical=False)
     weights, sums = _totals(points, labels)
     means = sums / weights.unsqueeze(-1)
     squared = (points - means[labels]).square().sum(-1, keepdim=True)
     variances = _totals(squared, labels)[1].squeeze(-1) / (3 * weights)
-    return SceneMixture(weights / len(points), means, variances.clamp_min((radius / 4) ** 2))
+    return SceneMixture(weights / len(points), means, variances.clamp_min((radius / 10) ** 2))
 
 
 def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
