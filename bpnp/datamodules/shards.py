@@ -5,11 +5,13 @@ import hashlib
 import multiprocessing
 import os
 import shutil
+import signal
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -87,6 +89,8 @@ def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int,
             return paths
         context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
         context.set_forkserver_preload([work.__module__])
+        with _interrupts_ignored():
+            forkserver.ensure_running()
         with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
             futures: list[Future[None]] = [pool.submit(work, jobs[i], paths[i]) for i in missing]
             try:
@@ -101,6 +105,19 @@ def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int,
             finally:
                 pool.shutdown(cancel_futures=True)
     return paths
+
+
+@contextmanager
+def _interrupts_ignored() -> Iterator[None]:
+    """Processes started meanwhile ignore Ctrl-C, which the terminal sends to all: this one hears it and ends them."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, previous)
 
 
 def _end_with_parent() -> None:
