@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from multiprocessing import forkserver
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -89,11 +88,10 @@ def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int,
             return paths
         context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
         context.set_forkserver_preload([work.__module__])
-        with _interrupts_ignored():
-            forkserver.ensure_running()
         with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
-            futures: list[Future[None]] = [pool.submit(work, jobs[i], paths[i]) for i in missing]
             try:
+                with _interrupts_later():
+                    futures: list[Future[None]] = [pool.submit(work, jobs[i], paths[i]) for i in missing]
                 for future in as_completed(futures):
                     future.result()
                     progress.advance(task)
@@ -108,16 +106,14 @@ def make_parts(folder: Path, jobs: Sequence[Any], work: Work, *, processes: int,
 
 
 @contextmanager
-def _interrupts_ignored() -> Iterator[None]:
-    """Processes started meanwhile ignore Ctrl-C, which the terminal sends to all: this one hears it and ends them."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+def _interrupts_later() -> Iterator[None]:
+    """Ctrl-C, which the terminal sends to all processes, reaches this one afterwards, and those started meanwhile
+    never: this one ends them."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, previous)
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _end_with_parent() -> None:
