@@ -5,8 +5,9 @@ import json
 from pathlib import Path
 
 import pytest
-from small_data import write_mesh_tree
+import torch
 
+from bpnp import BPnPNet
 from bpnp.cli import main
 from bpnp.report import read_results
 from bpnp.report.results import PairRow
@@ -15,6 +16,7 @@ from bpnp.table.layout import Line, as_latex, as_markdown
 from bpnp.table.methods import parse_methods
 from bpnp.table.pairs import TestPairs, read_data
 from bpnp.table.published import PUBLISHED
+from bpnp.task import BlindPnPTask
 
 RECIPE = """
 data:
@@ -155,14 +157,12 @@ def test_rows_survive_the_disk_with_their_infinities(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
-    meshes = write_mesh_tree(tmp_path / "meshes", train=3)
-    data = ["--data=bpnp.datamodules.MeshDataModule", "--data.num_points=12", "--data.pool_size=64",
-            f"--data.root={meshes}", f"--data.cache_dir={tmp_path}", "--data.train_pairs=4", "--data.val_fraction=0.3",
-            "--data.batch_size=2"]  # fmt: skip
-    net = ["--model.solver=bpnp.models.BPnPNet", "--model.solver.channels=16", "--model.solver.blocks=1"]
-    main(["fit", *data, *net, "--trainer.max_epochs=1", f"--trainer.default_root_dir={tmp_path}/run"])
+    task = BlindPnPTask(BPnPNet(channels=16, blocks=1))
+    content: dict[str, object] = {"state_dict": task.state_dict()}
+    task.on_save_checkpoint(content)
+    weights = tmp_path / "last.ckpt"
+    torch.save(content, weights)
     (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
-    weights = f"{tmp_path}/run/checkpoints/last.ckpt"
     main(["table", f"--data={tmp_path}/data.yaml", "--methods", f"Lc=bpnpnet@{weights}", f"hungarian@{weights}",
           "--limit=2", f"--output={tmp_path}/out", "--paper=none"])  # fmt: skip
     rows = [row["method"] for row in csv.DictReader((tmp_path / "out" / "table.csv").open())]
