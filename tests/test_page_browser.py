@@ -214,7 +214,8 @@ def test_other_pairs_open_as_sketches_and_photos_lie_under_the_points(browser: A
         assert "outside" not in browser.find_element("id", "image-text").text
         reds = (
             "const c = document.getElementById('image');"
-            "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; for (let i = 0; i < d.length; i += 4) n += d[i] > 200 && d[i + 1] < 60; return n"
+            "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
+            "for (let i = 0; i < d.length; i += 4) n += d[i] > 200 && d[i + 1] < 60; return n"
         )
         assert (browser.execute_script(reds) > 1000) == (index == 3)
         assert browser.find_element("id", "pair-photo").is_displayed() == (index == 3)
