@@ -87,8 +87,7 @@ class _EntropicPlan(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         plan, mu = ctx.saved_tensors
         a, b = solve_multipliers(plan, gradient)
-        projected = plan * (gradient - a.unsqueeze(-1) - b.unsqueeze(-2))
-        grad_cost = projected / -mu
+        grad_cost = (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan).div_(-mu)
         grad_mu = None
         if ctx.needs_input_grad[2]:
             grad_mu = torch.special.xlogy(grad_cost, plan).sum().reshape(mu.shape)

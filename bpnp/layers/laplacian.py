@@ -4,18 +4,64 @@
 leaves S b = y - P^T (x / P1) with S = diag(P^T 1) - P^T diag(1 / P1) P, the Laplacian of a graph between columns.
 """
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.layers.pacing import unfinished, waits
+from bpnp.layers.pacing import steps, unfinished, waits
 
-CG_ITERATIONS = 30
-CG_TOLERANCE = {torch.float32: 1e-6, torch.float64: 1e-13}
+CG_ITERATIONS = 150
+CG_ITERATIONS_ON_GPU = 30
+CG_TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}
 CG_TOLERANCE_PROMOTED = 1e-8  # in float64 for float32 data
-NEWTON_TOLERANCE = 1e-2
-SHARP = 16.0  # cols / degree beyond which float32 loses the gradient's sixth digit
+SHARP = 16.0  # mass per sum of the degrees, beyond which float32 loses the gradient's fifth digit
 RIDGE = 1e-13
+LOST = 100.0  # a degree of so many units of rounding has no digits as a difference
+
+
+@dataclass(frozen=True)
+class Plan:
+    """P = diag(alpha) K diag(beta), in products with vectors only; without scalings P = K."""
+
+    kernel: Float[Tensor, "b m n"]
+    alpha: Float[Tensor, "b m"] | None = None
+    beta: Float[Tensor, "b n"] | None = None
+
+    def times(self, b: Float[Tensor, "b n"]) -> Float[Tensor, "b m"]:
+        product = times(self.kernel, b if self.beta is None else self.beta * b)
+        return product if self.alpha is None else self.alpha * product
+
+    def transpose_times(self, a: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
+        product = transpose_times(self.kernel, a if self.alpha is None else self.alpha * a)
+        return product if self.beta is None else self.beta * product
+
+    def degree(self, rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b n"]:
+        """Diagonal of S.
+
+        As cols - sum P^2 / rows it would be noise when P is nearly a permutation: P is formed then for the sum of
+        positive terms.
+        """
+        weight = divide(torch.ones_like(rows), rows)
+        shared = transpose_times(self.kernel.square(), weight if self.alpha is None else self.alpha**2 * weight)
+        shared = shared if self.beta is None else self.beta**2 * shared
+        degree = cols - shared
+        weak = (degree < LOST * torch.finfo(cols.dtype).eps * cols).any(-1)
+        if unfinished(weak):
+            plan = self.formed()
+            exact = (plan * (1 - plan * weight.unsqueeze(-1))).sum(-2)
+            degree = torch.where(weak.unsqueeze(-1), exact, degree)
+        # A column whose links are below rounding still has an equation, which zero would hide.
+        return torch.maximum(degree, torch.finfo(cols.dtype).eps * cols)
+
+    def formed(self) -> Float[Tensor, "b m n"]:
+        scaled = self.kernel if self.alpha is None else self.kernel * self.alpha.unsqueeze(-1)
+        return scaled if self.beta is None else scaled * self.beta.unsqueeze(-2)
+
+    def samples(self, some: Tensor) -> "Plan":
+        kept = [None if x is None else x[some] for x in (self.alpha, self.beta)]
+        return Plan(self.kernel[some], *kept)
 
 
 def solve_multipliers(
@@ -46,76 +92,87 @@ def _solve(
     """(a, b) in the precision of the plan, and whether that precision is enough."""
     weighted = plan * gradient
     rows, cols = plan.sum(-1), plan.sum(-2)
-    row_mean = _divide(weighted.sum(-1), rows)
-    rhs = weighted.sum(-2) - _transpose_times(plan, row_mean)
-    degree = _degree(plan, rows, cols)
-    b, solved = _conjugate_gradients(plan, rows, cols, degree, rhs, tolerance)
+    row_mean = divide(weighted.sum(-1), rows)
+    rhs = weighted.sum(-2) - transpose_times(plan, row_mean)
+    del weighted
+    system = Plan(plan)
+    degree = system.degree(rows, cols)
+    b, mean, solved = _conjugate_gradients(system, rows, cols, degree, rhs, tolerance)
     if plan.dtype == torch.float64 and not waits(plan.device) and not bool(solved.all()):
-        b = _factorise_rest(plan, rows, cols, rhs, b, solved)
-    trusted = solved & (_divide(cols, degree).amax(-1) <= SHARP)
-    return row_mean - _divide(_times(plan, b), rows), b, trusted
+        b, mean = _factorise_rest(system, rows, cols, rhs, b, mean, solved)
+    return row_mean - mean, b, solved & (cols.sum(-1) <= SHARP * degree.sum(-1))
 
 
 def newton_direction(
-    plan: Float[Tensor, "b m n"], row_marginal: Float[Tensor, "b m"], col_marginal: Float[Tensor, "b n"]
-) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]]:
-    """Change (x, y) of the log scalings after which diag(e^x) P diag(e^y) has the marginals, to first order."""
-    rows, cols = plan.sum(-1), plan.sum(-2)
-    row_error = _divide(row_marginal - rows, rows)
-    rhs = col_marginal - cols - _transpose_times(plan, row_error)
-    y, solved = _conjugate_gradients(plan, rows, cols, _degree(plan, rows, cols), rhs, NEWTON_TOLERANCE)
-    if not waits(plan.device) and not bool(solved.all()):
-        y = _factorise_rest(plan, rows, cols, rhs, y, solved)
-    return row_error - _divide(_times(plan, y), rows), y
+    plan: Plan,
+    rows: Float[Tensor, "b m"],
+    row_marginal: Float[Tensor, "b m"],
+    col_marginal: Float[Tensor, "b n"],
+    tolerance: Float[Tensor, " b"],
+) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
+    """Change (x, y) of the log scalings after which diag(e^x) P diag(e^y) has the marginals, to first order.
 
-
-def _degree(plan: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, "b n"]:
-    """Diagonal of S as a sum of positive terms: cols - sum P^2 / rows would be noise when P is nearly a permutation."""
-    degree = (plan * (1 - _divide(plan, rows.unsqueeze(-1)))).sum(-2)
-    # A column whose links are below rounding still has an equation, which zero would hide.
-    return torch.maximum(degree, torch.finfo(plan.dtype).eps * cols)
+    rows: P 1; the columns have their sums already. tolerance: relative to the error of the rows, for each sample.
+    Where conjugate gradients stall, float64 factorises; the last value tells which samples float32 has no step for.
+    """
+    row_error = divide(row_marginal - rows, rows)
+    rhs = -plan.transpose_times(row_error)
+    degree = plan.degree(rows, col_marginal)
+    y, mean, solved = _conjugate_gradients(plan, rows, col_marginal, degree, rhs, tolerance)
+    if waits(rows.device):
+        return row_error - mean, y, torch.ones_like(solved)
+    if rows.dtype == torch.float64 and not bool(solved.all()):
+        y, mean = _factorise_rest(plan, rows, col_marginal, rhs, y, mean, solved)
+        solved = torch.ones_like(solved)
+    return row_error - mean, y, solved
 
 
 def _conjugate_gradients(
-    plan: Tensor, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: float
-) -> tuple[Float[Tensor, "b n"], Bool[Tensor, " b"]]:
-    """Preconditioned by the diagonal of S; each sample stops by itself, at a residual measured per unit of mass.
+    plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: float | Tensor
+) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
+    """b and P b / rows, preconditioned by the diagonal of S; each sample stops by itself.
 
-    In the preconditioner's own measure columns with weak links would outweigh all others.
+    The residual is measured per unit of mass: in the preconditioner's own measure columns with weak links would
+    outweigh all others.
     """
-    inverse, unit = _divide(torch.ones_like(cols), degree), _divide(torch.ones_like(cols), cols)
-    x = torch.zeros_like(rhs)
+    inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
+    x, mean = torch.zeros_like(rhs), torch.zeros_like(rows)
     r = rhs
     p = z = inverse * r
-    rz = (r * z).sum(-1)
-    target = (unit * r * r).sum(-1) * tolerance**2
+    rz = torch.linalg.vecdot(r, z)
+    target = torch.linalg.vecdot(unit * r, r) * tolerance**2
     active = rz > 0
     solved = ~active
-    for _ in range(CG_ITERATIONS):
+    for _ in range(steps(CG_ITERATIONS, rhs.device, CG_ITERATIONS_ON_GPU)):
         if not unfinished(active):
             break
-        sp = cols * p - _transpose_times(plan, _divide(_times(plan, p), rows))
-        curvature = (p * sp).sum(-1)
+        mean_p = per_row * plan.times(p)
+        sp = torch.addcmul(-plan.transpose_times(mean_p), cols, p)
+        curvature = torch.linalg.vecdot(p, sp)
+        positive = curvature > 0
         # A sample that has converged exactly has 0/0 here one step later: it must stop by itself.
-        alpha = torch.where(active & (curvature > 0), rz / curvature, 0).unsqueeze(-1)
-        x = x + alpha * p
-        r = r - alpha * sp
-        solved = solved | (active & ((unit * r * r).sum(-1) <= target))
+        alpha = torch.where(active & positive, rz / curvature, 0).unsqueeze(-1)
+        x = torch.addcmul(x, alpha, p)
+        mean = torch.addcmul(mean, alpha, mean_p)
+        r = torch.addcmul(r, alpha, sp, value=-1)
+        solved = solved | (active & (torch.linalg.vecdot(unit * r, r) <= target))
+        active = active & positive & ~solved
         z = inverse * r
-        rz_new = (r * z).sum(-1)
-        beta = torch.where(active & (rz > 0), rz_new / rz, 0).unsqueeze(-1)
-        p = torch.where(active.unsqueeze(-1), z + beta * p, p)
-        rz = torch.where(active, rz_new, rz)
-        active = active & ~solved & (curvature > 0)
-    return _centre(x, cols), solved
+        rz_new = torch.linalg.vecdot(r, z)
+        p = torch.addcmul(z, divide(rz_new, rz).unsqueeze(-1), p)
+        rz = rz_new
+    shift = _mean(x, cols)
+    return torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0), solved
 
 
 def _factorise_rest(
-    plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor, b: Tensor, solved: Bool[Tensor, " b"]
-) -> Float[Tensor, "b n"]:
+    plan: Plan, rows: Tensor, cols: Tensor, rhs: Tensor, b: Tensor, mean: Tensor, solved: Bool[Tensor, " b"]
+) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"]]:
     hard = (~solved).nonzero().squeeze(-1)
-    exact = _factorised(*(x[hard].double() for x in (plan, rows, cols, rhs)))
-    return b.index_copy(0, hard, exact.to(b.dtype))
+    kept = plan.samples(hard)
+    exact = _factorised(kept.formed().double(), *(x[hard].double() for x in (rows, cols, rhs))).to(b.dtype)
+    exact_mean = divide(kept.times(exact), rows[hard])
+    return b.index_copy(0, hard, exact), mean.index_copy(0, hard, exact_mean)
 
 
 def _factorised(plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor) -> Tensor:
@@ -124,29 +181,31 @@ def _factorised(plan: Tensor, rows: Tensor, cols: Tensor, rhs: Tensor) -> Tensor
     The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
     almost a permutation.
     """
-    laplacian = plan.mT @ (plan * _divide(-torch.ones_like(rows), rows).unsqueeze(-1))
+    laplacian = plan.mT @ (plan * divide(-torch.ones_like(rows), rows).unsqueeze(-1))
     diagonal = laplacian.diagonal(dim1=-2, dim2=-1)
     diagonal.zero_()
     # Between groups of columns that hardly share a row, the right-hand side is rounding and S nearly singular. The
     # ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
     diagonal.copy_(torch.where(cols > 0, RIDGE * cols - laplacian.sum(-1), 1))
     factor, _ = torch.linalg.cholesky_ex(laplacian)
-    return _centre(torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1), cols)
+    b = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
+    return torch.where(cols > 0, b - _mean(b, cols), 0)
 
 
-def _centre(b: Tensor, cols: Tensor) -> Tensor:
-    """Remove the component along the null vector; padded columns stay zero."""
-    return torch.where(cols > 0, b - (cols * b).sum(-1, keepdim=True) / cols.sum(-1, keepdim=True), 0)
+def _mean(b: Tensor, cols: Tensor) -> Tensor:
+    """Component along the null vector (b, 1)."""
+    return (cols * b).sum(-1, keepdim=True) / cols.sum(-1, keepdim=True)
 
 
-def _times(plan: Tensor, b: Tensor) -> Tensor:
-    return (plan @ b.unsqueeze(-1)).squeeze(-1)
+def times(matrix: Float[Tensor, "b m n"], b: Float[Tensor, "b n"]) -> Float[Tensor, "b m"]:
+    """Product from a row vector: in torch 2.13 on the CPU a batched one with a column takes eight times as long."""
+    return (b.unsqueeze(-2) @ matrix.mT).squeeze(-2)
 
 
-def _transpose_times(plan: Tensor, a: Tensor) -> Tensor:
-    return (a.unsqueeze(-2) @ plan).squeeze(-2)
+def transpose_times(matrix: Float[Tensor, "b m n"], a: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
+    return (a.unsqueeze(-2) @ matrix).squeeze(-2)
 
 
-def _divide(numerator: Tensor, denominator: Tensor) -> Tensor:
+def divide(numerator: Tensor, denominator: Tensor) -> Tensor:
     """Quotient, zero at padded rows and columns, whose sum is zero."""
     return torch.where(denominator > 0, numerator / denominator, 0)
