@@ -1,7 +1,7 @@
 """Forward solver of the entropic transport problem: scalings, Newton steps, and annealing for small mu.
 
-The plan is P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu) from potentials near the optimum. K is made once, and
-again only if the scalings grow so far that entries which underflowed might matter; in between all work is products
+The plan is P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu) from potentials near the optimum. K is made once,
+and again only if the scalings grow so far that entries which underflowed might matter; in between all work is products
 of K with vectors. Rescaling rows and columns in turn converges linearly, and slowly once points share their probability
 with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of `bpnp.layers.laplacian`,
 by conjugate gradients to no more digits than the step has) is quadratic there.

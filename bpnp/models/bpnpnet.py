@@ -6,6 +6,7 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import Method, WeightedPnP
@@ -128,6 +129,23 @@ def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> F
 
     The gradient at distance zero is taken as zero.
     """
-    squared = 2 - 2 * (a @ b.mT)
-    positive = squared > SQUARED_FLOOR
-    return torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)
+    return _PairwiseDistance.apply(a, b)
+
+
+class _PairwiseDistance(torch.autograd.Function):
+    """One matrix is kept for the gradient, the distances: dL/da = -(G / D) b."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
+        squared = torch.baddbmm(a.new_full((1, 1, 1), 2.0), a, b.mT, alpha=-2)
+        near = squared <= SQUARED_FLOOR
+        distance = squared.sqrt_().masked_fill_(near, 0)
+        ctx.save_for_backward(a, b, distance)
+        return distance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
+        a, b, distance = ctx.saved_tensors
+        weight = (gradient / distance).masked_fill_(distance == 0, 0).neg_()
+        return weight @ b, weight.mT @ a

@@ -10,7 +10,10 @@ from bpnp.models.normalisation import MaskedBatchNorm, context_norm
 
 
 class ResidualBlock(nn.Module):
-    """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm, optionally followed by a batch norm."""
+    """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm, optionally followed by a batch norm.
+
+    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product.
+    """
 
     def __init__(self, channels: int, *, batch_norm: bool) -> None:
         super().__init__()
@@ -21,11 +24,17 @@ class ResidualBlock(nn.Module):
         self.norm_c = MaskedBatchNorm(channels) if batch_norm else None
 
     def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        z = context_norm(self.linear_b(self.linear_a(x)), mask)
+        z = context_norm(nn.functional.linear(x, *self._first_map()), mask)
         z = z if self.norm_b is None else self.norm_b(z, mask)
         z = context_norm(self.linear_c(z), mask)
         z = z if self.norm_c is None else self.norm_c(z, mask)
         return x + torch.relu(z)
+
+    def _first_map(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias; under autocast, their product keeps its digits."""
+        a, b = self.linear_a, self.linear_b
+        with torch.autocast(a.weight.device.type, enabled=False):
+            return b.weight @ a.weight, torch.addmv(b.bias, b.weight, a.bias)
 
 
 class PointFeatures(nn.Module):

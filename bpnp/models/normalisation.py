@@ -1,10 +1,13 @@
 """Normalisation over sets of different sizes, padded: no statistic sees a padded point."""
 
+from typing import Any
+
 import torch
 import torch.distributed as dist
 import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 CONTEXT_EPS = 1e-3  # as in the released code
 
@@ -12,14 +15,38 @@ CONTEXT_EPS = 1e-3  # as in the released code
 def context_norm(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
     """(x - mean) / sqrt(var + 1e-3) over the points of each set, per channel, with the unbiased variance.
 
-    The only exchange between points of a set. A set of one point has variance zero.
+    The only exchange between points of a set. A set of one point has variance zero. The statistics of half-precision
+    values are made in float32.
     """
-    weight = mask.unsqueeze(-1).to(x.dtype)
-    count = weight.sum(1, keepdim=True)
-    mean = (x * weight).sum(1, keepdim=True) / count
-    centred = (x - mean) * weight
-    variance = (centred * centred).sum(1, keepdim=True) / (count - 1).clamp_min(1)
-    return centred * torch.rsqrt(variance + CONTEXT_EPS)
+    with torch.autocast(x.device.type, enabled=False):
+        return _ContextNorm.apply(x, mask)
+
+
+class _ContextNorm(torch.autograd.Function):
+    """Its gradient in closed form, dx = (g - mean(g) - y sum(g y) / (count - 1)) / std: half the passes of autograd."""
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, mask: Tensor) -> Tensor:
+        wide = x if x.dtype == torch.float64 else x.float()
+        weight = mask.unsqueeze(-1).to(wide.dtype)
+        count = weight.sum(1, keepdim=True)
+        mean = (wide * weight).sum(1, keepdim=True) / count
+        y = (wide - mean).mul_(weight)
+        variance = y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        scale = torch.rsqrt(variance + CONTEXT_EPS)
+        y.mul_(scale)
+        ctx.save_for_backward(y.to(x.dtype), weight, count, scale)
+        return y.to(x.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
+        y, weight, count, scale = ctx.saved_tensors
+        g = gradient.to(weight.dtype) * weight
+        mean = g.sum(1, keepdim=True) / count
+        along = (g * y).sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        dx = torch.addcmul(g, y.to(g.dtype), along, value=-1).sub_(mean).mul_(scale).mul_(weight)
+        return dx.to(gradient.dtype), None
 
 
 class MaskedBatchNorm(nn.BatchNorm1d):
@@ -30,9 +57,24 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     """
 
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
+        if not self.training or (x.device.type == "cpu" and not dist.is_initialized()):
+            return self._of_real_points(x, mask)
         weight = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
-        mean, variance = self._statistics(x, weight) if self.training else self._running()
-        return (x - mean) * torch.rsqrt(variance + self.eps) * self.weight + self.bias
+        mean, variance = self._statistics(x, weight)
+        scale = torch.rsqrt(variance + self.eps) * self.weight
+        return torch.addcmul(self.bias - mean * scale, x, scale)
+
+    def _of_real_points(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> Tensor:
+        """torch's own batch norm, several times quicker; in training it sees the real points only."""
+        real = None if mask is None or not self.training or bool(mask.all()) else mask
+        points = x.flatten(0, -2) if real is None else x[real]
+        enough = self.training and len(points) > 1
+        if enough and self.num_batches_tracked is not None:
+            self.num_batches_tracked += 1
+        out = nn.functional.batch_norm(
+            points, self.running_mean, self.running_var, self.weight, self.bias, enough, self.momentum or 0.0, self.eps
+        )
+        return out.view_as(x) if real is None else torch.zeros_like(x).masked_scatter(real.unsqueeze(-1), out)
 
     def _running(self) -> tuple[Tensor, Tensor]:
         assert self.running_mean is not None
