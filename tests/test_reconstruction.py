@@ -6,10 +6,12 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 from planted_model import HEIGHT, OPENCV, WIDTH, plant_model
 
-from bpnp.datamodules.reconstruction import CAMERA_MODELS, pycolmap, read_reconstruction
+from bpnp.cameras import camera_models
+from bpnp.datamodules.reconstruction import read_reconstruction
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 SIMPLE_RADIAL = ("SIMPLE_RADIAL", [700.0, 400.0, 300.0, -0.35])
@@ -28,7 +30,7 @@ def equal(a, b) -> bool:
     )
 
 
-@pytest.mark.parametrize("model", [name for name, _ in CAMERA_MODELS.values()])
+@pytest.mark.parametrize("model", [name for name, _ in camera_models().values()])
 def test_planted_points_come_back_through_every_camera_model(model: str, tmp_path: Path) -> None:
     """Keypoints are projections of known points, so undistorting them has to give x/z, y/z back."""
     info = pycolmap.Camera.create_from_model_name(1, model, 1.0, WIDTH, HEIGHT).params_info
@@ -153,7 +155,8 @@ def test_poses_of_a_rig_are_those_of_the_images(tmp_path: Path) -> None:
 def test_zlib_works_after_the_reading(tmp_path: Path) -> None:
     """pycolmap before zlib makes both calls abort the process."""
     code = (
-        "import bpnp.datamodules.reconstruction, io, zlib, numpy\n"
+        "import bpnp.cameras, io, zlib, numpy\n"
+        "bpnp.cameras.camera_models()\n"
         "zlib.compress(bytes(100_000)); numpy.savez_compressed(io.BytesIO(), a=numpy.arange(10_000))"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[1])

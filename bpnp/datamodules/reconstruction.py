@@ -1,33 +1,18 @@
-"""From COLMAP models to the 2D and 3D points of every image, as numpy arrays. The only file that imports pycolmap."""
+"""From COLMAP models to the 2D and 3D points of every image, as numpy arrays."""
 
 import logging
-import signal
-import threading
-
-# zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
-import zlib  # noqa: F401
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.cameras import Camera, camera_models, colmap_camera
 from bpnp.datamodules.colmap_format import CameraRecord, ColmapError, ImageRecord, read_records
 
-if threading.current_thread() is threading.main_thread():
-    # Whoever ends a process wants no stack trace, which pycolmap prints: back to what Python had set.
-    signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGTERM))
-
-CAMERA_MODELS: Mapping[int, tuple[str, int]] = {
-    int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
-    for name, model in pycolmap.CameraModelId.__members__.items()
-    if model != pycolmap.CameraModelId.INVALID
-}
-ROUND_TRIP = 0.01  # pixels
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
 logger = logging.getLogger(__name__)
 
@@ -76,7 +61,7 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
     Raises ColmapError if a file cannot be read, no image is left, or a camera is missing or broken.
     """
     path = Path(folder)
-    records = read_records(path, camera_models=CAMERA_MODELS)
+    records = read_records(path, camera_models=camera_models())
     order = np.argsort(records.point_ids)
     ids, points3d = records.point_ids[order], records.points3d[order]
     finite = np.isfinite(points3d).all(-1)
@@ -84,7 +69,7 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
     if not len(ids):
         raise ColmapError(f"expected 3D points in {path}, got none that is finite; try another model")
     lost = Counter({"points that are not finite": int((~finite).sum())})
-    cameras: dict[int, pycolmap.Camera] = {}
+    cameras: dict[int, Camera] = {}
     images = []
     for record in sorted(records.images, key=lambda image: image.name):
         pose = np.concatenate([record.quaternion, record.translation])
@@ -108,56 +93,31 @@ def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], 
 
     Raises ColmapError as `read_reconstruction`.
     """
-    records = read_records(folder, camera_models=CAMERA_MODELS)
+    records = read_records(folder, camera_models=camera_models())
     cameras = {image.camera_id: image for image in records.images}
     lenses = {key: _camera(folder, image, records.cameras.get(key)) for key, image in cameras.items()}
-    return {image.name: lenses[image.camera_id].img_from_cam for image in records.images}
+    return {image.name: lenses[image.camera_id].project for image in records.images}
 
 
-def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> pycolmap.Camera:
+def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> Camera:
+    where = f"camera {image.camera_id} of image {image.name!r} in {folder}"
     if record is None:
-        wrong = "no such camera"
-    elif not np.isfinite(record.params).all():
-        wrong = f"parameters {record.params.tolist()}"
-    else:
-        camera = pycolmap.Camera(model=record.model, params=record.params.tolist())
-        if _focal(camera) > 0:
-            return camera
-        wrong = f"focal length {_focal(camera)}"
-    raise ColmapError(
-        f"expected camera {image.camera_id} of image {image.name!r} in {folder}, got {wrong}; try another model"
-    )
-
-
-def _focal(camera: pycolmap.Camera) -> float:
-    """Mean focal length in pixels; for a model that has none (equirectangular), the scale at the principal ray."""
-    step = 1e-4
-    ahead, aside = camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
-    return float(camera.mean_focal_length() or np.linalg.norm(aside - ahead) / step)
-
-
-def _undistort(camera: pycolmap.Camera, keypoints: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Normalised coordinates of pixels, NaN where there are none.
-
-    pycolmap marks some failures with NaN and returns a wrong finite point for others (a fisheye beyond 90 degrees), so
-    the result has to project back to the pixel.
-    """
-    points = np.asarray(camera.cam_from_img(np.ascontiguousarray(keypoints)), dtype=np.float64)
-    back = np.asarray(camera.img_from_cam(np.column_stack([points, np.ones(len(points))])), dtype=np.float64)
-    with np.errstate(invalid="ignore"):
-        good = np.linalg.norm(back - keypoints, axis=-1) < ROUND_TRIP
-    return np.where(good[:, None], points, np.nan)
+        raise ColmapError(f"expected {where}, got no such camera; try another model")
+    try:
+        return colmap_camera(record.model, record.params)
+    except ValueError as error:
+        raise ColmapError(f"{where}: {error}; try another model") from error
 
 
 def _image_points(
     record: ImageRecord,
-    camera: pycolmap.Camera,
+    camera: Camera,
     ids: NDArray[np.int64],
     points3d: NDArray[np.float64],
     lost: Counter[str],
 ) -> ImagePoints:
     rotation = Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix()
-    undistorted = _undistort(camera, record.keypoints)
+    undistorted = camera.normalise(record.keypoints)
     usable = np.isfinite(undistorted).all(-1)
     lost["keypoints that could not be undistorted"] += int((~usable).sum())
 
@@ -185,5 +145,5 @@ def _image_points(
         observed=np.unique(place[known]),
         rotation=rotation,
         translation=record.translation,
-        focal=_focal(camera),
+        focal=camera.focal,
     )

@@ -1,0 +1,173 @@
+"""Cameras: from pixels to normalised image coordinates and back, distortion included.
+
+The only file that imports pycolmap, and only when a camera needs it: it takes half a second.
+"""
+
+import signal
+import threading
+
+# zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
+import zlib  # noqa: F401
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float64]
+ROUND_TRIP = 0.01  # pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Pinhole:
+    """A camera without distortion, pixels ~ K (x, y, 1)."""
+
+    matrix: Array
+
+    @property
+    def focal(self) -> float:
+        """Pixels per unit of normalised coordinates."""
+        return float(np.sqrt(abs(np.linalg.det(self.matrix[:2, :2]))))
+
+    def normalise(self, pixels: Array) -> Array:
+        """Normalised coordinates (k, 2) of pixels (k, 2)."""
+        return np.linalg.solve(self.matrix[:2, :2], (pixels - self.matrix[:2, 2]).T).T
+
+    def project(self, points: Array) -> Array:
+        """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
+        return in_front(points) @ self.matrix[:2].T
+
+
+@dataclass(frozen=True, eq=False)
+class Lens:
+    """A camera of any COLMAP model, with its distortion; `camera` is pycolmap's."""
+
+    camera: Any
+
+    @property
+    def focal(self) -> float:
+        """Pixels per unit of normalised coordinates: the mean focal length; of a model that has none (equirectangular),
+        the scale at the principal ray."""
+        step = 1e-4
+        ahead, aside = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
+        return float(self.camera.mean_focal_length() or np.linalg.norm(aside - ahead) / step)
+
+    def normalise(self, pixels: Array) -> Array:
+        """Normalised, undistorted coordinates (k, 2) of pixels (k, 2), NaN where there are none.
+
+        pycolmap marks some failures with NaN and returns a wrong finite point for others (a fisheye beyond 90 degrees),
+        so the result has to project back to the pixel.
+        """
+        points = np.asarray(self.camera.cam_from_img(np.ascontiguousarray(pixels)), dtype=np.float64)
+        back = np.asarray(self.camera.img_from_cam(np.column_stack([points, np.ones(len(points))])), dtype=np.float64)
+        with np.errstate(invalid="ignore"):
+            good = np.linalg.norm(back - pixels, axis=-1) < ROUND_TRIP
+        return np.where(good[:, None], points, np.nan)
+
+    def project(self, points: Array) -> Array:
+        """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
+        return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
+
+
+Camera = Pinhole | Lens
+
+
+def in_front(points: Array) -> Array:
+    """(x/z, y/z, 1) of points (k, 3) with z > 0, NaN for the others."""
+    depth = np.where(points[:, 2:] > 0, points[:, 2:], np.nan)
+    with np.errstate(over="ignore"):
+        return points / depth
+
+
+def camera_from(given: Any) -> Camera:
+    """The camera of a 3x3 matrix K, of (COLMAP model name, parameters) or (name, width, height, parameters), of a
+    mapping with `model` and `params`, or of a pycolmap.Camera.
+
+    Raises ValueError for a singular or broken K, an unknown model, a wrong number of parameters, or no positive focal
+    length.
+    """
+    if hasattr(given, "cam_from_img") and hasattr(given, "img_from_cam"):
+        return _checked(Lens(given), f"{given.params}")
+    if isinstance(given, Mapping):
+        if not {"model", "params"} <= set(given):
+            raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(given)}")
+        return colmap_camera(str(given["model"]), given["params"])
+    if isinstance(given, Sequence) and len(given) and isinstance(given[0], str):
+        if len(given) not in (2, 4):
+            raise ValueError(
+                f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(given)} "
+                "values"
+            )
+        return colmap_camera(given[0], given[-1])
+    return _pinhole(given)
+
+
+def colmap_camera(model: str, params: Any) -> Lens:
+    """The camera of a COLMAP model's name and parameters, in COLMAP's order. Raises ValueError as `camera_from`."""
+    counts = dict(camera_models().values())
+    if model not in counts:
+        raise ValueError(f"expected a COLMAP camera model among {', '.join(counts)}, got {model!r}")
+    try:
+        values = np.asarray(params, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected the parameters of a {model} camera as numbers, got {params!r:.60}") from error
+    if values.shape != (counts[model],):
+        raise ValueError(f"expected {counts[model]} parameters of a {model} camera, got {values.tolist()}")
+    if not np.isfinite(values).all():
+        raise ValueError(f"expected finite parameters of a {model} camera, got {values.tolist()}")
+    return _checked(Lens(_pycolmap().Camera(model=model, params=values.tolist())), f"{values.tolist()}")
+
+
+def camera_models() -> Mapping[int, tuple[str, int]]:
+    """Name and number of parameters of each COLMAP camera model, by its id."""
+    return _models()
+
+
+@cache
+def _models() -> Mapping[int, tuple[str, int]]:
+    pycolmap = _pycolmap()
+    return {
+        int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))
+        for name, model in pycolmap.CameraModelId.__members__.items()
+        if model != pycolmap.CameraModelId.INVALID
+    }
+
+
+@cache
+def _pycolmap() -> Any:
+    kept = signal.getsignal(signal.SIGTERM)
+    import pycolmap
+
+    if threading.current_thread() is threading.main_thread():
+        # Whoever ends a process wants no stack trace, which pycolmap prints: back to what Python had set.
+        signal.signal(signal.SIGTERM, kept)
+    return pycolmap
+
+
+def _checked(lens: Lens, shown: str) -> Lens:
+    focal = lens.focal
+    if not focal > 0:
+        raise ValueError(f"expected a camera with a positive focal length, got {focal} of the parameters {shown}")
+    return lens
+
+
+def _pinhole(given: Any) -> Pinhole:
+    try:
+        matrix = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given, dtype=np.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(
+            f"expected `camera` as a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, got {given!r:.60}"
+        ) from error
+    if matrix.shape != (3, 3):
+        raise ValueError(f"expected a `camera` matrix of shape (3, 3), got {matrix.shape}; try (model, parameters)")
+    if not np.isfinite(matrix).all():
+        raise ValueError(f"expected a finite `camera` matrix, got {matrix.tolist()}")
+    if np.any(matrix[2, :2] != 0) or matrix[2, 2] == 0:
+        raise ValueError(f"expected a `camera` matrix with the last row (0, 0, 1), got {matrix[2].tolist()}")
+    matrix = matrix / matrix[2, 2]
+    singular = np.linalg.svd(matrix[:2, :2], compute_uv=False)
+    if not singular[1] > 1e-9 * singular[0]:
+        raise ValueError(f"expected an invertible `camera` matrix, got the singular {matrix.tolist()}")
+    return Pinhole(matrix)
