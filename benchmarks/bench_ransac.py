@@ -10,10 +10,8 @@ do not. The threshold is 0.01. Solved is below 1 degree; an estimator that gives
 """
 
 import argparse
-import json
-import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -26,6 +24,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Column, Table
 from scipy.spatial.transform import Rotation
+from timing import machine, write_json
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers.consensus import consensus
@@ -151,31 +150,27 @@ def show(rows: list[Row]) -> None:
     Console().print(table)
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="also write the rows to this file")
     parser.add_argument("--problems", type=int, default=20, help="problems a row")
     parser.add_argument("--pairs", type=int, default=1500, help="candidate pairs a problem")
     parser.add_argument("--inliers", type=float, nargs="+", default=[0.05, 0.1, 0.3, 0.6])
     parser.add_argument("--threads", type=int, default=1, help="threads for torch; the others use one")
-    arguments = parser.parse_args()
-    torch.set_num_threads(arguments.threads)
+    options = parser.parse_args(arguments)
+    torch.set_num_threads(options.threads)
     rows = []
     for ordered in (True, False):
-        for inliers in arguments.inliers:
+        for inliers in options.inliers:
             problems = [
-                planted(seed, inliers=inliers, pairs=arguments.pairs, ordered=ordered)
-                for seed in range(arguments.problems)
+                planted(seed, inliers=inliers, pairs=options.pairs, ordered=ordered) for seed in range(options.problems)
             ]
             weights = "ordered" if ordered else "random"
             rows += [measure(name, problems, weights=weights, inliers=inliers) for name in ESTIMATORS]
     show(rows)
-    if arguments.json:
-        record = {"settings": {**vars(arguments), "json": str(arguments.json)}, "rows": [asdict(row) for row in rows]}
-        arguments.json.parent.mkdir(parents=True, exist_ok=True)
-        temporary = arguments.json.with_suffix(".partial")
-        temporary.write_text(json.dumps(record, indent=1))
-        os.replace(temporary, arguments.json)
+    if options.json:
+        settings = {**vars(options), "json": options.json.name}
+        write_json(options.json, {"machine": machine(), "settings": settings, "rows": [asdict(row) for row in rows]})
 
 
 if __name__ == "__main__":

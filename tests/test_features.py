@@ -2,9 +2,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
+from lightning import LightningModule, Trainer
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from bpnp.callbacks import CompileNets
+from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
 from bpnp.models.normalisation import MaskedBatchNorm, context_norm
 
@@ -188,3 +191,31 @@ def test_normalised_scenes_forget_their_unit_and_origin() -> None:
     assert not normalised[~mask].any()
     moved = normalise_points3d(250 * padded + torch.tensor([30.0, -20, 10]), mask)
     torch.testing.assert_close(moved, normalised, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_the_context_norm_has_the_gradient_of_its_formula(dtype: torch.dtype) -> None:
+    _, x, mask = sets(5, garbage=3.0)
+    x, weight = x.double(), torch.randn(x.shape, dtype=torch.float64)
+    if dtype == torch.float64:
+        assert torch.autograd.gradcheck(lambda x: context_norm(x, mask), x.requires_grad_())
+        return
+    gradients = []
+    for value in (x.requires_grad_(), x.detach().to(dtype).requires_grad_()):
+        out = context_norm(value, mask)
+        assert out.dtype == value.dtype
+        gradients.append(torch.autograd.grad((out.double() * weight).sum(), value)[0].double())
+    assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()  # 8 bits
+
+
+def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = []
+    monkeypatch.setattr(nn.Module, "compile", lambda net, backend: compiled.append((net, backend)))
+    task = LightningModule()
+    task.solver = net = BPnPNet(channels=8, blocks=2)
+    trainer = Trainer(accelerator="cpu", barebones=True)
+    CompileNets(backend="eager").on_fit_start(trainer, task)
+    assert [part is net.features2d or part is net.features3d or part is net.align for part, _ in compiled] == [True] * 3
+    assert {backend for _, backend in compiled} == {"eager"}
+    with pytest.raises(ValueError, match="expected nets of BPnPNet, got"):
+        CompileNets(["features4d"]).on_fit_start(trainer, task)

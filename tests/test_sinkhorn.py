@@ -1,4 +1,5 @@
 import math
+import sys
 
 import pytest
 import torch
@@ -217,3 +218,48 @@ def test_the_module_passes_its_options_on() -> None:
     assert {name for name, p in layer.named_parameters() if p.grad is not None} == {"log_mu", "bin_cost"}
     with pytest.raises(ValueError, match="expected a `dustbin` cost to learn from"):
         Sinkhorn(learn_dustbin=True)
+
+
+@pytest.mark.parametrize("shape", [(3, 1, 7), (3, 7, 1), (3, 1, 1)])
+@pytest.mark.parametrize("dustbin", [None, 0.5])
+def test_a_single_point_on_a_side_has_one_plan(shape: tuple[int, int, int], dustbin: float | None) -> None:
+    cost = random_cost(*shape).requires_grad_()
+    plan, stats = sinkhorn(cost, dustbin=dustbin)
+    assert stats.converged.all()
+    if dustbin is None:  # all marginals are given: nothing to choose, no gradient
+        torch.testing.assert_close(plan, torch.full_like(plan, 1 / plan[0].numel()))
+    (gradient,) = torch.autograd.grad((plan * random_cost(*shape, seed=1)).sum(), cost)
+    assert gradient.isfinite().all()
+    assert (gradient.abs().max() < 1e-12) == (dustbin is None)
+
+
+def test_scalings_beyond_the_range_of_float32_are_absorbed() -> None:
+    """Potentials that no single kernel exp(-M / mu) holds: they reach 200 mu, and float32 ends at 88."""
+    n, mu = 40, 0.01
+    far = 2 * torch.eye(n)[:, torch.arange(n).roll(1)] + torch.arange(n) / n
+    for cost in (far.unsqueeze(0), far.T.unsqueeze(0)):
+        uniform = torch.full((1, n), 1 / n, dtype=torch.float64)
+        plan, stats = sinkhorn(cost, mu=mu)
+        assert stats.converged.all()
+        expected = plain_sinkhorn(cost.double(), mu, uniform, uniform)
+        assert (plan - expected).abs().max() < 1e-5
+
+
+def test_the_parts_that_fit_into_the_cache_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = random_cost(5, 30, 20).float()
+    together, stats = sinkhorn(cost, mu=0.02)
+    monkeypatch.setattr("bpnp.layers.transport.CACHE", 1)
+    alone, alone_stats = sinkhorn(cost, mu=0.02)
+    assert (together - alone).abs().max() < 4 * torch.finfo(torch.float32).eps
+    assert torch.equal(stats.iterations, alone_stats.iterations)
+
+
+@pytest.mark.parametrize("mu", [0.1, 0.02])
+def test_without_waiting_for_the_device_the_plan_is_the_same(mu: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    cost = random_cost(3, 30, 20)
+    expected, _ = sinkhorn(cost, mu=mu, **EXACT)
+    for module in ("sinkhorn", "transport", "scalings", "laplacian", "pacing"):
+        monkeypatch.setattr(sys.modules[f"bpnp.layers.{module}"], "waits", lambda _device: True)
+    plan, stats = sinkhorn(cost, mu=mu)
+    assert stats.converged.all()
+    assert (plan - expected).abs().max() < 1e-6

@@ -33,7 +33,8 @@ def aggregate(
     assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]
 ) -> Float[Tensor, "b n 3"]:  # fmt: skip
     """q_j = sum_i P_ij f_i: one mean bearing for each 3D point, with its weight as its length."""
-    return assignment.mT @ bearings.to(assignment.dtype)
+    # As (F^T P)^T: in torch 2.13 on the CPU the product with three columns on the right takes four times as long.
+    return (bearings.to(assignment.dtype).mT @ assignment).mT
 
 
 @dataclass(frozen=True)

@@ -45,6 +45,7 @@ def weighted_pnp(
     method: "newton", damped, per sample, O(n) an iteration; "lbfgs", strong Wolfe on the dense objective, per sample.
     tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii; 1e-7 at least
         for "lbfgs", whose line search cannot see less.
+    max_iterations: of the solver; on cuda at most 12, all of which are taken (a stop would make the host wait).
 
     Returns rotation, translation and stats per sample. Iterations run in float64. Gradients flow to assignment,
     bearings and points3d by the implicit function theorem with the true Hessian (Lemma 1). `converged` is False, and

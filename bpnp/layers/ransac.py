@@ -38,7 +38,9 @@ def top_pairs(
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
     count = torch.minimum((pairs_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
-    scores = assignment.detach().masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
+    scores = assignment.detach()
+    if mask2d is not None or mask3d is not None:
+        scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
     k = min(int(pairs_factor * min(m, n)), m * n)
     probability, flat = scores.flatten(1).topk(k, dim=-1)
     mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
@@ -63,13 +65,15 @@ def ransac_pnp(
 
     assignment: P; its order alone matters. points2d: normalised image coordinates. points3d: scene units.
     backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC, then EPnP on its
-        inliers: the paper's, with 1000 iterations. EPnP is unreliable on points of one plane.
+        inliers: the paper's, with 1000 iterations. Where EPnP loses inliers of the pose that it refits, as it may on
+        points of one plane, SQPnP does it.
     threshold: largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
     seed: of the sampling, the same for each sample, so that a pose does not depend on the other samples.
 
     Returns rotation, translation and stats (residual: mean reprojection error of the inliers, root mean square for
-    "torch"; iterations: hypotheses, or the bound on them where the backend does not tell). A sample for which no pose
-    has 4 inliers holds NaN and `converged` False. No gradient: the pose only starts a solver that has one.
+    "torch"; iterations: hypotheses, or the bound on them where the backend does not tell, 0 without 4 pairs). A sample
+    for which no pose has 4 inliers holds NaN and `converged` False. No gradient: the pose only starts a solver that has
+    one.
     Raises ValueError for an unknown backend.
     """
     if backend not in ("auto", "torch", *ESTIMATORS):
@@ -119,11 +123,12 @@ def _one_by_one(
         # Around the origin, so that a scene far from it loses no digits in the minimal solver.
         centre = p.mean(0)
         result = estimate(x, p - centre, threshold, iterations, seed)
+        taken[i] = iterations if result is None else result.iterations
         error = None if result is None else mean_residual(result, x, p - centre, threshold)
         if result is None or error is None:
             continue
         rotation[i], translation[i] = result.rotation, result.translation - result.rotation @ centre
-        taken[i], residual[i], found[i] = result.iterations, error, True
+        residual[i], found[i] = error, True
     device = image.device
     stats = SolveStats(*(torch.as_tensor(x, device=device) for x in (taken, residual, found)))
     return torch.as_tensor(rotation, device=device), torch.as_tensor(translation, device=device), stats

@@ -40,6 +40,8 @@ def sinkhorn(
         points share their marginals with one bin on each side in the proportion m : n, points to the other side's bin,
         and the assignment sums to less than one.
     tolerance: largest L1 error of the row and of the column sums at which a sample stops.
+    max_iterations: pairs of scalings; on cuda at most 24, all of which are taken (a stop would make the host wait), and
+        in the cost's own precision: sharp plans in float32 may end short of the tolerance there, and say so.
 
     Returns the assignment (b, m, n) and stats (residual: that L1 error). Samples stop independently of each other. The
     gradient is that of the optimum (`bpnp.layers.implicit`); its memory is O(m n), whatever the iterations.

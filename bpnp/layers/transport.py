@@ -8,14 +8,15 @@ by conjugate gradients to no more digits than the step has) is quadratic there.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.layers.laplacian import Plan, newton_direction, times, transpose_times
+from bpnp.layers.laplacian import Plan, newton_direction, times
 from bpnp.layers.pacing import steps, unfinished, waits
+from bpnp.layers.scalings import Scaled, absorb, from_row_minima, sweep
 from bpnp.types import SolveStats
 
 SWEEPS_BEFORE_NEWTON = 4
@@ -24,7 +25,6 @@ STEPS_IN_FLOAT32 = 28  # a sample that is not done by then is short of digits, n
 STEPS_ON_GPU = 24
 NEWTON_RADIUS = 2.0  # largest first change of a log scaling
 LOOSEST, SAFETY = 0.1, 0.3  # of a Newton step: relative error, and the error to end at per tolerance
-LARGEST_LOG_SCALING = 20.0  # twice this is far from where entries of K underflow in float32
 COARSEST = 0.05  # annealing starts at this part of the range of the costs
 COOLING = 4.0
 SWEEPS_PER_TEMPERATURE = 5
@@ -89,12 +89,12 @@ def _solve(
     active = torch.ones_like(residual, dtype=torch.bool)
     while taken < last and unfinished(active):
         if taken:
-            state = _absorb(state, cost, temperature)
+            state = absorb(state, cost, temperature, active)
         some = _worked_on(active)
         part, sweeps, exact = state.samples(some), 1 if taken else first, active[some]
         if taken:
             part, radius[some], exact = _newton(part, rows[some], cols[some], radius[some], active[some], tolerance)
-        part, part_residual, part_sweeps = _sweep(part, rows[some], cols[some], active[some], tolerance, sweeps)
+        part, part_residual, part_sweeps = sweep(part, rows[some], cols[some], active[some], tolerance, sweeps)
         taken += sweeps
         state = state.with_scalings(some, part)
         residual[some] = torch.where(active[some], part_residual, residual[some])
@@ -104,34 +104,6 @@ def _solve(
     return iterations, residual
 
 
-@dataclass(frozen=True)
-class _State:
-    """P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu), and its row sums."""
-
-    kernel: Tensor
-    u: Tensor
-    v: Tensor
-    alpha: Tensor
-    beta: Tensor
-    row_sums: Tensor
-
-    @classmethod
-    def start(cls, kernel: Tensor, u: Tensor, v: Tensor) -> "_State":
-        ones = torch.ones_like(v)
-        return cls(kernel, u, v, torch.ones_like(u), ones, times(kernel, ones))
-
-    def samples(self, some: Int[Tensor, " s"]) -> "_State":
-        if len(some) == len(self.u):
-            return self
-        return _State(*(x[some] for x in (self.kernel, self.u, self.v, self.alpha, self.beta, self.row_sums)))
-
-    def with_scalings(self, some: Int[Tensor, " s"], part: "_State") -> "_State":
-        if len(some) == len(self.u):
-            return part
-        names = ("alpha", "beta", "row_sums")
-        return replace(self, **{x: getattr(self, x).index_copy(0, some, getattr(part, x)) for x in names})
-
-
 def _worked_on(active: Bool[Tensor, " b"]) -> Int[Tensor, " s"]:
     """The samples that steps are computed for: the active ones, or all where it costs a wait to know them."""
     if waits(active.device):
@@ -139,52 +111,9 @@ def _worked_on(active: Bool[Tensor, " b"]) -> Int[Tensor, " s"]:
     return active.nonzero().squeeze(-1)
 
 
-def _absorb(state: _State, cost: Tensor, mu: Float[Tensor, " b"]) -> _State:
-    """Move large scalings into the potentials and make K of these samples again; on a GPU, of all."""
-    log_alpha, log_beta = state.alpha.log(), state.beta.log()
-    large = torch.maximum(log_alpha.abs().amax(-1), log_beta.abs().amax(-1)) > LARGEST_LOG_SCALING
-    if not unfinished(large):
-        return state
-    u, v = state.u + mu[:, None] * log_alpha, state.v + mu[:, None] * log_beta
-    # Slices, not indices: K is changed in place and may be nearly all the memory there is.
-    parts = [slice(None)] if waits(cost.device) else [slice(i, i + 1) for i in large.nonzero().flatten().tolist()]
-    values = [x.clone() for x in (state.u, state.v, state.alpha, state.beta, state.row_sums)]
-    for some in parts:
-        kernel = torch.sub(u[some].unsqueeze(-1), cost[some], out=state.kernel[some])
-        kernel.add_(v[some].unsqueeze(-2)).div_(mu[some, None, None]).exp_()
-        fresh = _State.start(kernel, u[some], v[some])
-        for value, new in zip(values, (fresh.u, fresh.v, fresh.alpha, fresh.beta, fresh.row_sums), strict=True):
-            value[some] = new
-    return _State(state.kernel, *values)
-
-
-def _sweep(
-    state: _State, rows: Tensor, cols: Tensor, active: Bool[Tensor, " b"], tolerance: float, sweeps: int
-) -> tuple[_State, Float[Tensor, " b"], Int[Tensor, " b"]]:
-    """Rescale rows, then columns, up to `sweeps` times; each sample stops at the tolerance."""
-    kernel, alpha, beta, row_sums = state.kernel, state.alpha, state.beta, state.row_sums
-    residual = torch.full_like(row_sums[:, 0], torch.inf)
-    taken = torch.zeros_like(active, dtype=torch.long)
-    for _ in range(sweeps):
-        if not unfinished(active):
-            break
-        alpha = _rescale(alpha, rows / row_sums, active)
-        beta = _rescale(beta, cols / (beta * transpose_times(kernel, alpha)), active)
-        row_sums = alpha * times(kernel, beta)
-        residual = torch.where(active, (row_sums - rows).abs().sum(-1), residual)
-        taken += active
-        active = active & (residual > tolerance)
-    return replace(state, alpha=alpha, beta=beta, row_sums=row_sums), residual, taken
-
-
-def _rescale(scaling: Tensor, factor: Tensor, active: Tensor) -> Tensor:
-    """Padded points, whose factor is 0/0, keep their scaling, and so do samples that have stopped."""
-    return torch.where(active.unsqueeze(-1) & (factor > 0) & factor.isfinite(), scaling * factor, scaling)
-
-
 def _newton(
-    state: _State, rows: Tensor, cols: Tensor, radius: Tensor, active: Bool[Tensor, " b"], tolerance: float
-) -> tuple[_State, Float[Tensor, " b"], Bool[Tensor, " b"]]:
+    state: Scaled, rows: Tensor, cols: Tensor, radius: Tensor, active: Bool[Tensor, " b"], tolerance: float
+) -> tuple[Scaled, Float[Tensor, " b"], Bool[Tensor, " b"]]:
     """One Newton step inside a trust radius, taken if it does not lower the (concave) dual objective.
 
     The new radius, and which samples go on: those whose direction the precision can tell.
@@ -213,7 +142,7 @@ def _newton(
 
 def _anneal(
     cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"], kernel: Tensor, coolings: float
-) -> _State:
+) -> Scaled:
     """Potentials from which the plan at `mu` neither over- nor underflows, and K in `kernel`.
 
     Sweeps at falling temperatures, each sample from its own range of costs down to mu. Each temperature starts with the
@@ -222,26 +151,19 @@ def _anneal(
     warm = torch.maximum(COARSEST * _range(cost, rows, cols), mu)
     v = torch.where(cols > 0, 0.0, -math.inf).to(cost.dtype)
     while coolings > 0 and unfinished(cooling := warm > mu):
-        state = _from_row_minima(cost, rows, v, warm, kernel)
-        state, _, _ = _sweep(state, rows, cols, cooling, 0.0, SWEEPS_PER_TEMPERATURE)
+        state = from_row_minima(cost, rows, v, warm, kernel)
+        state, _, _ = sweep(state, rows, cols, cooling, 0.0, SWEEPS_PER_TEMPERATURE)
         v = v + torch.where(cooling, warm, 0).unsqueeze(-1) * state.beta.log()
         warm = torch.maximum(warm / COOLING, mu)
         coolings -= 1
-    return _from_row_minima(cost, rows, v, mu, kernel)
+    return from_row_minima(cost, rows, v, mu, kernel)
 
 
-def _coolings_on_gpu(mu: float | Tensor) -> int:
+def _coolings_on_gpu(mu: float | Tensor) -> float:
     """Temperatures above mu for costs between unit features, in [0, 2]; mu is not read back if it is a tensor."""
     if isinstance(mu, Tensor):
-        return 2
-    return max(0, math.ceil(math.log(2 * COARSEST / mu, COOLING)))
-
-
-def _from_row_minima(cost: Tensor, rows: Tensor, v: Tensor, mu: Float[Tensor, " b"], kernel: Tensor) -> _State:
-    u = torch.sub(cost, v.unsqueeze(-2), out=kernel).amin(-1)
-    u = torch.where(rows > 0, u, -math.inf)
-    kernel.sub_(u.unsqueeze(-1)).div_(-mu[:, None, None]).exp_()
-    return _State.start(kernel, u, v)
+        return 2.0
+    return max(0.0, float(math.ceil(math.log(2 * COARSEST / mu, COOLING))))
 
 
 def _range(cost: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, " b"]:
