@@ -12,6 +12,7 @@ from bpnp.geometry import bearings
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.precision import full_precision
 from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.layers.refine import Refine
 from bpnp.layers.sinkhorn import Sinkhorn
 from bpnp.models.checkpoint import read_checkpoint
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
@@ -41,9 +42,8 @@ class BPnPNet(nn.Module):
         pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
         pnp_method: newton, or lbfgs as in the paper.
         pnp_iterations: most iterations of the PnP layer.
+        refine: give a third pose in evaluation, "refined", annealed from the other two without the assignment.
     """
-
-    estimates = ("ransac", "pnp")
 
     def __init__(
         self,
@@ -64,6 +64,7 @@ class BPnPNet(nn.Module):
         pairs_factor: float = 1.5,
         pnp_method: Method = "newton",
         pnp_iterations: int = 50,
+        refine: bool = True,
     ) -> None:
         super().__init__()
         self.settings: dict[str, Any] = {
@@ -83,20 +84,26 @@ class BPnPNet(nn.Module):
             max_iterations=ransac_iterations,
         )
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
+        self.refine = Refine() if refine else None
+        self.estimates = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
-        """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"."""
+        """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"; in evaluation "refined"."""
         cost = self.cost(batch)
         assignment, assignment_stats = self.sinkhorn(cost, batch.mask2d, batch.mask3d)
         if not poses:
             return Prediction(assignment, assignment_stats)
-        start = Pose(
-            *self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d)
-        )  # fmt: skip
-        refined = Pose(
-            *self.pnp(assignment, bearings(batch.points2d), batch.points3d, start.rotation, start.translation)
-        )  # fmt: skip
-        return Prediction(assignment, assignment_stats, {"ransac": start, "pnp": refined})
+        rays = bearings(batch.points2d)
+        ransac = Pose(*self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
+        pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
+        estimates = {"ransac": ransac, "pnp": pnp}
+        if self.refine is not None and not self.training:
+            rotations = torch.stack([ransac.rotation, pnp.rotation], 1)
+            translations = torch.stack([ransac.translation, pnp.translation], 1)
+            estimates["refined"] = Pose(
+                *self.refine(rays, batch.points3d, rotations, translations, batch.mask2d, batch.mask3d)
+            )
+        return Prediction(assignment, assignment_stats, estimates)
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
         """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2], in the network's dtype."""

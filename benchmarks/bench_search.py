@@ -1,0 +1,147 @@
+"""The training-free search on real meshes and photos: errors, failures, verdicts and seconds a pair.
+
+python benchmarks/bench_search.py --data ../shared/data psb psb-so3 psb-0.5 castle-P30 castle-P30-0.25
+A set is psb, psb-so3, psb-RHO (uniform outliers on both sides), SCENE, SCENE-CLUTTER (natural, ratio to the true
+pairs) or SCENE-all (all keypoints, all scene points).
+"""
+
+import argparse
+import json
+import re
+import time
+import warnings
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from bpnp.accuracy import rotation_error, translation_error
+from bpnp.datamodules import ColmapDataModule, MeshDataModule
+from bpnp.datamodules.batching import PairSource
+from bpnp.datamodules.outliers import Outliers
+from bpnp.geometry import bearings
+from bpnp.layers import search_candidates
+from bpnp.types import Batch
+from bpnp.verdict import judge
+
+EVERYTHING = 1e6
+
+
+def source(name: str, data: Path, limit: int) -> PairSource:
+    """The pairs of a set."""
+    if name.startswith("psb"):
+        rho = 0.0 if name in ("psb", "psb-so3") else float(name.removeprefix("psb-"))
+        module: MeshDataModule | ColmapDataModule = MeshDataModule(
+            str(data / "psb"),
+            test_pairs=limit,
+            seed=1,
+            rotation="so3" if name == "psb-so3" else "euler",
+            test_outliers=Outliers(ratio=rho),
+        )
+    else:
+        match = re.fullmatch(r"(.+?)(?:-(all|\d+\.\d+))?", name)
+        assert match is not None
+        scene, clutter = match.groups()
+        ratio = EVERYTHING if clutter == "all" else float(clutter or 0)
+        module = ColmapDataModule(str(data / "colmap" / scene), test_fraction=1.0, rotate=True, clutter=ratio, seed=1)
+    module.setup("test")
+    return module.sources["test"]
+
+
+def run(name: str, data: Path, limit: int, seed: int, time_limit: float | None, max_batches: int) -> list[dict]:
+    pairs = source(name, data, limit)
+    count = len(pairs.sizes)
+    rows = []
+    for i in sorted({int(k * count / limit) for k in range(limit)}) if count > limit else range(count):
+        pair = pairs.pair(i, 0)
+        batch = Batch.from_arrays(pair.points2d, pair.points3d, pair.rotation, pair.translation)
+        start = time.perf_counter()
+        found = search_candidates(
+            bearings(batch.points2d),
+            batch.points3d,
+            seed=seed,
+            time_limit=time_limit,
+            max_batches=max_batches,
+        )
+        seconds = time.perf_counter() - start
+        assert batch.rotation is not None
+        assert batch.translation is not None
+        rotation = float(rotation_error(found.rotation[:, 0], batch.rotation))
+        translation = float(translation_error(found.translation[:, 0], batch.translation))
+        verdict, _ = judge(found, 0, len(pair.points2d), len(pair.points3d))
+        rows.append(
+            {
+                "pair": pair.name,
+                "rotation_deg": rotation,
+                "translation": translation,
+                "verdict": verdict,
+                "batches": int(found.stats.iterations[0]),
+                "seconds": seconds,
+                "points": [len(pair.points2d), len(pair.points3d)],
+            }
+        )
+    return rows
+
+
+def summary(name: str, rows: list[dict]) -> dict:
+    """Quartiles, recalls, verdicts and seconds of a set."""
+    error, shift = (np.array([row[key] for row in rows]) for key in ("rotation_deg", "translation"))
+    sure = np.array([row["verdict"] == "confident" for row in rows])
+    seconds = [row["seconds"] for row in rows]
+    return {
+        "set": name,
+        "pairs": len(rows),
+        "rotation_q_deg": [float(q) for q in np.percentile(error, (25, 50, 75))],
+        "translation_q": [float(q) for q in np.percentile(shift, (25, 50, 75))],
+        "under_1_deg": float((error < 1).mean()),
+        "under_2_deg": float((error < 2).mean()),
+        "recall_15_deg_0.5": float(((error < 15) & (shift < 0.5)).mean()),
+        "confident": float(sure.mean()),
+        "confident_over_2_deg": int((sure & (error > 2)).sum()),
+        "confident_over_5_deg": int((sure & (error > 5)).sum()),
+        "failed": int(sum(row["verdict"] == "failed" for row in rows)),
+        "seconds_mean": float(np.mean(seconds)),
+        "seconds_max": float(np.max(seconds)),
+        "batches_mean": float(np.mean([row["batches"] for row in rows])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("sets", nargs="+")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--limit", type=int, default=100)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--time-limit", type=float)
+    parser.add_argument("--max-batches", type=int, default=32)
+    parser.add_argument("--output", type=Path, help="JSON to add the results to")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    run("psb", options.data, 1, 0, None, 1)  # compiles
+    results = json.loads(options.output.read_text()) if options.output and options.output.exists() else {}
+    for name in options.sets:
+        rows = run(name, options.data, options.limit, options.seed, options.time_limit, options.max_batches)
+        row = summary(name, rows)
+        q = " / ".join(f"{value:.2f}" for value in row["rotation_q_deg"])
+        print(
+            f"{name:24s} {row['pairs']:4d} pairs  rotation {q} deg  <1: {row['under_1_deg']:.3f}  <2: "
+            f"{row['under_2_deg']:.3f}  (15, 0.5): {row['recall_15_deg_0.5']:.3f}  confident {row['confident']:.2f}, "
+            f"over 2 / 5 deg {row['confident_over_2_deg']} / {row['confident_over_5_deg']}  failed {row['failed']}  "
+            f"{row['seconds_mean']:.2f} s (max {row['seconds_max']:.1f}), {row['batches_mean']:.1f} batches",
+            flush=True,
+        )
+        results[name] = row | {
+            "seed": options.seed,
+            "time_limit": options.time_limit,
+            "max_batches": options.max_batches,
+            "threads": torch.get_num_threads(),
+        }
+        if options.output:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            temporary = options.output.with_suffix(".tmp")
+            temporary.write_text(json.dumps(results, indent=1) + "\n")
+            temporary.replace(options.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,86 @@
+"""The distinct poses that a search has met, and how sure the best of them is."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.layers.scene import Scene
+from bpnp.layers.starts import Array
+
+SAME_DEG, SAME_SHIFT = 3.0, 0.05  # poses closer than this, in degrees and in extents of the scene, are one
+OTHER_DEG = 10.0  # poses farther apart than this answer differently
+FAR_AHEAD, FAR_HITS, AHEAD, SAFE_HITS = 100.0, 2, 20.0, 4  # nats, and batches that found the pose
+SAFE_MATCHED = 0.2
+
+
+class Pool(NamedTuple):
+    """Distinct poses in the frame of a `Scene`, best first.
+
+    result (c, 3): likelihood, matched share and scale. hits (c,): batches whose own starts ended there.
+    """
+
+    rotation: Array
+    translation: Array
+    result: Array
+    hits: NDArray[np.int64]
+
+    def joined(self, other: "Pool", count: int) -> "Pool":
+        """The best `count` distinct poses of both; a pose that both have counts the hits of both."""
+        rotation = np.concatenate([self.rotation, other.rotation])
+        translation = np.concatenate([self.translation, other.translation])
+        result, hits = np.concatenate([self.result, other.result]), np.concatenate([self.hits, other.hits])
+        kept = distinct(rotation, translation, result[:, 0], count, SAME_DEG, SAME_SHIFT)
+        total = np.array(
+            [hits[near(rotation, translation, i, SAME_DEG, SAME_SHIFT)].sum() for i in kept.tolist()], dtype=np.int64
+        )  # fmt: skip
+        return Pool(rotation[kept], translation[kept], result[kept], total)
+
+
+def near(rotation: Array, translation: Array, i: int, degrees: float, shift: float) -> NDArray[np.bool_]:
+    """Which poses are within both limits of pose i."""
+    flat = rotation.reshape(-1, 9)
+    turned = flat @ flat[i] < 1 + 2 * math.cos(math.radians(degrees))
+    return ~turned & (np.linalg.norm(translation - translation[i], axis=-1) <= shift)
+
+
+def distinct(
+    rotation: Array, translation: Array, score: Array, count: int, degrees: float, shift: float
+) -> NDArray[np.int64]:
+    """The best `count` poses of which no two are closer than both limits, best first; NaN and -inf are left out."""
+    kept: list[int] = []
+    free = np.isfinite(score)
+    for i in np.argsort(-np.where(free, score, -np.inf), kind="stable").tolist():
+        if len(kept) == count:
+            break
+        if free[i]:
+            kept.append(i)
+            free &= ~near(rotation, translation, i, degrees, shift)
+    return np.array(kept, dtype=np.int64)
+
+
+def is_safe(pool: Pool, scene: Scene) -> bool:
+    """Whether more starts would hardly change the answer.
+
+    A pose whose matches are unique says so itself. Where points lie closer than the residuals, the pose must
+    lead the others and have come out of several batches while none found a better one.
+    """
+    ahead = lead(pool, scene)
+    hits = int(pool.hits[0])
+    found = (ahead > FAR_AHEAD and hits >= FAR_HITS) or (ahead > AHEAD and hits >= SAFE_HITS)
+    return unique(pool, scene) or found
+
+
+def unique(pool: Pool, scene: Scene) -> bool:
+    """Whether many points are matched at a scale at which chance would give few of them a neighbour."""
+    _, matched, scale = pool.result[0]
+    chance = len(scene.points3d) / scene.solid_angle * math.pi * (2 * float(scale)) ** 2
+    return bool(matched > max(SAFE_MATCHED, 2 * chance))
+
+
+def lead(pool: Pool, scene: Scene) -> float:
+    """Log-likelihood of all bearings under the best pose over that under the next other one, nats."""
+    other = ~near(pool.rotation, pool.translation, 0, OTHER_DEG, math.inf)
+    gap = pool.result[0, 0] - pool.result[other, 0].max() if other.any() else math.inf
+    return float(gap) * len(scene.bearings)

@@ -1,0 +1,211 @@
+"""Pose from two unmatched point sets, without training: many starts, annealed; batch after batch until one is safe."""
+
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from bpnp.geometry import bearings as as_bearings
+from bpnp.layers.annealing import FINE_OUTLIERS, KEPT, RECIPES, finish, run_batch
+from bpnp.layers.pool import Pool, is_safe
+from bpnp.layers.scene import Scene, degenerate
+from bpnp.layers.starts import Array, Prior
+from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+Progress = Callable[[int, int, float], None]  # pair, batch, seconds
+LEAST_CLUTTER = 0.02
+
+
+class Candidates(NamedTuple):
+    """Distinct poses of each sample, best first; NaN in empty slots.
+
+    score: mean log-likelihood of the bearings, nats. matched: expected share of min(m, n) that is matched.
+    scale: standard deviation of the residuals per axis, radians, at which score and matched were taken.
+    stats: iterations are batches of starts; converged where more of them would hardly have changed the best pose.
+    """
+
+    rotation: Float[Tensor, "b c 3 3"]
+    translation: Float[Tensor, "b c 3"]
+    score: Float[Tensor, "b c"]
+    matched: Float[Tensor, "b c"]
+    scale: Float[Tensor, "b c"]
+    stats: SolveStats
+
+
+def search_candidates(
+    bearings: Float[Tensor, "b m 3"],
+    points3d: Float[Tensor, "b n 3"],
+    *,
+    mask2d: Bool[Tensor, "b m"] | None = None,
+    mask3d: Bool[Tensor, "b n"] | None = None,
+    prior: Prior | None = None,
+    clutter: float | None = None,
+    seed: int = 0,
+    time_limit: float | None = None,
+    max_batches: int = 32,
+    progress: Progress | None = None,
+) -> Candidates:
+    """Every distinct pose (R, t) found that explains the bearings f_i by the points p_j, in no known order.
+
+    Maximises the likelihood of the bearings under the mixture
+    p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
+    A the solid angle of the view, by annealing s from starts over all rotations.
+
+    bearings: unit vectors of any field of view. points3d: any unit, any origin. prior: what is known of the pose.
+    clutter: share of the points without a partner to expect, from 0 to below 1; None tries several.
+    seed: of the starts, the same for each sample, so that no pose depends on the other samples.
+    time_limit: seconds a sample, after which no batch of starts begins; the result then depends on the machine.
+    max_batches: of starts, at most. progress: called after each batch with sample, batch and seconds.
+
+    A sample with fewer than 4 points of a side, or with all its bearings or all its points on one line or in one
+    place, has no candidates. Not differentiable; runs on the host's cores whatever the device.
+    Raises ValueError for a `time_limit` or `max_batches` that is not positive.
+    """
+    if max_batches < 1 or (time_limit is not None and not time_limit > 0):
+        raise ValueError(f"expected a positive `max_batches` and `time_limit`, got {max_batches} and {time_limit}")
+    if clutter is not None and not 0 <= clutter < 1:
+        raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
+    found = []
+    for i in range(len(bearings)):
+        f = bearings[i] if mask2d is None else bearings[i][mask2d[i]]
+        p = points3d[i] if mask3d is None else points3d[i][mask3d[i]]
+        found.append(
+            _search_pair(
+                f.detach().double().cpu().numpy(),
+                p.detach().double().cpu().numpy(),
+                _Budget(max_batches, math.inf if time_limit is None else time_limit, time.monotonic()),
+                prior,
+                clutter,
+                seed,
+                None if progress is None else partial(progress, i),
+            )
+        )
+    return _stacked(found, points3d)
+
+
+def search(
+    bearings: Float[Tensor, "b m 3"],
+    points3d: Float[Tensor, "b n 3"],
+    *,
+    mask2d: Bool[Tensor, "b m"] | None = None,
+    mask3d: Bool[Tensor, "b n"] | None = None,
+    prior: Prior | None = None,
+    clutter: float | None = None,
+    seed: int = 0,
+    time_limit: float | None = None,
+    max_batches: int = 32,
+    progress: Progress | None = None,
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
+    """The best of `search_candidates`, whose arguments these are: rotation, translation and stats.
+
+    A sample without a candidate holds NaN and `converged` False; `residual` is the scale of its residuals, radians.
+    """
+    found = search_candidates(
+        bearings, points3d, mask2d=mask2d, mask3d=mask3d, prior=prior, clutter=clutter, seed=seed,
+        time_limit=time_limit, max_batches=max_batches, progress=progress,
+    )  # fmt: skip
+    return found.rotation[:, 0], found.translation[:, 0], found.stats
+
+
+class Search(nn.Module):
+    """`search` as a solver: a `Batch` in, a `Prediction` with the pose "search" out. Nothing to train.
+
+    Args:
+        seed: of the starts.
+        time_limit: seconds a pair; none for no limit.
+        max_batches: batches of starts a pair, at most.
+    """
+
+    estimates = ("search",)
+
+    def __init__(self, *, seed: int = 0, time_limit: float | None = None, max_batches: int = 32) -> None:
+        super().__init__()
+        self.seed, self.time_limit, self.max_batches = seed, time_limit, max_batches
+
+    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+        """Prediction with the estimate "search" and no assignment."""
+        if not poses:
+            return Prediction()
+        pose = Pose(
+            *search(
+                as_bearings(batch.points2d), batch.points3d, mask2d=batch.mask2d, mask3d=batch.mask3d,
+                seed=self.seed, time_limit=self.time_limit, max_batches=self.max_batches,
+            )
+        )  # fmt: skip
+        return Prediction(poses={"search": pose})
+
+
+class _Found(NamedTuple):
+    poses: (
+        tuple[NDArray[np.float64], NDArray[np.float64], Array] | None
+    )  # rotations, translations in scene units, results
+    batches: int
+    safe: bool
+
+
+class _Budget(NamedTuple):
+    batches: int
+    seconds: float
+    start: float
+
+    def spent(self) -> float:
+        return time.monotonic() - self.start
+
+
+def _search_pair(
+    bearings: NDArray[np.float64],
+    points3d: NDArray[np.float64],
+    budget: _Budget,
+    prior: Prior | None,
+    clutter: float | None,
+    seed: int,
+    progress: Callable[[int, float], None] | None,
+) -> _Found:
+    if degenerate(bearings) or degenerate(points3d):
+        return _Found(None, 0, False)
+    scene = Scene(bearings, points3d, seed)
+    known = None if prior is None else scene.enter_prior(prior)
+    share = FINE_OUTLIERS if clutter is None else max(clutter, LEAST_CLUTTER)
+    pool: Pool | None = None
+    batch, safe = 0, False
+    while batch < budget.batches and not safe and budget.spent() < budget.seconds:
+        recipe = RECIPES[batch % len(RECIPES)]
+        recipe = recipe if clutter is None else recipe._replace(outliers=share)
+        found = run_batch(scene, recipe, known, pool, share)
+        pool = found if pool is None else pool.joined(found, KEPT)
+        safe = len(pool.hits) > 0 and is_safe(pool, scene)
+        if progress is not None:
+            progress(batch, budget.spent())
+        batch += 1
+    if pool is None or not len(pool.hits):
+        return _Found(None, batch, False)
+    pool = finish(scene, pool, share)
+    rotation, translation = scene.leave(pool.rotation, pool.translation)
+    return _Found((rotation, translation, pool.result), batch, safe)
+
+
+def _stacked(found: list[_Found], like: Tensor) -> Candidates:
+    b = len(found)
+    shape = (b, KEPT)
+    rotation, translation = np.full((*shape, 3, 3), np.nan), np.full((*shape, 3), np.nan)
+    result = np.full((*shape, 3), np.nan)
+    for i, one in enumerate(found):
+        if one.poses is not None:
+            count = len(one.poses[0])
+            rotation[i, :count], translation[i, :count], result[i, :count] = one.poses
+    score, matched, scale = (torch.as_tensor(values).to(like) for values in np.moveaxis(result, -1, 0))
+    stats = SolveStats(
+        torch.tensor([one.batches for one in found], device=like.device),
+        torch.nan_to_num(scale[:, 0], nan=torch.inf),
+        torch.tensor([one.safe for one in found], device=like.device, dtype=torch.bool),
+    )
+    return Candidates(
+        torch.as_tensor(rotation).to(like), torch.as_tensor(translation).to(like), score, matched, scale, stats
+    )  # fmt: skip

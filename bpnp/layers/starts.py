@@ -1,0 +1,115 @@
+"""Where a search starts: poses spread over all rotations, or around what is known of the camera."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+Array = NDArray[np.float32]
+
+
+class PosePrior(NamedTuple):
+    """A rough pose, camera = R p + t, and how rough: one standard deviation in degrees and in scene units.
+
+    Without a translation only the rotation is known.
+    """
+
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, " 3"] | None
+    rotation_sigma_deg: float
+    translation_sigma: float = math.inf
+
+
+class GravityPrior(NamedTuple):
+    """The direction up, in the camera and in the scene, known to within `sigma_deg` (one standard deviation)."""
+
+    up_camera: Float[Tensor, " 3"]
+    up_scene: Float[Tensor, " 3"]
+    sigma_deg: float = 2.0
+
+
+Prior = PosePrior | GravityPrior
+
+
+class Spread(NamedTuple):
+    """How translations are drawn around the weak-perspective one.
+
+    off_centre: 0 looks at the mean of the points; up to 1, at a point of the scene between the mean and any of them.
+    log_depth: the depth is multiplied by exp(u), u uniform in +- this.
+    """
+
+    off_centre: float
+    log_depth: float
+
+
+def super_fibonacci(count: int) -> NDArray[np.float64]:
+    """Rotations (count, 3, 3) spread evenly over SO(3): super-Fibonacci spirals (Alexa, CVPR 2022, Algorithm 1)."""
+    s = np.arange(count) + 0.5
+    inner, outer = np.sqrt(s / count), np.sqrt(1 - s / count)
+    alpha, beta = 2 * math.pi * s / math.sqrt(2), 2 * math.pi * s / 1.533751168755204288118041
+    quaternions = [inner * np.sin(alpha), inner * np.cos(alpha), outer * np.sin(beta), outer * np.cos(beta)]
+    return Rotation.from_quat(np.stack(quaternions, -1)).as_matrix()
+
+
+def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) -> NDArray[np.float64]:
+    """An evenly spread set, turned at random, or rotations drawn from the prior (the first one its mean)."""
+    if prior is None:
+        return super_fibonacci(count) @ Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    if isinstance(prior, PosePrior):
+        tilt = Rotation.from_rotvec(math.radians(prior.rotation_sigma_deg) * rng.standard_normal((count, 3)))
+        mean = np.asarray(prior.rotation, dtype=np.float64)
+    else:
+        up, scene = (np.asarray(v, dtype=np.float64) / np.linalg.norm(np.asarray(v)) for v in prior[:2])
+        angles = 2 * math.pi * (np.arange(count) + rng.random()) / count
+        about = Rotation.from_rotvec(rng.permutation(angles)[:, None] * up)
+        tilt = Rotation.from_rotvec(math.radians(prior.sigma_deg) * rng.standard_normal((count, 3))) * about
+        mean = Rotation.align_vectors(up[None], scene[None])[0].as_matrix()
+    rotations = tilt.as_matrix() @ mean
+    rotations[0] = mean
+    return rotations
+
+
+def draw_poses(
+    bearings: Array, points3d: Array, count: int, spread: Spread, prior: Prior | None, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Rotations (count, 3, 3) and translations (count, 3) to start from.
+
+    The weak-perspective translation puts a point of the scene on the mean bearing, at the distance at which the points'
+    extent across it has the extent of the bearings.
+    """
+    rotation = draw_rotations(count, prior, rng)
+    axis = bearings.mean(0)
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
+    sample = points3d[rng.choice(len(points3d), min(200, len(points3d)), replace=False)]
+    across = sample @ rotation.transpose(0, 2, 1)
+    across = across - (across @ axis)[..., None] * axis
+    extent = np.sqrt(((across - across.mean(1, keepdims=True)) ** 2).sum(-1).mean(-1))
+    depth = extent / angular_spread(bearings) * np.exp(spread.log_depth * rng.uniform(-1, 1, count))
+    middle = points3d.mean(0)
+    seen = middle + spread.off_centre * rng.random((count, 1)) * (
+        points3d[rng.integers(len(points3d), size=count)] - middle
+    )
+    translation = depth[:, None] * axis - np.einsum("sij,sj->si", rotation, seen)
+    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
+        # About the middle of the points: there the rotation's error moves the camera, not what it looks at.
+        known = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
+        noise = prior.translation_sigma * rng.standard_normal((count, 3))
+        noise[0] = 0
+        translation = known + noise - rotation @ middle
+    return rotation.astype(np.float32), translation.astype(np.float32)
+
+
+def angular_spread(bearings: Array) -> float:
+    """Root mean square distance of the bearings from their mean, radians for a narrow view."""
+    return max(float(np.sqrt(bearings.var(0).sum())), 1e-6)
+
+
+def solid_angle(bearings: Array) -> float:
+    """Steradians that the bearings fill: of the rectangle with their principal standard deviations, 4 pi at most."""
+    centred = bearings - bearings.mean(0)
+    variances = np.linalg.eigvalsh(centred.T @ centred / len(bearings))[1:]
+    return float(np.clip(12 * math.sqrt(max(float(variances.prod()), 0.0)), 1e-9, 4 * math.pi))
