@@ -24,7 +24,7 @@ def main() -> None:
     options = parser.parse_args()
     kind, folder = machine()["kind"], options.results
     layers, scaling, ransac = (folder / f"{name}{kind}.json" for name in ("", "scaling-", "ransac-"))
-    bench_layers.main(["--out", str(layers), *(["--quick"] if options.quick else ["--rounds", "5"])])
+    bench_layers.main(["--out", str(layers), *(["--quick"] if options.quick else ["--rounds", "3"])])
     sizes = ["--sizes", "250", "500"] if options.quick else []
     bench_scaling.main(["--out", str(scaling), *sizes])
     problems = ["--problems", "2"] if options.quick else []

@@ -25,7 +25,6 @@ FORWARD_CASES: tuple[tuple[Kind, float, float, float, int, str], ...] = (
     ("smooth", 3, 0.0, MU, 100, ">= 1x, 1e-6"),
     ("smooth", 10, 0.0, MU, 100, ">= 1x, 1e-6"),
     ("smooth", 3, 0.0, MU, MANY, ""),
-    ("smooth", 10, 0.0, MU, MANY, ""),
     ("smooth", 10, 0.0, 0.01, 100, "1e-6"),
     ("independent", 0.7, 0.2, 0.01, 100, "1e-6"),
 )

@@ -24,7 +24,7 @@ SWEEPS_BEFORE_NEWTON_ON_GPU = 16
 STEPS_IN_FLOAT32 = 28  # a sample that is not done by then is short of digits, not of steps
 STEPS_ON_GPU = 24
 NEWTON_RADIUS = 2.0  # largest first change of a log scaling
-LOOSEST, SAFETY = 0.1, 0.3  # of a Newton step: relative error, and the error to end at per tolerance
+LOOSEST, SAFETY = 0.3, 0.8  # of a Newton step: relative error, and the error to end at per tolerance
 COARSEST = 0.05  # annealing starts at this part of the range of the costs
 COOLING = 4.0
 SWEEPS_PER_TEMPERATURE = 5
@@ -119,7 +119,7 @@ def _newton(
     The new radius, and which samples go on: those whose direction the precision can tell.
     """
     error = (state.row_sums - rows).abs().sum(-1)
-    precision = torch.maximum(SAFETY * tolerance / error, error.clamp_max(LOOSEST))
+    precision = torch.maximum(SAFETY * tolerance / error, error.sqrt().clamp_max(LOOSEST))
     plan = Plan(state.kernel, state.alpha, state.beta)
     x, y, solved = newton_direction(plan, state.row_sums, rows, cols, precision)
     size = torch.maximum(x.abs().amax(-1), y.abs().amax(-1))
