@@ -38,6 +38,7 @@ RELAXATION = np.float32(1.7)  # of the steps while annealing: expectation-maximi
 KEPT = 8
 SHAKEN, SHAKES, SHAKE_DEG, SHAKE_SHIFT = 4, 6, 6.0, 0.1
 FINISH_SCALES = 2.0
+SHARES = (0.03, 0.6)  # of outliers, tried at the end beside the expected one
 
 
 def run_batch(scene: Scene, recipe: Recipe, prior: Prior | None, pool: Pool | None, fine_outliers: float) -> Pool:
@@ -108,20 +109,22 @@ def polish(
         tuple(grid)[:5], np.ascontiguousarray(scene.points3d.T), rotation, translation, scales,
         scene.outlier_density(outliers), SWEEPS, np.float32(1), PATIENCE, result,
     )  # fmt: skip
+    result[:, 0] += math.log(1 - outliers)  # the mixture's factor, for shares to be compared
     kept = distinct(rotation, translation, result[:, 0], len(result), SAME_DEG, SAME_SHIFT)
     return Pool(rotation[kept], translation[kept], result[kept], hits[kept].astype(np.int64))
 
 
 def finish(scene: Scene, pool: Pool, outliers: float) -> Pool:
-    """The poses, annealed once more on every bearing from a little above their scale."""
-    ends = [
-        polish(
-            scene, pool.rotation[[i]], pool.translation[[i]], pool.hits[[i]],
-            FINISH_SCALES * float(pool.result[i, 2]), outliers, bearings=None,
-        )
-        for i in range(len(pool.hits))
-    ]  # fmt: skip
+    """The poses, annealed once more on every bearing, the best of them for several shares of outliers too."""
+    ends = [_again(scene, pool, i, outliers) for i in range(len(pool.hits))]
+    ends += [_again(scene, pool, i, share) for i in range(min(2, len(pool.hits))) for share in SHARES]
     return functools.reduce(lambda joined, end: joined.joined(end, KEPT), ends)
+
+
+def _again(scene: Scene, pool: Pool, i: int, outliers: float) -> Pool:
+    first_scale = FINISH_SCALES * float(pool.result[i, 2])
+    rotation, translation = pool.rotation[[i]].copy(), pool.translation[[i]].copy()
+    return polish(scene, rotation, translation, pool.hits[[i]], first_scale, outliers, bearings=None)
 
 
 def _scales(spread: float, first: float, last: float, rounds: int) -> Array:

@@ -12,7 +12,8 @@ from bpnp.layers.starts import Array
 SAME_DEG, SAME_SHIFT = 3.0, 0.05  # poses closer than this, in degrees and in extents of the scene, are one
 OTHER_DEG = 10.0  # poses farther apart than this answer differently
 FAR_AHEAD, FAR_HITS, AHEAD, SAFE_HITS = 100.0, 2, 20.0, 4  # nats, and batches that found the pose
-SAFE_MATCHED = 0.2
+SAFE_MATCHED, OVER_CHANCE, PLAUSIBLE = 0.2, 6.0, 2.0
+MOST_STALLED, BETTER = 4, 0.002  # batches, and nats a bearing
 
 
 class Pool(NamedTuple):
@@ -61,22 +62,32 @@ def distinct(
 
 
 def is_safe(pool: Pool, scene: Scene) -> bool:
-    """Whether more starts would hardly change the answer.
+    """Whether more starts would hardly change the answer, and no other pose comes close.
 
-    A pose whose matches are unique says so itself. Where points lie closer than the residuals, the pose must
-    lead the others and have come out of several batches while none found a better one.
+    A pose whose matches are unique says so itself. Where points lie as close as the residuals, the pose must lead the
+    others and have come out of several batches while none found a better one.
     """
-    ahead = lead(pool, scene)
-    hits = int(pool.hits[0])
+    ahead, hits = lead(pool, scene), int(pool.hits[0])
     found = (ahead > FAR_AHEAD and hits >= FAR_HITS) or (ahead > AHEAD and hits >= SAFE_HITS)
-    return unique(pool, scene) or found
+    return unique(pool, scene) or (found and plausible(pool, scene))
+
+
+def is_exhausted(pool: Pool, scene: Scene, stalled: int) -> bool:
+    """Whether batches keep ending at the best pose, or `stalled` of them in a row did not better it."""
+    return (int(pool.hits[0]) >= SAFE_HITS or stalled >= MOST_STALLED) and plausible(pool, scene)
 
 
 def unique(pool: Pool, scene: Scene) -> bool:
     """Whether many points are matched at a scale at which chance would give few of them a neighbour."""
     _, matched, scale = pool.result[0]
     chance = len(scene.points3d) / scene.solid_angle * math.pi * (2 * float(scale)) ** 2
-    return bool(matched > max(SAFE_MATCHED, 2 * chance))
+    return bool(matched > max(SAFE_MATCHED, OVER_CHANCE * chance))
+
+
+def plausible(pool: Pool, scene: Scene) -> bool:
+    """Whether the residuals are about the spacing of the bearings or less: larger ones say that only a shape fits."""
+    spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.bearings))
+    return float(pool.result[0, 2]) < PLAUSIBLE * spacing
 
 
 def lead(pool: Pool, scene: Scene) -> float:

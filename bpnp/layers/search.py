@@ -14,7 +14,7 @@ from torch import Tensor, nn
 
 from bpnp.geometry import bearings as as_bearings
 from bpnp.layers.annealing import FINE_OUTLIERS, KEPT, RECIPES, finish, run_batch
-from bpnp.layers.pool import Pool, is_safe
+from bpnp.layers.pool import BETTER, Pool, is_exhausted, is_safe, plausible
 from bpnp.layers.scene import Scene, degenerate
 from bpnp.layers.starts import Array, Prior
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -29,6 +29,7 @@ class Candidates(NamedTuple):
     score: mean log-likelihood of the bearings, nats. matched: expected share of min(m, n) that is matched.
     scale: standard deviation of the residuals per axis, radians, at which score and matched were taken.
     stats: iterations are batches of starts; converged where more of them would hardly have changed the best pose.
+    plausible: whether the best pose's residuals are about the spacing of the bearings or less.
     """
 
     rotation: Float[Tensor, "b c 3 3"]
@@ -37,6 +38,7 @@ class Candidates(NamedTuple):
     matched: Float[Tensor, "b c"]
     scale: Float[Tensor, "b c"]
     stats: SolveStats
+    plausible: Bool[Tensor, " b"]
 
 
 def search_candidates(
@@ -148,6 +150,7 @@ class _Found(NamedTuple):
     )  # rotations, translations in scene units, results
     batches: int
     safe: bool
+    plausible: bool = False
 
 
 class _Budget(NamedTuple):
@@ -174,21 +177,25 @@ def _search_pair(
     known = None if prior is None else scene.enter_prior(prior)
     share = FINE_OUTLIERS if clutter is None else max(clutter, LEAST_CLUTTER)
     pool: Pool | None = None
-    batch, safe = 0, False
-    while batch < budget.batches and not safe and budget.spent() < budget.seconds:
+    batch, stalled, best = 0, 0, -math.inf
+    safe = exhausted = False
+    while batch < budget.batches and not (safe or exhausted) and budget.spent() < budget.seconds:
         recipe = RECIPES[batch % len(RECIPES)]
         recipe = recipe if clutter is None else recipe._replace(outliers=share)
         found = run_batch(scene, recipe, known, pool, share)
         pool = found if pool is None else pool.joined(found, KEPT)
-        safe = len(pool.hits) > 0 and is_safe(pool, scene)
+        batch += 1
+        if len(pool.hits):
+            stalled = stalled + 1 if pool.result[0, 0] < best + BETTER else 0
+            best = float(pool.result[0, 0])
+            safe, exhausted = is_safe(pool, scene), is_exhausted(pool, scene, stalled)
         if progress is not None:
             progress(batch, budget.spent())
-        batch += 1
     if pool is None or not len(pool.hits):
         return _Found(None, batch, False)
     pool = finish(scene, pool, share)
     rotation, translation = scene.leave(pool.rotation, pool.translation)
-    return _Found((rotation, translation, pool.result), batch, safe)
+    return _Found((rotation, translation, pool.result), batch, safe, plausible(pool, scene))
 
 
 def _stacked(found: list[_Found], like: Tensor) -> Candidates:
@@ -206,6 +213,6 @@ def _stacked(found: list[_Found], like: Tensor) -> Candidates:
         torch.nan_to_num(scale[:, 0], nan=torch.inf),
         torch.tensor([one.safe for one in found], device=like.device, dtype=torch.bool),
     )
-    return Candidates(
-        torch.as_tensor(rotation).to(like), torch.as_tensor(translation).to(like), score, matched, scale, stats
-    )  # fmt: skip
+    fits = torch.tensor([one.plausible for one in found], device=like.device, dtype=torch.bool)
+    turned, shifted = torch.as_tensor(rotation).to(like), torch.as_tensor(translation).to(like)
+    return Candidates(turned, shifted, score, matched, scale, stats, fits)
