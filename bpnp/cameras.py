@@ -8,7 +8,7 @@ import threading
 
 # zlib has to be loaded before pycolmap (4.2): in the other order zlib.compress and np.savez_compressed abort Python.
 import zlib  # noqa: F401
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Any
@@ -33,7 +33,7 @@ class Pinhole:
 
     def normalise(self, pixels: Array) -> Array:
         """Normalised coordinates (k, 2) of pixels (k, 2)."""
-        return np.linalg.solve(self.matrix[:2, :2], (pixels - self.matrix[:2, 2]).T).T
+        return np.asarray((pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T, np.float64)
 
     def project(self, points: Array) -> Array:
         """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
@@ -94,7 +94,7 @@ def camera_from(given: Any) -> Camera:
         if not {"model", "params"} <= set(given):
             raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(given)}")
         return colmap_camera(str(given["model"]), given["params"])
-    if isinstance(given, Sequence) and len(given) and isinstance(given[0], str):
+    if isinstance(given, (tuple, list)) and len(given) and isinstance(given[0], str):
         if len(given) not in (2, 4):
             raise ValueError(
                 f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(given)} "

@@ -17,6 +17,7 @@ from lightning.pytorch.loggers import CSVLogger
 from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
 from bpnp.commands import convert_weights, prepare
 from bpnp.datamodules.photos import photo_finder
+from bpnp.localization import localize_command, solve_command
 from bpnp.report import report_command, view_command
 from bpnp.report.dashboards import wandb_command
 from bpnp.table import table_command
@@ -24,6 +25,7 @@ from bpnp.task import BlindPnPTask, TrainingDivergedError
 
 DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
 
+Find a pose:             bpnp solve POINTS2D POINTS3D, bpnp localize --model sparse/0
 Train and evaluate:      bpnp {fit,validate,test,predict} --config configs/quickstart.yaml
 Read results:            bpnp report RUN..., bpnp view RUN PAIR, bpnp wandb RUN...
 Compare methods:         bpnp table --data configs/psb.yaml --methods METHOD...
@@ -31,6 +33,8 @@ Prepare data:            bpnp prepare DATASET SOURCE
 Released weights:        bpnp convert-weights FILE OUT
 """
 COMMANDS: dict[str, Callable[[list[str]], None]] = {
+    "solve": solve_command,
+    "localize": localize_command,
     "report": partial(report_command, photos=photo_finder),
     "view": partial(view_command, photos=photo_finder),
     "wandb": wandb_command,

@@ -14,11 +14,11 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # A part imports from parts of its own row and of rows above it.
 ROWS = [
     ["bpnp.geometry", "bpnp.types", "bpnp.cameras"],
-    ["bpnp.layers", "bpnp.losses", "bpnp.metrics", "bpnp.accuracy"],
+    ["bpnp.layers", "bpnp.losses", "bpnp.metrics", "bpnp.accuracy", "bpnp.verdict"],
     ["bpnp.models"],
     ["bpnp.report"],
-    ["bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.api"],
-    ["bpnp.cli", "bpnp.commands", "bpnp.table", "bpnp.__main__"],
+    ["bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.api", "bpnp.solving"],
+    ["bpnp.cli", "bpnp.commands", "bpnp.table", "bpnp.localization", "bpnp.__main__"],
 ]
 ROW = {part: i for i, row in enumerate(ROWS) for part in row}
 MAY_IMPORT_LIGHTNING = (

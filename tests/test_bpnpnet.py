@@ -44,17 +44,24 @@ def test_has_the_parameters_of_the_released_network() -> None:
     assert sum(p.numel() for p in net.parameters()) == 1_992_841
 
 
-def test_gives_an_assignment_and_both_poses() -> None:
+def test_gives_an_assignment_and_all_poses() -> None:
     batch = different_sizes(12, 20, dtype=torch.float32)
     prediction = BPnPNet(**SMALL).eval()(batch)
     assert prediction.assignment.shape == (2, 25, 20)
     assert prediction.assignment_stats.converged.all()
-    assert tuple(prediction.poses) == BPnPNet.estimates == ("ransac", "pnp")
+    assert tuple(prediction.poses) == BPnPNet.estimates == ("ransac", "pnp", "refined")
     for pose in prediction.poses.values():
         assert (pose.rotation.shape, pose.translation.shape) == ((2, 3, 3), (2, 3))
         assert pose.rotation.dtype == torch.float32
     torch.testing.assert_close(prediction.assignment.sum((-2, -1)), torch.ones(2))
     assert not prediction.assignment[~(batch.mask2d.unsqueeze(-1) & batch.mask3d.unsqueeze(1))].any()
+
+
+def test_only_evaluation_refines_and_only_if_asked() -> None:
+    batch = different_sizes(12, 20, dtype=torch.float32)
+    assert tuple(BPnPNet(**SMALL).train()(batch).poses) == ("ransac", "pnp")
+    without = BPnPNet(refine=False, **SMALL).eval()
+    assert tuple(without(batch).poses) == without.estimates == ("ransac", "pnp")
 
 
 def test_without_poses_none_is_solved() -> None:

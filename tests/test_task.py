@@ -114,7 +114,7 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     run = trainer(tmp_path, callbacks=[ResultsWriter()])
     run.test(task, datamodule=module, verbose=False)
     results = read_results(tmp_path / "test")
-    assert len(results.rows) == 7 * 2
+    assert len(results.rows) == 7 * 3
     assert {row.id for row in results.rows} == {pair for batch in module.test_dataloader() for pair in batch.ids}
     logged = float(run.callback_metrics["test/rotation_q2_deg"])
     assert logged == pytest.approx(results.estimates["ransac"]["rotation_q2_deg"], rel=1e-6)
@@ -122,7 +122,7 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     run.predict(task, datamodule=module)
     lines = (tmp_path / "predict" / "poses.csv").read_text().splitlines()
     assert lines[0] == "id,estimate,qw,qx,qy,qz,tx,ty,tz,found,converged"
-    assert len(lines) == 1 + 7 * 2
+    assert len(lines) == 1 + 7 * 3
 
 
 def test_wrong_settings_are_refused() -> None:

@@ -38,6 +38,7 @@ class ImageRecord:
     """quaternion (w, x, y, z) and translation are cam_from_world; keypoints (k, 2) pixels; point_ids (k,), -1: none."""
 
     name: str
+    image_id: int
     camera_id: int
     quaternion: NDArray[np.float64]
     translation: NDArray[np.float64]
@@ -165,11 +166,12 @@ def _binary_cameras(cursor: _Cursor, models: Mapping[int, tuple[str, int]]) -> I
 
 def _binary_images(cursor: _Cursor) -> Iterator[ImageRecord]:
     for _ in cursor.records():
-        _, *pose, camera_id = cursor.take(_IMAGE)
+        image_id, *pose, camera_id = cursor.take(_IMAGE)
         name = cursor.string()
         keypoints = cursor.array(KEYPOINT, cursor.take(_COUNT)[0])
+        quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
         yield ImageRecord(
-            name, camera_id, np.array(pose[:4]), np.array(pose[4:]), keypoints["position"], keypoints["point_id"]
+            name, image_id, camera_id, quaternion, translation, keypoints["position"], keypoints["point_id"]
         )
     cursor.finish()
 
@@ -226,14 +228,13 @@ def _text_camera(line: bytes, models: Mapping[str, int]) -> tuple[int, CameraRec
 
 
 def _text_image(line: bytes, rest: Iterator[bytes]) -> ImageRecord:
-    _, *numbers, camera_id, name = line.split(maxsplit=9)  # a name may have spaces
+    image_id, *numbers, camera_id, name = line.split(maxsplit=9)  # a name may have spaces
     pose = np.array(numbers, dtype=np.float64)
     fields = next(rest).split()
     keypoints = np.array(fields, dtype=np.float64).reshape(-1, 3)[:, :2]
     point_ids = np.array(fields[2::3], dtype=np.int64)
-    return ImageRecord(
-        name.rstrip().decode(errors="backslashreplace"), int(camera_id), pose[:4], pose[4:], keypoints, point_ids
-    )
+    shown = name.rstrip().decode(errors="backslashreplace")
+    return ImageRecord(shown, int(image_id), int(camera_id), pose[:4], pose[4:], keypoints, point_ids)
 
 
 def _text_point(line: bytes, rest: Iterator[bytes]) -> tuple[int, float, float, float]:

@@ -23,10 +23,12 @@ class ImagePoints:
 
     points2d (k, 2) sees the scene's points3d[seen], seen (k,) without repetition. clutter2d (c, 2): the keypoints
     without a 3D point. observed: every 3D point the image has a keypoint of, `seen` and those that were dropped.
-    focal: pixels per unit of normalised coordinates.
+    focal: pixels per unit of normalised coordinates. image_id, camera_id: of the model.
     """
 
     name: str
+    image_id: int
+    camera_id: int
     points2d: NDArray[np.float32]
     seen: NDArray[np.int64]
     clutter2d: NDArray[np.float32]
@@ -139,6 +141,8 @@ def _image_points(
     lost["repeated keypoints"] += len(pair) - len(seen)
     return ImagePoints(
         name=record.name,
+        image_id=record.image_id,
+        camera_id=record.camera_id,
         points2d=undistorted[pair[by_error[first]]].astype(np.float32),
         seen=seen,
         clutter2d=undistorted[~has_point & usable].astype(np.float32),

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
@@ -64,6 +64,20 @@ def parse_mesh(content: bytes, suffix: str) -> Mesh:
     return _parse_off(content) if suffix.lower() == ".off" else _parse_other(content, suffix.lower())
 
 
+def read_vertices(path: Path) -> NDArray[np.float64]:
+    """The points (v, 3) of a cloud in the order of the file, or the different vertices of a mesh.
+
+    Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
+    """
+    content = path.read_bytes()
+    try:
+        if path.suffix.lower() == ".off":
+            return _different(_parse_off(content).vertices)
+        return _vertices(content, path.suffix.lower())
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
 def _parse_off(content: bytes) -> Mesh:
     """The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
 
@@ -104,17 +118,38 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
 
 
 def _parse_other(content: bytes, suffix: str) -> Mesh:
+    mesh = _load(content, suffix)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
+
+
+def _vertices(content: bytes, suffix: str) -> NDArray[np.float64]:
+    vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
+    if not len(vertices):  # as a mesh, a cloud of points is empty
+        vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64).reshape(-1, 3)
+        declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
+        expected = 1 if declared is None else int(declared[1])
+        if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
+            raise MeshError(f"expected {expected} points, got {len(vertices)}")
+    return vertices
+
+
+def _different(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    _, first = np.unique(vertices, axis=0, return_index=True)
+    return vertices[np.sort(first)]
+
+
+def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh") -> Any:
+    """trimesh's mesh, or what it makes of the file."""
     if not content:
         raise MeshError("expected a mesh, got an empty file")
     try:
         # force: one mesh of all parts, each where the scene puts it; process: no search for equal vertices
         file = io.BytesIO(content)
-        mesh = trimesh.load(file, file_type=suffix[1:], force="mesh", process=False, skip_materials=True)
+        return trimesh.load(file, file_type=suffix[1:], force=force, process=False, skip_materials=True)
     except Exception as error:
         raise MeshError(f"expected a {suffix} mesh, got a file that trimesh cannot read ({error})") from error
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
-    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
 
 
 @cache

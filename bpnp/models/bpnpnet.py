@@ -45,6 +45,8 @@ class BPnPNet(nn.Module):
         refine: give a third pose in evaluation, "refined", annealed from the other two without the assignment.
     """
 
+    estimates: tuple[str, ...] = ("ransac", "pnp", "refined")
+
     def __init__(
         self,
         *,
@@ -85,7 +87,8 @@ class BPnPNet(nn.Module):
         )
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
         self.refine = Refine() if refine else None
-        self.estimates = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
+        if not refine:
+            self.estimates = ("ransac", "pnp")
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
         """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"; in evaluation "refined"."""

@@ -13,7 +13,10 @@ NEEDED = ("points2d", "points3d", "rotation", "translation")
 
 @runtime_checkable
 class Solved(Protocol):
-    """What a view needs of a solution: points (m, 2) and (n, 3), pose camera = R p + t, matches (k, 2)."""
+    """What a view needs of a solution: points (m, 2) and (n, 3), pose camera = R p + t, matches (k, 2).
+
+    A 2D point of NaN, which the camera could not undistort, is not drawn.
+    """
 
     @property
     def points2d(self) -> Any: ...
@@ -59,6 +62,14 @@ def _view(parts: dict[str, Any], *, id: str) -> PairView:
     matches = parts.get("matches")
     if matches is not None:
         matches = _array(parts, "matches", (-1, 2)).astype(np.int64) if len(matches) else None
+    finite = np.isfinite(points2d[:, 0]) & np.isfinite(points2d[:, 1])
+    if not finite.all():
+        if not finite.any():
+            raise ValueError("expected finite `points2d`, got none")
+        if matches is not None and matches[:, 0].max() < len(finite):
+            matches = matches[finite[matches[:, 0]]]
+            matches[:, 0] = (np.cumsum(finite) - 1)[matches[:, 0]]
+        points2d = points2d[finite]
     return view_of(points2d, points3d, rotation, translation, matches=matches, id=id)
 
 

@@ -1,0 +1,120 @@
+"""Files of points and cameras, as arrays."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bpnp.datamodules.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
+
+Array = npt.NDArray[np.float64]
+TEXTS = (".csv", ".txt", ".xyz")
+
+
+def read_points(path: Path, width: int | None = None, *, surface: int | None = None, seed: int = 0) -> Array:
+    """The points (k, width) of a file; width None for image points, which have two columns, or three if they are rays.
+
+    .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces, the first line may
+    name them, and # starts a comment; for 3D points also .ply and meshes (.obj, .off, .stl, .glb): their different
+    vertices, or `surface` points drawn from their triangles.
+    Raises ValueError that names the file and what is wrong in it.
+    """
+    if not path.is_file():
+        raise ValueError(f"expected a file of points, got no file {path}")
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES and width == 3:
+        if surface is not None:
+            return sample_surface(read_mesh(path), surface, np.random.default_rng(seed))
+        return read_vertices(path)
+    if surface is not None:
+        raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
+    if suffix == ".npy":
+        points = _npy(path)
+    elif suffix in TEXTS:
+        points = _columns(path)
+    else:
+        known = (".npy", *TEXTS, *(SUFFIXES if width == 3 else ()))
+        raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
+    widths = (2, 3) if width is None else (width,)
+    if points.ndim != 2 or points.shape[1] not in widths:
+        columns = " or ".join(map(str, widths))
+        hint = " (are the two files swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
+        raise ValueError(f"expected points with {columns} columns in {path}, got shape {points.shape}{hint}")
+    return points
+
+
+def read_camera(text: str) -> Any:
+    """The camera that `--camera` names: a file with a 3x3 matrix, or a COLMAP model with its parameters.
+
+    "PINHOLE 500 500 320 240" and "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt) are both
+    understood. Raises ValueError for anything else.
+    """
+    path = Path(text)
+    if path.is_file():
+        return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)
+    words = text.replace(",", " ").split()
+    try:
+        numbers = [float(word) for word in words[1:]]
+    except ValueError:
+        numbers = []
+    if not numbers or not words[0].replace("_", "").isalnum() or words[0][0].isdigit():
+        raise ValueError(
+            f"expected --camera as a file with a 3x3 matrix or as MODEL,PARAMETERS such as SIMPLE_PINHOLE,800,320,240; "
+            f"got {text!r}"
+        )
+    return _described(words[0].upper(), numbers)
+
+
+def _described(model: str, numbers: list[float]) -> tuple[Any, ...]:
+    """With width and height there are two numbers more than the model has parameters."""
+    from bpnp.cameras import camera_models
+
+    count = dict(camera_models().values()).get(model)
+    if count is not None and len(numbers) == count + 2:
+        return model, *numbers[:2], numbers[2:]
+    return model, numbers
+
+
+def _npy(path: Path) -> Array:
+    try:
+        array = np.load(path, allow_pickle=False)
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
+            raise ValueError(f"{type(array).__name__} of {getattr(array, 'dtype', 'no numbers')}")
+        return array.astype(np.float64)
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"expected an array of numbers in {path}, got {error}") from error
+
+
+def _columns(path: Path) -> Array:
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (UnicodeDecodeError, OSError) as error:
+        raise ValueError(f"expected text with numbers in {path}, got {error}") from error
+    rows: list[list[float]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        content = line.partition("#")[0].strip()
+        if not content:
+            continue
+        separator = next((mark for mark in (",", ";") if mark in content), None)
+        words = content.split(separator)
+        try:
+            row = [float(word) for word in words]
+        except ValueError:
+            if not rows and not any(_is_number(word) for word in words):
+                continue  # names of the columns
+            raise ValueError(f"expected numbers in line {number} of {path}, got {line[:60]!r}") from None
+        if rows and len(row) != len(rows[0]):
+            raise ValueError(f"expected {len(rows[0])} numbers in line {number} of {path}, got {len(row)}")
+        rows.append(row)
+    if not rows:
+        raise ValueError(f"expected lines of numbers in {path}, got none")
+    return np.array(rows)
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True

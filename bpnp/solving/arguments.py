@@ -1,0 +1,76 @@
+"""The arguments of `solve_many`, one entry a pair. Every function raises ValueError for what is not usable."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import nn
+
+from bpnp.cameras import Camera, camera_from
+from bpnp.models import BPnPNet
+
+
+def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
+    """The module that solves, None for the search."""
+    if isinstance(solver, nn.Module):
+        return solver
+    if solver == "search":
+        return None
+    if isinstance(solver, Path) or Path(str(solver)).suffix or Path(str(solver)).is_file():
+        return BPnPNet.from_checkpoint(solver)
+    raise ValueError(f'expected `solver` "search", a module from Batch to Prediction, or a checkpoint, got {solver!r}')
+
+
+def device_from(wanted: str | torch.device | None, module: nn.Module | None) -> torch.device:
+    """The wanted device, or that of the module."""
+    if wanted is None:
+        parameter = None if module is None else next(module.parameters(), None)
+        return torch.device("cpu") if parameter is None else parameter.device
+    try:
+        device = torch.device(wanted)
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:
+        raise ValueError(f"expected a `device` of this machine, got {wanted}: {str(error).splitlines()[0]}") from error
+    return device
+
+
+def each_set(name: str, values: Any, size: int | None) -> list[Any]:
+    """The arrays of the pairs; one array (n, 3) is shared by all where their number is known."""
+    if isinstance(values, (np.ndarray, torch.Tensor)):
+        if values.ndim == 2 and size is not None:
+            return [values] * size
+        if values.ndim != 3:
+            raise ValueError(f"expected `{name}` as a sequence of arrays, one a pair, got shape {tuple(values.shape)}")
+    try:
+        found = list(values)
+    except TypeError as error:
+        raise ValueError(f"expected `{name}` as a sequence of arrays, one a pair, got {values!r:.60}") from error
+    if not found or (size is not None and len(found) != size):
+        wanted = "one array a pair" if size is None else f"{size} arrays as in `points2d`"
+        raise ValueError(f"expected {wanted} in `{name}`, got {len(found)}")
+    return found
+
+
+def each_of(name: str, given: Any, size: int) -> list[Any]:
+    """A list has one each; anything else is for all."""
+    if not isinstance(given, list):
+        return [given] * size
+    if len(given) != size:
+        raise ValueError(f"expected {size} of `{name}`, one a pair, got {len(given)}")
+    return given
+
+
+def each_camera(given: Any, size: int) -> list[Camera | None]:
+    """One camera for all, or a list or stack of them. A 3x3 matrix as a list of lists is one camera."""
+    return [None if one is None else camera_from(one) for one in _each_given_camera(given, size)]
+
+
+def _each_given_camera(given: Any, size: int) -> list[Any]:
+    if isinstance(given, (np.ndarray, torch.Tensor)) and given.ndim == 3:
+        given = list(given)
+    if isinstance(given, list) and given and np.ndim(given[0]) == 1 and not isinstance(given[0], (tuple, str)):
+        return [given] * size
+    if isinstance(given, list) and given and isinstance(given[0], str):
+        return [tuple(given)] * size
+    return each_of("camera", given, size)

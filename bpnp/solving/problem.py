@@ -1,0 +1,177 @@
+"""One problem from a user's arrays: checked, undistorted, and with the plane in which its residuals are measured."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+import torch
+
+from bpnp.cameras import Camera, in_front
+
+Array = npt.NDArray[np.float64]
+Unit = Literal["px", "normalised", "rad"]
+FEWEST = 4
+FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
+FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
+UNIT_NORM = 1e-3
+WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
+INSIDE_ONE_PIXEL = 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """k usable of m given 2D points, and n 3D points.
+
+    bearings: (k, 3) unit. usable: (k,) their places among the given. image: (k, d) the usable points where residuals
+    are measured, in `unit`: pixels with a camera, else the normalised image plane, or the unit sphere for bearings.
+    points2d: (m, 2) normalised, NaN for a point that has no such coordinates. points3d: (n, 3) as given. origin: where
+    solvers put the scene's origin, for scenes so far from it that float32 would lose digits. degenerate: why no pose
+    can follow from these points, if so.
+    """
+
+    bearings: Array
+    usable: npt.NDArray[np.int64]
+    image: Array
+    unit: Unit
+    points2d: Array
+    points3d: Array
+    origin: Array
+    camera: Camera | None
+    degenerate: str | None
+
+    @property
+    def local3d(self) -> Array:
+        """The 3D points around `origin`."""
+        return self.points3d - self.origin
+
+    @property
+    def per_radian(self) -> float:
+        """Units of `image` a radian, at the median point: a plane stretches by (1 + r^2)^(3/4) at the distance r."""
+        if self.unit == "rad":
+            return 1.0
+        stretch = (1 + (self.points2d[self.usable] ** 2).sum(-1)) ** 0.75
+        return float(np.median(stretch) * (1.0 if self.camera is None else self.camera.focal))
+
+    def project(self, rotation: Array, translation: Array, points: Array) -> Array:
+        """Where points (p, 3) around `origin` are seen, in the coordinates of `image`; NaN if they cannot be."""
+        camera = points @ rotation.T + translation
+        if self.unit == "px" and self.camera is not None:
+            return self.camera.project(camera)
+        if self.unit == "normalised":
+            return in_front(camera)[:, :2]
+        length = np.linalg.norm(camera, axis=-1, keepdims=True)
+        return np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
+
+
+def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: str = "") -> Problem:
+    """Check the arrays of one pair.
+
+    points2d: (m, 2) pixels with a camera, normalised coordinates or (m, 3) unit bearings without; points3d (n, 3).
+    where: added to the errors, to name the pair. Pixels that cannot be undistorted are left out of `usable`.
+    Raises ValueError that names the argument: wrong shape, swapped, fewer than 4 points, NaN, pixels without a camera
+    or the reverse.
+    """
+    given2d, given3d = _numbers("points2d", points2d, where), _numbers("points3d", points3d, where)
+    if given2d.ndim == 2 and given2d.shape[1] == 3 and (camera is not None or given3d.shape[-1:] == (2,)):
+        what = (
+            "pixels `points2d` of shape (m, 2) with a `camera`" if camera is not None else "`points3d` of shape (n, 3)"
+        )
+        wrong = given2d if camera is not None else given3d
+        raise ValueError(f"expected {what}{where}, got {wrong.shape} (are points2d and points3d swapped?)")
+    _check_points("points2d", given2d, (2, 3) if camera is None else (2,), where)
+    _check_points("points3d", given3d, (3,), where)
+    if given2d.shape[1] == 3:
+        image, unit = _unit(given2d, where), "rad"
+        bearings, plane = image, in_front(image)[:, :2]
+    else:
+        image, unit = given2d, "normalised" if camera is None else "px"
+        plane = _plane(given2d, camera, where)
+        rays = np.column_stack([plane, np.ones(len(plane))])
+        bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    usable = np.flatnonzero(np.isfinite(bearings).all(-1))
+    if len(usable) < FEWEST:
+        raise ValueError(
+            f"expected {FEWEST} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
+        )
+    return Problem(
+        bearings=bearings[usable],
+        usable=usable,
+        image=image[usable],
+        unit=unit,  # type: ignore[arg-type]
+        points2d=plane,
+        points3d=given3d,
+        origin=_origin(given3d),
+        camera=camera,
+        degenerate=_degenerate(bearings[usable], given3d),
+    )
+
+
+def _numbers(name: str, values: Any, where: str) -> Array:
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().double().numpy() if not values.is_complex() else values.numpy()
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"{array.dtype}")
+        return array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
+
+
+def _check_points(name: str, points: Array, widths: tuple[int, ...], where: str) -> None:
+    if points.ndim != 2 or points.shape[1] not in widths:
+        shapes = " or ".join(f"(k, {width})" for width in widths)
+        swapped = points.ndim == 2 and points.shape[1] in (2, 3)
+        hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
+        raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
+    if len(points) < FEWEST:
+        raise ValueError(f"expected {FEWEST} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
+    bad = np.flatnonzero(~np.isfinite(points).all(-1))
+    if len(bad):
+        raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
+
+
+def _unit(rays: Array, where: str) -> Array:
+    length = np.linalg.norm(rays, axis=-1, keepdims=True)
+    if np.abs(length - 1).max() > UNIT_NORM:
+        worst = float(length[np.abs(length - 1).argmax(), 0])
+        raise ValueError(
+            f"expected unit bearings in `points2d` of shape (m, 3){where}, got one of length {worst:g} (are points2d "
+            "and points3d swapped?); try points2d of shape (m, 2), or to divide by the lengths"
+        )
+    return rays / length
+
+
+def _plane(given: Array, camera: Camera | None, where: str) -> Array:
+    if camera is None:
+        if np.median(np.linalg.norm(given, axis=-1)) > WIDEST:
+            raise ValueError(
+                f"expected normalised image coordinates without a `camera`{where}, got values up to "
+                f"{np.abs(given).max():g}, which look like pixels; try camera=K"
+            )
+        return given
+    if np.abs(given).max() < INSIDE_ONE_PIXEL and camera.focal > 100:
+        raise ValueError(
+            f"expected pixels with a `camera`{where}, got values up to {np.abs(given).max():g}, which look normalised; "
+            "try without the camera"
+        )
+    return camera.normalise(given)
+
+
+def _origin(points3d: Array) -> Array:
+    """The median of the points if they are far from the origin, else the origin."""
+    median = np.median(points3d, axis=0)
+    extent = np.median(np.linalg.norm(points3d - median, axis=-1))
+    return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
+
+
+def _degenerate(bearings: Array, points3d: Array) -> str | None:
+    for name, points in (("2D", bearings), ("3D", points3d)):
+        count = len(np.unique(points, axis=0))
+        if count < FEWEST:
+            return f"only {count} different {name} point{'s' if count > 1 else ''}: {FEWEST} or more fix a pose"
+    extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
+    if extents[1] <= FLAT * extents[0]:
+        return "the 3D points lie on one line: the camera can turn about it"
+    return None

@@ -1,0 +1,153 @@
+"""What `bpnp.solve` returns, and its JSON file."""
+
+import json
+import math
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import numpy.typing as npt
+
+from bpnp.solving.problem import Unit
+
+Array = npt.NDArray[np.float64]
+Verdict = Literal["confident", "ambiguous", "failed"]
+FORMAT = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A distinct pose that was found, camera = R p + t, with its score (mean log-likelihood of the bearings, nats;
+    larger is better) and its number of one-to-one inliers (paper Eq. 1)."""
+
+    rotation: Array
+    translation: Array
+    score: float
+    inlier_count: int
+
+    @property
+    def centre(self) -> Array:
+        """Centre of the camera in the scene, -R^T t."""
+        return -self.rotation.T @ self.translation
+
+
+@dataclass(frozen=True)
+class SolutionStats:
+    """How the search went: rounds (batches of starts), what it left as residual, whether it stopped by itself because
+    the evidence was safe, and how many 2D points could not be undistorted and were left out."""
+
+    iterations: int = 0
+    residual: float = math.nan
+    converged: bool = False
+    dropped2d: int = 0
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """The pose of one pair of point sets, camera = R p + t; without a pose NaN, no matches and the verdict "failed".
+
+    rotation: (3, 3). translation: (3,), scene units.
+    matches: (k, 2) places of a 2D and of a 3D point in the arrays that were given; no point is in two of them.
+    inlier_count: how many matches there are within `inlier_threshold` (paper Eq. 1), inlier_ratio: of min(m, n).
+    inlier_threshold, reprojection_error: in `unit`, pixels with a camera, else normalised image units, or radians for
+        bearings; the error is the mean over the matches. reprojection_error_deg: the mean angle.
+    candidates: the distinct poses that were found, best first; the first is this one.
+    verdict: "confident"; "ambiguous", other poses explain the points about as well; "failed", this pose, if there is
+        one, is a guess. reason: why, in words.
+    seconds: for this pair; a share of the time where many were solved together.
+    points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
+    """
+
+    rotation: Array
+    translation: Array
+    matches: npt.NDArray[np.int64]
+    inlier_count: int
+    inlier_ratio: float
+    inlier_threshold: float
+    reprojection_error: float
+    reprojection_error_deg: float
+    unit: Unit
+    candidates: tuple[Candidate, ...]
+    verdict: Verdict
+    reason: str
+    stats: SolutionStats
+    seconds: float
+    points2d: Array = field(repr=False)
+    points3d: Array = field(repr=False)
+
+    @property
+    def centre(self) -> Array:
+        """Centre of the camera in the scene, -R^T t."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def found(self) -> bool:
+        """Whether there is a pose at all; see `verdict` for whether to trust it."""
+        return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
+
+    def to_json(self) -> str:
+        """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""
+        content: dict[str, Any] = {"format": FORMAT}
+        content |= {f.name: getattr(self, f.name) for f in fields(self)} | {"centre": self.centre}
+        content["candidates"] = [vars(candidate) for candidate in self.candidates]
+        content["stats"] = vars(self.stats)
+        if not self.found:
+            content |= dict.fromkeys(POSE)
+        return json.dumps(_plain(content), allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str | bytes | Path) -> "Solution":
+        """The solution of `to_json`, or of a file with it. Raises ValueError for anything else."""
+        name = f" in {text}" if isinstance(text, Path) else ""
+        try:
+            content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
+            if content["format"] != FORMAT:
+                raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
+            known = {f.name: content[f.name] for f in fields(cls)}
+            candidates = tuple(
+                Candidate(_array(c["rotation"], 3, 3), _array(c["translation"], 3), c["score"], c["inlier_count"])
+                for c in known["candidates"]
+            )
+            if known["verdict"] not in get_args(Verdict):
+                raise ValueError(f"verdict {known['verdict']!r}")
+            return cls(
+                **known
+                | {"candidates": candidates, "stats": SolutionStats(**_numbers(known["stats"]))}
+                | {key: _array(known[key], *shape) for key, shape in SHAPES.items()}
+                | {"matches": np.array(known["matches"], np.int64).reshape(-1, 2)}
+                | _numbers(
+                    {key: known[key] for key in ("inlier_threshold", "reprojection_error", "reprojection_error_deg")}
+                )
+            )
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
+
+
+POSE = ("rotation", "translation", "centre")
+SHAPES = {"rotation": (3, 3), "translation": (3,), "points2d": (-1, 2), "points3d": (-1, 3)}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return _plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _array(values: Any, *shape: int) -> Array:
+    return np.full(shape, math.nan) if values is None else np.array(values, np.float64).reshape(shape)
+
+
+def _numbers(values: dict[str, Any]) -> dict[str, Any]:
+    return {key: math.nan if value is None else value for key, value in values.items()}
+
+
+def no_pose() -> tuple[Array, Array]:
+    """The pose of a pair without one."""
+    return np.full((3, 3), math.nan), np.full(3, math.nan)

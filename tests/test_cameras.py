@@ -1,0 +1,77 @@
+"""Pixels and rays of every kind of camera, against pycolmap and OpenCV."""
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from bpnp.cameras import camera_from
+
+K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
+OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
+RAYS = np.random.default_rng(0).uniform((-0.6, -0.5, 1), (0.6, 0.5, 1), (50, 3))
+
+
+@pytest.mark.parametrize("given", [K, K.tolist(), torch.tensor(K), 2 * K, K.astype(np.float32)])
+def test_a_matrix_is_the_projection_of_opencv(given: object) -> None:
+    camera = camera_from(given)
+    expected = (RAYS @ K.T)[:, :2]
+    np.testing.assert_allclose(camera.project(3.5 * RAYS), expected, rtol=1e-6)
+    np.testing.assert_allclose(camera.normalise(expected), RAYS[:, :2], atol=1e-6)
+    assert camera.focal == pytest.approx(np.sqrt(520 * 500), rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        OPENCV,
+        ("OPENCV", 800, 600, OPENCV[1]),
+        {"model": "OPENCV", "params": OPENCV[1], "width": 800, "height": 600},
+        pycolmap.Camera(model="OPENCV", width=800, height=600, params=OPENCV[1]),
+    ],
+)
+def test_a_lens_is_undone_and_applied_as_in_opencv(given: object) -> None:
+    camera = camera_from(given)
+    fx, fy, cx, cy, *distortion = OPENCV[1]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    expected, _ = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, np.array(distortion))
+    np.testing.assert_allclose(camera.project(2 * RAYS), expected[:, 0], atol=1e-6)
+    np.testing.assert_allclose(camera.normalise(expected[:, 0]), RAYS[:, :2], atol=1e-6)
+    assert camera.focal == pytest.approx(510)
+
+
+@pytest.mark.parametrize("given", [K, OPENCV])
+def test_nothing_is_seen_behind_the_camera(given: object) -> None:
+    pixels = camera_from(given).project(np.array([[0.1, 0.1, 1.0], [0.1, 0.1, -1.0], [0.1, 0.1, 0.0]]))
+    assert np.isfinite(pixels).all(-1).tolist() == [True, False, False]
+
+
+def test_pixels_that_no_ray_reaches_are_none() -> None:
+    """A fisheye pixel 600 from the centre at 300 pixels a radian looks backwards."""
+    camera = camera_from(("OPENCV_FISHEYE", [300.0, 300.0, 400.0, 300.0, 0.0, 0.0, 0.0, 0.0]))
+    found = camera.normalise(np.array([[400.0, 300.0], [1000.0, 300.0]]))
+    assert np.isfinite(found).all(-1).tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (np.diag([500.0, 0.0, 1.0]), "invertible `camera` matrix"),
+        (np.ones((3, 3)), r"last row \(0, 0, 1\)"),
+        (np.array([[500.0, 0, 0], [0, np.nan, 0], [0, 0, 1]]), "finite `camera` matrix"),
+        (np.eye(4), r"shape \(3, 3\)"),
+        ("PINHOLE", "expected `camera` as a 3x3 matrix"),
+        (object(), "expected `camera` as a 3x3 matrix"),
+        (("PINHOL", [1.0]), "COLMAP camera model among .*got 'PINHOL'"),
+        (("PINHOLE", [500.0, 500.0, 320.0]), "4 parameters of a PINHOLE camera"),
+        (("PINHOLE", [500.0, 500.0, np.inf, 240.0]), "finite parameters"),
+        (("PINHOLE", [0.0, 0.0, 320.0, 240.0]), "positive focal length"),
+        (("PINHOLE", 640, [1.0]), "got 3 values"),
+        (("PINHOLE", "wide"), "as numbers"),
+        ({"model": "PINHOLE"}, "`model` and `params`"),
+    ],
+)
+def test_a_broken_camera_is_refused(given: object, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        camera_from(given)

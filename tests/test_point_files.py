@@ -1,0 +1,121 @@
+"""Files of points and cameras, against what was written into them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from bpnp.localization.point_files import read_camera, read_points
+
+POINTS = np.random.default_rng(0).normal(size=(20, 3))
+
+
+def rows(points: np.ndarray, separator: str) -> str:
+    return "\n".join(separator.join(map(repr, row)) for row in points.tolist())
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.csv", "x,y,z\n" + rows(POINTS, ",")),
+        ("a.csv", "\ufeff" + rows(POINTS, ", ")),
+        ("a.csv", rows(POINTS, ";") + "\r\n\r\n"),
+        ("a.txt", "# X Y Z\n\n" + rows(POINTS, " ")),
+        ("a.txt", rows(POINTS, "\t") + " # last"),
+        ("a.xyz", rows(POINTS, "  ")),
+    ],
+)
+def test_columns_of_text(name: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text, encoding="utf-8")
+    np.testing.assert_array_equal(read_points(tmp_path / name, 3), POINTS)
+    np.testing.assert_array_equal(read_points(tmp_path / name), POINTS)
+
+
+def test_arrays_of_numpy(tmp_path: Path) -> None:
+    for dtype in (np.float32, np.float64, np.int32, ">f8"):
+        np.save(tmp_path / "a.npy", POINTS.astype(dtype))
+        np.testing.assert_array_equal(read_points(tmp_path / "a.npy", 3), POINTS.astype(dtype).astype(np.float64))
+    np.save(tmp_path / "a.npy", POINTS[:, :2])
+    assert read_points(tmp_path / "a.npy").shape == (20, 2)
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_a_cloud_keeps_its_order(encoding: str, tmp_path: Path) -> None:
+    cloud = np.concatenate([POINTS, POINTS[:2]]).astype(np.float32)
+    (tmp_path / "cloud.ply").write_bytes(trimesh.PointCloud(cloud).export(file_type="ply", encoding=encoding))
+    np.testing.assert_allclose(read_points(tmp_path / "cloud.ply", 3), cloud, atol=1e-6)
+
+
+@pytest.mark.parametrize("suffix", [".off", ".ply", ".obj", ".stl", ".glb"])
+def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) -> None:
+    box = trimesh.creation.box(extents=(2, 4, 6))
+    box.export(tmp_path / f"box{suffix}")
+    corners = read_points(tmp_path / f"box{suffix}", 3)
+    assert {tuple(corner) for corner in corners.tolist()} == {
+        (x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)
+    }
+    assert len(corners) == 8
+    surface = read_points(tmp_path / f"box{suffix}", 3, surface=500, seed=1)
+    assert surface.shape == (500, 3)
+    np.testing.assert_allclose((np.abs(surface) / [1, 2, 3]).max(-1), 1, atol=1e-6)
+    assert (read_points(tmp_path / f"box{suffix}", 3, surface=500, seed=1) == surface).all()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.csv", b"1,2,3\n4,5\n", "3 numbers in line 2 of .*a.csv, got 2"),
+        ("a.csv", b"1,2,3\n4,,6\n", "numbers in line 2"),
+        ("a.csv", b"1,2,3\nx,y,z\n", "numbers in line 2"),
+        ("a.csv", b"", "lines of numbers in .*a.csv, got none"),
+        ("a.csv", b"x,y,z\n", "lines of numbers"),
+        ("a.csv", b"1,2\n3,4\n", r"3 columns in .*got shape \(2, 2\) \(are the two files swapped\?\)"),
+        ("a.csv", b"1,2,3,4\n", r"3 columns in .*got shape \(1, 4\)"),
+        ("a.txt", b"\xff\xfe\x00", "text with numbers"),
+        ("a.npy", b"not numpy", "array of numbers in .*a.npy"),
+        ("a.npy", b"", "array of numbers in .*a.npy"),
+        ("a.jpg", b"", "a file that ends in .npy, .csv, .txt, .xyz, .glb, .obj, .off, .ply, .stl"),
+        ("a.ply", b"", "a.ply: expected a mesh, got an empty file"),
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+                  b"end_header\n0 0 0\n1 1 1\n", "a.ply: expected 4 points, got 2"),
+        ("a.stl", b"no mesh", "a.stl: expected"),
+        ("a.off", b"OFF\n3 1 0\n0 0 0\n", "truncated"),
+    ],
+)  # fmt: skip
+def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(ValueError, match=message):
+        read_points(tmp_path / name, 3)
+
+
+def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="got no file .*nowhere.npy"):
+        read_points(tmp_path / "nowhere.npy", 3)
+    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object))
+    with pytest.raises(ValueError, match="array of numbers"):
+        read_points(tmp_path / "a.npy", 3)
+    np.save(tmp_path / "a.npy", POINTS)
+    with pytest.raises(ValueError, match="a mesh to draw 9 points from"):
+        read_points(tmp_path / "a.npy", 3, surface=9)
+    trimesh.creation.box().export(tmp_path / "a.ply")
+    with pytest.raises(ValueError, match="ends in .npy, .csv, .txt, .xyz, got"):
+        read_points(tmp_path / "a.ply")
+
+
+def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
+    matrix = np.array([[500.0, 0, 320], [0, 510, 240], [0, 0, 1]])
+    np.save(tmp_path / "k.npy", matrix)
+    (tmp_path / "k.txt").write_text(rows(matrix, " "))
+    for name in ("k.npy", "k.txt"):
+        np.testing.assert_array_equal(read_camera(str(tmp_path / name)), matrix)
+    params = [500.0, 510.0, 320.0, 240.0]
+    assert read_camera("PINHOLE,500,510,320,240") == ("PINHOLE", params)
+    assert read_camera("pinhole 500 510 320 240") == ("PINHOLE", params)
+    assert read_camera("PINHOLE 640 480 500 510 320 240") == ("PINHOLE", 640.0, 480.0, params)
+
+
+@pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
+def test_what_is_no_camera_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="expected --camera as a file"):
+        read_camera(text)

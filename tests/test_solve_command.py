@@ -1,0 +1,169 @@
+"""`bpnp solve` on planted problems: files in, JSON, table and picture out; a mistake is one line."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+from planted import plant
+from rich.progress import Progress
+from scipy.spatial.transform import Rotation
+
+from bpnp import Solution
+from bpnp.cli import main
+from bpnp.localization import slow_progress
+from bpnp.localization.slow_progress import SlowProgress
+from bpnp.report.pictures import solution_picture
+
+PLANTED = plant(1, 40, seed=2)
+X, P = PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy()
+CAMERA = ["--camera", "SIMPLE_PINHOLE,800,320,240"]
+
+
+def write(folder: Path, points2d: np.ndarray = X, points3d: np.ndarray = P) -> list[str]:
+    np.savetxt(folder / "x.csv", points2d, delimiter=",", header="x,y", comments="")
+    np.save(folder / "p.npy", points3d)
+    return [str(folder / "x.csv"), str(folder / "p.npy")]
+
+
+def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(["solve", *arguments])
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "Traceback" not in error
+    assert len(error.strip().splitlines()) == 1
+    return error
+
+
+def test_files_become_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = write(tmp_path, 800 * X + [320, 240])
+    output, picture = tmp_path / "out" / "result.json", tmp_path / "out" / "result.png"
+    main(["solve", *files, *CAMERA, "--output", str(output), "--picture", str(picture)])
+    shown = capsys.readouterr().out
+    assert "confident" in shown
+    assert "40 of 40 (100.0 %)" in shown
+    solution = Solution.from_json(output)
+    np.testing.assert_allclose(solution.rotation, PLANTED.rotation[0], atol=1e-8)
+    np.testing.assert_allclose(solution.translation, PLANTED.translation[0], atol=1e-8)
+    assert solution.unit == "px"
+    assert Image.open(picture).size[0] > 500
+    main(["view", str(output), "--output", str(tmp_path / "view.png")])
+    assert (tmp_path / "view.png").stat().st_size > 5000
+
+
+def test_json_is_all_that_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    main(["solve", *write(tmp_path), "--json", "--seed", "3", "--inlier_threshold", "0.01", "--time_limit", "60"])
+    content = json.loads(capsys.readouterr().out)
+    assert content["verdict"] == "confident"
+    assert content["inlier_threshold"] == 0.01
+    assert len(content["matches"]) == 40
+    np.testing.assert_allclose(content["centre"], -PLANTED.rotation[0].mT @ PLANTED.translation[0], atol=1e-8)
+
+
+def test_a_mesh_is_found_by_its_corners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An L-shaped solid has no symmetry that a camera could not tell."""
+    rng = np.random.default_rng(0)
+    mesh = trimesh.util.concatenate([
+        trimesh.creation.box(extents=extents).apply_translation(shift)
+        for extents, shift in zip(rng.uniform(0.3, 1, (6, 3)), rng.uniform(-2, 2, (6, 3)), strict=True)
+    ])  # fmt: skip
+    mesh.export(tmp_path / "solid.stl")
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, 0.2, 8.0])
+    camera = np.unique(mesh.vertices, axis=0) @ rotation.T + translation
+    np.save(tmp_path / "x.npy", (camera[:, :2] / camera[:, 2:])[rng.permutation(len(camera))])
+    main(["solve", str(tmp_path / "x.npy"), str(tmp_path / "solid.stl"), "--json"])
+    content = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(content["rotation"], rotation, atol=1e-4)
+
+
+def test_a_pose_without_trust_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = write(tmp_path, X, np.outer(P[:, 0], [1.0, 2.0, 3.0]))
+    main(["solve", *files, "--output", str(tmp_path / "r.json"), "--picture", str(tmp_path / "r.svg")])
+    assert "failed: the 3D points lie on one line" in " ".join(capsys.readouterr().out.split())
+    assert json.loads((tmp_path / "r.json").read_text())["rotation"] is None
+    assert "<svg" in (tmp_path / "r.svg").read_text()
+
+
+def test_a_rough_pose_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rotation, translation = (value[0].tolist() for value in PLANTED.near(0.05))
+    (tmp_path / "rough.json").write_text(json.dumps({"rotation": rotation, "translation": translation}))
+    rough = ["--prior", str(tmp_path / "rough.json"), "--prior-degrees", "5", "--prior-distance", "0.2"]
+    main(["solve", *write(tmp_path), "--json", *rough])
+    np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda files: files[::-1], "are the two files swapped?"),
+        (lambda files: [files[0], "nowhere.npy"], "got no file nowhere.npy"),
+        (lambda files: [*files, *CAMERA], "look normalised"),
+        (lambda files: [*files, "--camera", "PINHOLE,1"], "4 parameters of a PINHOLE camera"),
+        (lambda files: [*files, "--camera", "nonsense"], "--camera as a file with a 3x3 matrix"),
+        (lambda files: [*files, "--solver", "search2"], "expected `solver`"),
+        (lambda files: [*files, "--solver", "nothing.ckpt"], "nothing.ckpt"),
+        (lambda files: [*files, "--prior", "nothing.json"], "nothing.json"),
+        (lambda files: [*files, "--time-limit", "0"], "positive `time_limit`"),
+        (lambda files: [*files, "--surface", "100"], "a mesh to draw 100 points from"),
+        (lambda files: [*files, "--picture", "a.jpeg"], "--picture that ends in .png, .svg, .pdf"),
+        (lambda files: [*files, "--device", "tpu9"], "`device` of this machine"),
+    ],
+)
+def test_a_mistake_is_one_line(change, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert message in fails(change(write(tmp_path)), capsys)
+
+
+def test_bad_points_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for points2d, points3d, message in (
+        (X[:3], P, "4 or more points in `points2d`, got 3"),
+        (X, np.where(np.arange(40)[:, None] == 7, np.nan, P), "finite `points3d`"),
+        (500 * X, P, "look like pixels"),
+    ):
+        assert message in fails(write(tmp_path, points2d, points3d), capsys)
+
+
+def test_an_unwritable_output_is_known_before_the_search(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("bpnp.localization.from_files.solve", None)
+    (tmp_path / "file").write_text("")
+    assert "file" in fails([*write(tmp_path), "--output", str(tmp_path / "file" / "r.json")], capsys)
+
+
+def test_an_interruption_is_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("bpnp.localization.from_files.solve", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        main(["solve", *write(tmp_path)])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "bpnp: interrupted\n"
+
+
+def test_progress_is_shown_only_where_it_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
+    started: list[str] = []
+    monkeypatch.setattr(Progress, "start", lambda _: started.append("shown"))
+    for patience, expected in ((1000.0, []), (0.0, ["shown"])):
+        monkeypatch.setattr(slow_progress, "PATIENCE", patience)
+        with SlowProgress("searching") as progress:
+            progress.describe("on it")
+            if not patience:
+                progress._timer.join(10)
+        assert started == expected
+
+
+def test_the_picture_shows_every_match(tmp_path: Path) -> None:
+    main(["solve", *write(tmp_path), "--output", str(tmp_path / "r.json"), "--json"])
+    figure = solution_picture(Solution.from_json(tmp_path / "r.json"), title="a $ sign")
+    (segments,) = figure.axes[0].collections
+    ends = np.stack(segments.get_segments())
+    assert ends.shape == (40, 2, 2)
+    np.testing.assert_allclose(ends[:, 0], X[np.lexsort(X.T)][np.argsort(np.lexsort(X.T))], atol=1e-9)
+    np.testing.assert_allclose(ends[:, 0], ends[:, 1], atol=1e-7)
+    assert figure.get_suptitle().startswith("a \\$ sign\nconfident: 40 matches (100 %)")
