@@ -60,7 +60,7 @@ def test_neighbours_padding_and_batch_size_do_not_matter(problem):
 
 def test_the_seed_decides(problem):
     first, second = (search_candidates(problem.bearings[:1], problem.points3d[:1], seed=3) for _ in range(2))
-    for a, b in zip(first[:-1], second[:-1], strict=True):
+    for a, b in zip(first[:5], second[:5], strict=True):
         torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
 
 

@@ -2,7 +2,7 @@
 
 `bpnp.layers.alignment` states the mathematics and is the same algorithm in torch, for other devices. Arrays are
 float32 and coordinate-major, (3, m) bearings and (3, n) points, so that loops over points vectorise. The starts are
-independent of each other: the result does not depend on the number of threads.
+independent of each other. One thread: numba's pools do not survive the fork of a loader's workers.
 """
 
 import inspect
@@ -21,11 +21,6 @@ LARGEST_TURN = 0.5  # radians in one step
 def compiled(function: Callable[..., Any]) -> Any:
     """Compile for the CPU, without the wrappers that a type checker puts around a function when it is imported."""
     return numba.njit(inspect.unwrap(function), **COMPILE)
-
-
-def compiled_parallel(function: Callable[..., Any]) -> Any:
-    """The same, with `numba.prange` over all cores."""
-    return numba.njit(inspect.unwrap(function), parallel=True, **COMPILE)
 
 
 @compiled
@@ -214,7 +209,7 @@ def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scal
     return likelihood / total_a
 
 
-@compiled_parallel
+@compiled
 def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
             relaxation: Any, score: Any) -> None:  # fmt: skip
     """Anneal every start (S, 3, 3), (S, 3) in place; score (S,) is the likelihood at the last scale, -inf if lost.
@@ -222,7 +217,7 @@ def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, sca
     outlier: o / s^2 of `alignment.outlier_density`.
     """
     m, n = f.shape[1], p.shape[1]
-    for k in numba.prange(len(rotation)):
+    for k in range(len(rotation)):
         kernel, row, q = np.empty((n, m), F), np.empty(m, F), np.empty((3, n), F)
         hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)
         for scale in scales:

@@ -7,11 +7,10 @@ neighbours within three scales, not O(m n). Arrays are float32 and coordinate-ma
 import math
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.layers.kernels import F, compiled, compiled_parallel, move
+from bpnp.layers.kernels import F, compiled, move
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
 CAPACITY = 96  # neighbours kept of a point
@@ -134,7 +133,7 @@ def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any
     return likelihood / F(m), matched / F(min(m, n))
 
 
-@compiled_parallel
+@compiled
 def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, sweeps: int,
                    relaxation: Any, patience: int, result: Any) -> None:  # fmt: skip
     """Anneal every start (S, 3, 3), (S, 3) in place to the scale that explains the bearings best.
@@ -143,7 +142,7 @@ def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: A
     result (S, 3): likelihood, matched share and scale there; -inf, 0, 0 where the points do not fix the pose.
     """
     m, n = grid[0].shape[1], p.shape[1]
-    for k in numba.prange(len(rotation)):
+    for k in range(len(rotation)):
         index, kernel, count = np.empty((n, CAPACITY), np.int32), np.empty((n, CAPACITY), F), np.empty(n, np.int32)
         row, column, q = np.empty(m, F), np.empty(n, F), np.empty((3, n), F)
         hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)

@@ -22,6 +22,7 @@ from bpnp.localization.slow_progress import SlowProgress
 from bpnp.report.figures import save_figure
 from bpnp.report.photos import PhotoFinder
 from bpnp.report.pictures import picture_box, solution_picture
+from bpnp.report.tables import WIDTH
 from bpnp.solving.solution import Solution
 
 DESCRIPTION = """Solve images of a COLMAP model as if their poses were unknown, and compare with the model's. The scene
@@ -32,7 +33,7 @@ EVERYTHING = 1e9  # times the true pairs: all the clutter there is
 def localize_command(arguments: Sequence[str], console: Console | None = None) -> None:
     """`bpnp localize --model sparse/0 [--image NAME] [--points seen|clutter|all] [--output FOLDER]`.
 
-    Writes results.json, images.txt (poses in the frame of the model, COLMAP's format) and pictures/<image>.png as it
+    Writes results.json, images.txt (confident poses in the frame of the model) and pictures/<image>.png as it
     goes, so that an interruption loses nothing. Raises ValueError for a model that cannot be read or an unknown image.
     """
     chosen = _parser().parse_args(list(arguments))
@@ -49,9 +50,11 @@ def localize_command(arguments: Sequence[str], console: Console | None = None) -
             if draw is not None:
                 draw(solution, result, chosen.output / "pictures")
             progress.advance()
-    console = console or Console()
+    if console is None:
+        console = Console()
+        console.width = max(console.width, WIDTH)
     console.print(localized_table(done))
-    console.print(summary(done), highlight=False)
+    console.print(summary(done), highlight=False, soft_wrap=True)
     written = ", ".join(["results.json", "images.txt", *([] if draw is None else ["pictures/"])])
     console.print(f"wrote {written} in {chosen.output}", markup=False, highlight=False, soft_wrap=True)
 

@@ -90,10 +90,10 @@ def localized(
 
 
 def images_text(done: Sequence[Localized]) -> str:
-    """COLMAP's images.txt with the poses that are not failures; no keypoints."""
+    """COLMAP's images.txt with the poses to rely on, those of the verdict "confident"; no keypoints."""
     lines = []
     for result in done:
-        if result.verdict != "failed":
+        if result.verdict == "confident":
             x, y, z, w = Rotation.from_matrix(result.rotation).as_quat(canonical=True).tolist()
             pose = " ".join(map(repr, (w, x, y, z, *result.translation.tolist())))
             lines.append(f"{result.image_id} {pose} {result.camera_id} {result.image}\n\n")

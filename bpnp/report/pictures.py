@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 QUIET = "#59626d"
+WIDTH, CAPTIONS = 8.0, 1.3  # inches
 
 
 def picture_box(points2d: Array) -> Box:
@@ -38,7 +39,8 @@ def solution_picture(solution: Any, *, title: str | None = None, photo: Array | 
 
     points2d, matches = np.asarray(solution.points2d), np.asarray(solution.matches)
     box = picture_box(points2d)
-    figure = Figure(figsize=(8, 7), layout="constrained")
+    height = WIDTH * (box.bottom - box.top) / (box.right - box.left)
+    figure = Figure(figsize=(WIDTH, float(np.clip(height, 2.5, 9)) + CAPTIONS), layout="constrained")
     axes = figure.add_subplot()
     if photo is not None:
         axes.imshow(photo, extent=(box.left, box.right, box.bottom, box.top), alpha=0.75, zorder=0)
