@@ -166,7 +166,7 @@ def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
     main(["table", f"--data={tmp_path}/data.yaml", "--methods", f"Lc=bpnpnet@{weights}", f"hungarian@{weights}",
           "--limit=2", f"--output={tmp_path}/out", "--paper=none"])  # fmt: skip
     rows = [row["method"] for row in csv.DictReader((tmp_path / "out" / "table.csv").open())]
-    assert rows == ["Lc ransac", "Lc pnp", "hungarian ransac", "hungarian pnp"]
+    assert rows == ["Lc ransac", "Lc pnp", "Lc refined", "hungarian ransac", "hungarian pnp"]
 
 
 def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:

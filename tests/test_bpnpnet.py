@@ -105,8 +105,10 @@ def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any
             m = n + n // 4
             assert (together.assignment[i, :m, :n] - alone.assignment[0]).abs().max() < 1e-12
             for name, pose in alone.poses.items():
+                # A refined pose starts from poses rounded to float32, whose last bit a rounding in float64 may turn.
+                tolerance = 1e-4 if name == "refined" else 1e-7
                 torch.testing.assert_close(
-                    together.poses[name].rotation[i], pose.rotation[0], atol=1e-7, rtol=0, equal_nan=True
+                    together.poses[name].rotation[i], pose.rotation[0], atol=tolerance, rtol=0, equal_nan=True
                 )
                 assert together.poses[name].stats.converged[i] == pose.stats.converged[0]
 

@@ -76,7 +76,7 @@ def test_two_processes_give_the_figures_of_one(tmp_path: Path) -> None:
     one, two = results[1], results[2]
     # Seven test pairs in batches of four: the second process repeats some, which count once.
     assert [row.id for row in two.rows] == [row.id for row in one.rows]
-    assert len(one.rows) == 7 * 2
+    assert len(one.rows) == 7 * 3
     assert two.correspondence_loss == pytest.approx(one.correspondence_loss, abs=1e-8)
     for estimate, values in one.estimates.items():
         for key in ("rotation_q2_deg", "translation_q2", "recall_rotation_20deg"):
