@@ -25,7 +25,7 @@ class OfflineWandbLogger(WandbLogger):
 
     def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str = "runs") -> None:
         os.makedirs(save_dir, exist_ok=True)
-        mode = os.environ.get("WANDB_MODE") or "offline"  # given as an argument too: wandb reads its variables only once
+        mode = os.environ.get("WANDB_MODE") or "offline"  # as an argument too: wandb reads its variables only once
         super().__init__(project=project, name=name, save_dir=save_dir, offline=mode == "offline", mode=mode)
 
 
