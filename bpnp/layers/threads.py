@@ -1,0 +1,32 @@
+"""Compiled loops over samples or starts on the host's cores: a share of them to each thread."""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+
+import torch
+
+
+def spread(work: Callable[[int, int], object], count: int, *, least: int = 1) -> None:
+    """Call work(first, last) on consecutive shares of range(count), one a thread, and wait for all of them.
+
+    As many threads as torch has (`torch.set_num_threads`, OMP_NUM_THREADS), and no share smaller than `least`. Only
+    work that gives the GIL back gains, as numba's `nogil` functions do; it writes to its own share of an array.
+    Python's threads and not a pool of numba's: that one does not survive the fork of a loader's workers.
+    """
+    shares = max(1, min(torch.get_num_threads(), count // least))
+    if shares == 1:
+        work(0, count)
+        return
+    edges = [count * k // shares for k in range(shares + 1)]
+    others = [_pool(os.getpid()).submit(work, *edge) for edge in zip(edges[1:-1], edges[2:], strict=True)]
+    work(*edges[:2])
+    for other in others:
+        other.result()
+
+
+@lru_cache(1)
+def _pool(process: int) -> ThreadPoolExecutor:
+    """The threads of a process; a fork inherits none of its parent's, so each has its own."""
+    return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
