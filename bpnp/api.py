@@ -51,7 +51,7 @@ def solve(
         image (radians for bearings). By default three times the residuals' own scale.
     clutter: share of the points that is expected to have no partner, if known.
     time_limit: seconds after which the search ends with what it has.
-    device: where a module computes, by default where it is; the search runs on the host's cores.
+    device: where a module computes, by default where it is, or the search its coarse rounds, by default on the host.
     progress: called with (pair, batch of starts, seconds).
 
     A pose that is not to be trusted has the verdict "failed"; so have points from which none follows (on one line, or

@@ -5,14 +5,17 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.layers import alignment
 from bpnp.layers.kernels import descend
 from bpnp.layers.pool import SAME_DEG, SAME_SHIFT, Pool, distinct
 from bpnp.layers.scene import Scene
 from bpnp.layers.sparse_kernels import build_grid, descend_sparse
 from bpnp.layers.starts import Array, Prior, Spread, draw_poses
+from bpnp.layers.threads import spread
 
 
 class Recipe(NamedTuple):
@@ -47,7 +50,7 @@ def run_batch(scene: Scene, recipe: Recipe, prior: Prior | None, pool: Pool | No
     score = np.empty(len(rotation), np.float32)
     outlier = scene.outlier_density(recipe.outliers)
     scales = _scales(scene.spread, recipe.first_scale, COARSE_SCALE, COARSE_ROUNDS)
-    descend(*scene.clusters(COARSE), rotation, translation, scales, outlier, RELAXATION, score)
+    _descend(scene, COARSE, rotation, translation, scales, outlier, score)
 
     kept = distinct(rotation, translation, score, MIDDLE_STARTS, SAME_DEG, math.inf)
     rotation, translation = rotation[kept], translation[kept]
@@ -77,12 +80,29 @@ def _descend_further(
     score = np.empty(len(rotation), np.float32)
     scales = _scales(scene.spread, COARSE_SCALE, MIDDLE_SCALE, MIDDLE_ROUNDS)
     outlier = scene.outlier_density(outliers)
-    descend(*scene.clusters(MIDDLE), rotation, translation, scales, outlier, RELAXATION, score)
+    _descend(scene, MIDDLE, rotation, translation, scales, outlier, score)
     kept = distinct(rotation, translation, score, FINE_STARTS, 1.0, math.inf)
     return polish(
         scene, rotation[kept], translation[kept], kept < fresh, MIDDLE_SCALE * scene.spread, fine_outliers,
         bearings=FINE,
     )  # fmt: skip
+
+
+def _descend(
+    scene: Scene, count: int, rotation: Array, translation: Array, scales: Array, outlier: np.float32, score: Array
+) -> None:
+    """Anneal poses on `count` clusters of each side, in place, with their scores."""
+    clusters = scene.clusters(count)
+    if scene.device is not None:
+        f, a, p, b = (torch.as_tensor(x, device=scene.device) for x in clusters)
+        turns, shifts = (torch.as_tensor(x, device=scene.device) for x in (rotation, translation))
+        ends = alignment.descend(f.T, a, p.T, b, turns, shifts, scales.tolist(), float(outlier), float(RELAXATION))
+        rotation[:], translation[:], score[:] = (x.cpu().numpy() for x in ends)
+        return
+    spread(
+        lambda i, j: descend(*clusters, rotation[i:j], translation[i:j], scales, outlier, RELAXATION, score[i:j]),
+        len(rotation),
+    )
 
 
 def shaken(scene: Scene, pool: Pool) -> tuple[Array, Array]:
@@ -105,9 +125,13 @@ def polish(
     result = np.empty((len(rotation), 3), np.float32)
     grid = build_grid(scene.bearings[:bearings], float(scales[-1]))
     rotation, translation = np.ascontiguousarray(rotation), np.ascontiguousarray(translation)
-    descend_sparse(
-        tuple(grid)[:5], np.ascontiguousarray(scene.points3d.T), rotation, translation, scales,
-        scene.outlier_density(outliers), SWEEPS, np.float32(1), PATIENCE, result,
+    points, outlier = np.ascontiguousarray(scene.points3d.T), scene.outlier_density(outliers)
+    spread(
+        lambda i, j: descend_sparse(
+            tuple(grid)[:5], points, rotation[i:j], translation[i:j], scales, outlier, SWEEPS, np.float32(1), PATIENCE,
+            result[i:j],
+        ),
+        len(rotation),
     )  # fmt: skip
     result[:, 0] += math.log(1 - outliers)  # the mixture's factor, for shares to be compared
     kept = distinct(rotation, translation, result[:, 0], len(result), SAME_DEG, SAME_SHIFT)

@@ -1,8 +1,8 @@
 """Alignment of many poses on the CPU: each start runs through all its scales in one fused loop that stays in the cache.
 
-`bpnp.layers.alignment` states the mathematics and is the same algorithm in torch, for other devices. Arrays are
+docs/search.md states the mathematics, `bpnp.layers.alignment` is the same for other devices. Arrays are
 float32 and coordinate-major, (3, m) bearings and (3, n) points, so that loops over points vectorise. The starts are
-independent of each other. One thread: numba's pools do not survive the fork of a loader's workers.
+independent of each other, so that shares of them go to several threads.
 """
 
 import inspect
@@ -16,6 +16,7 @@ import numpy as np
 F = np.float32
 COMPILE: dict[str, Any] = {"fastmath": True, "nogil": True, "cache": True, "boundscheck": False}
 LARGEST_TURN = 0.5  # radians in one step
+POWER = 256  # of the kernel: eight squarings
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -167,7 +168,7 @@ def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scal
     """
     m, n = f.shape[1], p.shape[1]
     total_a, total_b = F(a.sum()), F(b.sum())
-    sharp = F(1) / (scale * scale * F(256))
+    sharp = F(1) / (scale * scale * F(POWER))
     for i in range(m):
         row[i] = outlier * total_b
     for j in range(n):
@@ -214,7 +215,7 @@ def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, sca
             relaxation: Any, score: Any) -> None:  # fmt: skip
     """Anneal every start (S, 3, 3), (S, 3) in place; score (S,) is the likelihood at the last scale, -inf if lost.
 
-    outlier: o / s^2 of `alignment.outlier_density`.
+    outlier: o / s^2 of `Scene.outlier_density`.
     """
     m, n = f.shape[1], p.shape[1]
     for k in range(len(rotation)):

@@ -18,9 +18,19 @@ FLAT = 1e-6  # second singular value over the first, below which points lie on a
 
 
 class Scene:
-    """One pair, centred and scaled to unit extent, each side in a random order, and its clusters."""
+    """One pair, centred and scaled to unit extent, each side in a random order, and its clusters.
 
-    def __init__(self, bearings: NDArray[np.float64], points3d: NDArray[np.float64], seed: int) -> None:
+    device: where starts are aligned to clusters, in torch; None for compiled loops on the host.
+    """
+
+    def __init__(
+        self,
+        bearings: NDArray[np.float64],
+        points3d: NDArray[np.float64],
+        seed: int,
+        device: torch.device | None = None,
+    ) -> None:
+        self.device = device
         self.rng = np.random.default_rng(seed)
         self.centre = points3d.mean(0)
         self.size = max(float(np.sqrt(((points3d - self.centre) ** 2).sum(-1).mean())), 1e-30)

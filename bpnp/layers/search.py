@@ -67,7 +67,8 @@ def search_candidates(
     max_batches: of starts, at most. progress: called after each batch with sample, batch and seconds.
 
     A sample with fewer than 4 points of a side, or with all its bearings or all its points on one line or in one
-    place, has no candidates. Not differentiable; runs on the host's cores whatever the device.
+    place, has no candidates. Not differentiable. The coarse rounds run on the device of the bearings,
+    the fine ones, which look up neighbours, on the host's cores.
     Raises ValueError for a `time_limit` or `max_batches` that is not positive.
     """
     if max_batches < 1 or (time_limit is not None and not time_limit > 0):
@@ -86,6 +87,7 @@ def search_candidates(
                 prior,
                 clutter,
                 seed,
+                None if f.device.type == "cpu" else f.device,
                 None if progress is None else partial(progress, i),
             )
         )
@@ -169,11 +171,12 @@ def _search_pair(
     prior: Prior | None,
     clutter: float | None,
     seed: int,
+    device: torch.device | None,
     progress: Callable[[int, float], None] | None,
 ) -> _Found:
     if degenerate(bearings) or degenerate(points3d):
         return _Found(None, 0, False)
-    scene = Scene(bearings, points3d, seed)
+    scene = Scene(bearings, points3d, seed, device)
     known = None if prior is None else scene.enter_prior(prior)
     share = FINE_OUTLIERS if clutter is None else max(clutter, LEAST_CLUTTER)
     pool: Pool | None = None

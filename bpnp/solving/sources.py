@@ -83,8 +83,8 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
     """The search, after a net's pose around it: if that is not safe, everywhere."""
     run = partial(
         search_candidates,
-        torch.as_tensor(problem.bearings)[None],
-        torch.as_tensor(problem.local3d)[None],
+        torch.as_tensor(problem.bearings, device=options.device)[None],
+        torch.as_tensor(problem.local3d, device=options.device)[None],
         clutter=options.clutter,
         seed=options.seed,
         time_limit=options.time_limit,
