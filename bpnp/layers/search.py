@@ -52,6 +52,7 @@ def search_candidates(
     seed: int = 0,
     time_limit: float | None = None,
     max_batches: int = 32,
+    device: torch.device | None = None,
     progress: Progress | None = None,
 ) -> Candidates:
     """Every distinct pose (R, t) found that explains the bearings f_i by the points p_j, in no known order.
@@ -65,17 +66,17 @@ def search_candidates(
     seed: of the starts, the same for each sample, so that no pose depends on the other samples.
     time_limit: seconds a sample, after which no batch of starts begins; the result then depends on the machine.
     max_batches: of starts, at most. progress: called after each batch with sample, batch and seconds.
+    device: of the coarse rounds, by default that of the bearings; the fine ones look up neighbours on the host.
 
     A sample with fewer than 4 points of a side, or with all its bearings or all its points on one line or in one
-    place, has no candidates. Not differentiable. The coarse rounds run on the device of the bearings,
-    the fine ones, which look up neighbours, on the host's cores.
+    place, has no candidates. Not differentiable.
     Raises ValueError for a `time_limit` or `max_batches` that is not positive.
     """
     if max_batches < 1 or (time_limit is not None and not time_limit > 0):
         raise ValueError(f"expected a positive `max_batches` and `time_limit`, got {max_batches} and {time_limit}")
     if clutter is not None and not 0 <= clutter < 1:
         raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
-    found = []
+    found, on = [], bearings.device if device is None else device
     for i in range(len(bearings)):
         f = bearings[i] if mask2d is None else bearings[i][mask2d[i]]
         p = points3d[i] if mask3d is None else points3d[i][mask3d[i]]
@@ -87,7 +88,7 @@ def search_candidates(
                 prior,
                 clutter,
                 seed,
-                None if f.device.type == "cpu" else f.device,
+                None if on.type == "cpu" else on,
                 None if progress is None else partial(progress, i),
             )
         )

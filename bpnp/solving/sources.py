@@ -83,11 +83,12 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
     """The search, after a net's pose around it: if that is not safe, everywhere."""
     run = partial(
         search_candidates,
-        torch.as_tensor(problem.bearings, device=options.device)[None],
-        torch.as_tensor(problem.local3d, device=options.device)[None],
+        torch.as_tensor(problem.bearings)[None],
+        torch.as_tensor(problem.local3d)[None],
         clutter=options.clutter,
         seed=options.seed,
         time_limit=options.time_limit,
+        device=options.device,
         progress=None if options.progress is None else partial(_report, options.progress, number),
     )
     if not isinstance(prior, BPnPNet):
