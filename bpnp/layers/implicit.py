@@ -13,6 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from bpnp.layers.fused import projected
 from bpnp.layers.laplacian import solve_multipliers
 
 
@@ -87,7 +88,10 @@ class _EntropicPlan(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         plan, mu = ctx.saved_tensors
         a, b = solve_multipliers(plan, gradient)
-        grad_cost = (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan).div_(-mu)
+        if plan.device.type == "cpu":
+            grad_cost = projected(plan, gradient, a, b, -1 / float(mu))
+        else:
+            grad_cost = (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan).div_(-mu)
         grad_mu = None
         if ctx.needs_input_grad[2]:
             grad_mu = torch.special.xlogy(grad_cost, plan).sum().reshape(mu.shape)

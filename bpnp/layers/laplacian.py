@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.layers.pacing import steps, unfinished, waits
+from bpnp.layers.fused import conjugate_gradients, moments, square_product
+from bpnp.layers.pacing import unfinished, waits
 
 CG_ITERATIONS = 150
 CG_ITERATIONS_ON_GPU = 30
@@ -44,7 +45,9 @@ class Plan:
         positive terms.
         """
         weight = divide(torch.ones_like(rows), rows)
-        shared = transpose_times(self.kernel.square(), weight if self.alpha is None else self.alpha**2 * weight)
+        scaled = weight if self.alpha is None else self.alpha**2 * weight
+        on_cpu = self.kernel.device.type == "cpu"
+        shared = square_product(self.kernel, scaled) if on_cpu else transpose_times(self.kernel.square(), scaled)
         shared = shared if self.beta is None else self.beta**2 * shared
         degree = cols - shared
         weak = (degree < LOST * torch.finfo(cols.dtype).eps * cols).any(-1)
@@ -90,17 +93,22 @@ def _solve(
     plan: Tensor, gradient: Tensor, tolerance: float
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
     """(a, b) in the precision of the plan, and whether that precision is enough."""
-    weighted = plan * gradient
-    rows, cols = plan.sum(-1), plan.sum(-2)
-    row_mean = divide(weighted.sum(-1), rows)
-    rhs = weighted.sum(-2) - transpose_times(plan, row_mean)
-    del weighted
+    rows, row_mean, cols, rhs = _moments(plan, gradient)
     system = Plan(plan)
     degree = system.degree(rows, cols)
     b, mean, solved = _conjugate_gradients(system, rows, cols, degree, rhs, tolerance)
     if plan.dtype == torch.float64 and not waits(plan.device) and not bool(solved.all()):
         b, mean = _factorise_rest(system, rows, cols, rhs, b, mean, solved)
     return row_mean - mean, b, solved & (cols.sum(-1) <= SHARP * degree.sum(-1))
+
+
+def _moments(plan: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """P 1, the rows' means w of the gradient V, P^T 1 and P^T (V - w 1^T)."""
+    if plan.device.type == "cpu":
+        return moments(plan, gradient)
+    weighted, rows = plan * gradient, plan.sum(-1)
+    means = divide(weighted.sum(-1), rows)
+    return rows, means, plan.sum(-2), weighted.sum(-2) - transpose_times(plan, means)
 
 
 def newton_direction(
@@ -135,6 +143,13 @@ def _conjugate_gradients(
     The residual is measured per unit of mass: in the preconditioner's own measure columns with weak links would
     outweigh all others.
     """
+    if rhs.device.type == "cpu":
+        alpha = torch.ones_like(rows) if plan.alpha is None else plan.alpha
+        beta = torch.ones_like(cols) if plan.beta is None else plan.beta
+        x, mean, solved = conjugate_gradients(
+            plan.kernel, (alpha, beta), (rows, cols), degree, rhs, tolerance, CG_ITERATIONS
+        )
+        return _centred(x, mean, rows, cols, solved)
     inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
     x, mean = torch.zeros_like(rhs), torch.zeros_like(rows)
     r = rhs
@@ -143,9 +158,7 @@ def _conjugate_gradients(
     target = torch.linalg.vecdot(unit * r, r) * tolerance**2
     active = rz > 0
     solved = ~active
-    for _ in range(steps(CG_ITERATIONS, rhs.device, CG_ITERATIONS_ON_GPU)):
-        if not unfinished(active):
-            break
+    for _ in range(CG_ITERATIONS_ON_GPU):
         mean_p = per_row * plan.times(p)
         sp = torch.addcmul(-plan.transpose_times(mean_p), cols, p)
         curvature = torch.linalg.vecdot(p, sp)
@@ -161,6 +174,11 @@ def _conjugate_gradients(
         rz_new = torch.linalg.vecdot(r, z)
         p = torch.addcmul(z, divide(rz_new, rz).unsqueeze(-1), p)
         rz = rz_new
+    return _centred(x, mean, rows, cols, solved)
+
+
+def _centred(x: Tensor, mean: Tensor, rows: Tensor, cols: Tensor, solved: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Without the component along the null vector."""
     shift = _mean(x, cols)
     return torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0), solved
 

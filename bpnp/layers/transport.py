@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.layers.laplacian import Plan, newton_direction, times
+from bpnp.layers.memory import empty
 from bpnp.layers.pacing import steps, unfinished, waits
 from bpnp.layers.scalings import Scaled, absorb, from_row_minima, sweep
 from bpnp.types import SolveStats
@@ -45,7 +46,7 @@ def solve_plan(
     A point with zero marginal takes no part. Iterations count pairs of scalings; a late one follows a Newton step. A
     GPU takes at most `STEPS_ON_GPU` and is not waited for.
     """
-    plan = torch.empty(cost.shape, dtype=cost.dtype, device=cost.device)
+    plan = empty(cost.shape, dtype=cost.dtype, device=cost.device)
     size = len(cost) if waits(cost.device) else max(1, CACHE // (cost[0].numel() * cost.element_size()))
     parts = []
     for start in range(0, len(cost), size):
