@@ -13,6 +13,7 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import torch
 
 from bpnp.accuracy import rotation_error, translation_error
@@ -119,6 +120,7 @@ def main() -> None:
     parser.add_argument("--time-limit", type=float)
     parser.add_argument("--max-batches", type=int, default=32)
     parser.add_argument("--output", type=Path, help="JSON to add the results to")
+    parser.add_argument("--pairs", type=Path, help="folder for a CSV of each set's pairs")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     run("psb", options.data, 1, 0, None, 1)  # compiles
@@ -143,6 +145,9 @@ def main() -> None:
         }
         if options.output:
             write_json(options.output, results)
+        if options.pairs:
+            options.pairs.mkdir(parents=True, exist_ok=True)
+            pd.DataFrame(rows).to_csv(options.pairs / f"{name}.csv", index=False)
 
 
 def write_json(path: Path, results: dict) -> None:
