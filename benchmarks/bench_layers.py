@@ -43,7 +43,7 @@ def _spread(value: Spread) -> str:
 
 def save_plot(rows: Sequence[Row], path: Path) -> None:
     """Ratio of every row with its quartiles, on a logarithmic axis."""
-    figure, axes = plt.subplots(figsize=(8, 0.4 * len(rows) + 1), layout="constrained")
+    figure, axes = plt.subplots(figsize=(12, 0.4 * len(rows) + 1), layout="constrained")
     ratios = [row.race.ratio for row in rows]
     medians = [ratio.median for ratio in ratios]
     axes.barh([f"{row.what}, {row.inputs}, B={row.batch}" for row in rows], medians, color="tab:blue")
@@ -52,7 +52,7 @@ def save_plot(rows: Sequence[Row], path: Path) -> None:
     axes.axvline(1, color="black", linewidth=0.8)
     axes.set(xscale="log", xlabel="times faster than the paper's method")
     axes.invert_yaxis()
-    figure.savefig(path, dpi=80)
+    figure.savefig(path, dpi=80, bbox_inches="tight")
     plt.close(figure)
 
 

@@ -54,7 +54,25 @@ def test_gradient_and_hessian_are_those_of_autograd() -> None:
         assert (found.gradient[i] - gradient).abs().max() < 1e-13
         assert (found.hessian[i] - hessian).abs().max() < 1e-13
     q = aggregate(assignment, planted.bearings)
-    assert torch.equal(pose_gradient(q, planted.points3d, rotation, translation), found.gradient)
+    same = pose_gradient(q, planted.points3d, rotation, translation)
+    torch.testing.assert_close(same, found.gradient, rtol=1e-12, atol=1e-14)
+
+
+def test_the_loop_over_points_gives_what_torch_gives_a_point_at_the_camera_included() -> None:
+    planted = plant(4, 12, outliers2d=5, seed=3)
+    q, (rotation, translation) = aggregate(planted.diffuse(0.3), planted.bearings), planted.near(0.4)
+    points3d = planted.points3d.clone()
+    points3d[0, 0] = -(rotation[0].mT @ translation[0])
+    points3d[1, 2, 1] = torch.nan
+    found = derivatives(q, points3d, rotation, translation)
+    followed = derivatives(q.clone().requires_grad_(), points3d, rotation, translation)
+    assert followed.hessian.requires_grad
+    for name in ("value", "gradient", "hessian"):
+        some, other = getattr(found, name), getattr(followed, name).detach()
+        torch.testing.assert_close(some[2:], other[2:], rtol=1e-12, atol=1e-13)
+        assert some[0].isfinite().all()
+        assert some[1].isnan().any()
+        assert other[1].isnan().any()
 
 
 @pytest.mark.parametrize("method", ["newton", "lbfgs"])

@@ -6,7 +6,8 @@ import pytest
 import torch
 from lightning import Trainer
 from small_data import SMALL_MESHES
-from torch import nn
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
 
 from bpnp import Batch, BPnPNet, Prediction
 from bpnp.callbacks import PoseLossWarmup, ResultsWriter
@@ -88,6 +89,42 @@ def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path) -> None:
     with pytest.raises(TrainingDivergedError, match=r"got 4 steps in a row without.*try a lower model.learning_rate"):
         trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(task, datamodule=data(tmp_path))
     assert len(task.solver.wanted) == 4
+
+
+class Untransformed(nn.Module):
+    """In place of the input transform, whose batch norms see a whole batch."""
+
+    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
+        return points
+
+
+def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points3d = rng.uniform(-1, 1, (4, 20, 3))
+    points2d = points3d[..., :2] / (points3d[..., 2:] + 4.5)
+    pose = np.broadcast_to(np.eye(3), (4, 3, 3)), np.broadcast_to([0, 0, 4.5], (4, 3))
+    matches = np.broadcast_to(np.arange(20), (4, 20))
+
+    def batch(first: int, last: int) -> Batch:
+        arrays = (points2d, points3d, *pose, matches)
+        return Batch.from_arrays(*(list(x[first:last]) for x in arrays)).to(torch.float32)
+
+    def gradients(batches: list[Batch], pose_weight: float) -> dict[str, Tensor]:
+        torch.manual_seed(3)
+        solver = BPnPNet(channels=16, blocks=2, image_scale=4.0, centre_features=True)
+        solver.align = Untransformed()
+        task = BlindPnPTask(solver, pose_weight=pose_weight)
+        trainer(tmp_path, max_steps=1, accumulate_grad_batches=len(batches), limit_val_batches=0,
+                enable_checkpointing=False).fit(task, DataLoader(batches, batch_size=None))  # fmt: skip
+        return {name: p.grad for name, p in solver.named_parameters()}
+
+    for pose_weight in (0.0, 0.5):
+        whole = gradients([batch(0, 4)], pose_weight)
+        parts = gradients([batch(0, 2), batch(2, 4)], pose_weight)
+        largest = max(float(g.abs().max()) for g in whole.values())
+        assert largest > 1e-4
+        for name, value in whole.items():  # a bias before a norm has no gradient but rounding
+            torch.testing.assert_close(parts[name], value, rtol=1e-3, atol=1e-4 * largest, msg=name)
 
 
 def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:

@@ -37,14 +37,14 @@ def moments(
     """Row sums of P, means w of the gradient V over the rows, column sums of P, and P^T (V - w 1^T)."""
     b, m, n = plan.shape
     rows, means, cols, centred = (plan.new_empty(b, k) for k in (m, m, n, n))
-    _run(_moments, plan, gradient, rows, means, cols, centred)
+    run(_moments, plan, gradient, rows, means, cols, centred)
     return rows, means, cols, centred
 
 
 def square_product(kernel: Float[Tensor, "b m n"], weight: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
     """sum_i weight_i K_ij^2."""
     total = kernel.new_empty(len(kernel), kernel.shape[2])
-    _run(_squares, kernel, weight, total)
+    run(_squares, kernel, weight, total)
     return total
 
 
@@ -53,7 +53,7 @@ def outer_products(
 ) -> Float[Tensor, "b m n"]:  # fmt: skip
     """left @ right^T in one pass of writing: a product made for many more columns takes twice as long."""
     result = empty(torch.Size((*left.shape[:2], right.shape[1])), dtype=left.dtype, device=left.device)
-    _run(_outer, left, right.mT, result)
+    run(_outer, left, right.mT, result)
     return result
 
 
@@ -66,7 +66,7 @@ def projected(
 ) -> Float[Tensor, "b m n"]:
     """factor P . (V - a 1^T - 1 b^T)."""
     result = empty(plan.shape, dtype=plan.dtype, device=plan.device)
-    _run(_project, plan, gradient, a, b, torch.full_like(plan[:, 0, 0], factor), result)
+    run(_project, plan, gradient, a, b, torch.full_like(plan[:, 0, 0], factor), result)
     return result
 
 
@@ -84,11 +84,11 @@ def conjugate_gradients(
     solved = torch.zeros(len(rhs), dtype=torch.bool)
     bound = torch.zeros_like(rhs[:, 0]) + tolerance
     limits = torch.full_like(solved, limit, dtype=torch.long)
-    _run(_solve, kernel, *scalings, *sums, degree, rhs, bound, limits, x, mean, solved)
+    run(_solve, kernel, *scalings, *sums, degree, rhs, bound, limits, x, mean, solved)
     return x, mean, solved
 
 
-def _run(loop: Any, *values: Tensor) -> None:
+def run(loop: Any, *values: Tensor) -> None:
     """Call a loop over samples, which stops for no other, on as many threads as torch uses."""
     arrays = [x.detach().contiguous().numpy() for x in values]
     spread(lambda first, last: loop(first, last, *arrays), len(values[0]))

@@ -16,6 +16,7 @@ from torch.autograd.function import once_differentiable
 
 from bpnp.geometry import transform
 from bpnp.layers.fused import outer_products
+from bpnp.layers.fused_objective import fused_derivatives
 
 NEAR = 1e-12  # distances below this count as this: a point at the camera centre has no direction
 
@@ -82,6 +83,9 @@ def derivatives(q: Tensor, points3d: Tensor, rotation: Tensor, translation: Tens
     With u = y/|y|, d = |y|: h = -(q - (q.u) u)/d is the gradient in y and G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2
     its Hessian; a rotation also bends the path, which adds sym(Rp h^T) - (Rp . h) I to the rotation block.
     """
+    followed = torch.is_grad_enabled() and (q.requires_grad or points3d.requires_grad)
+    if q.device.type == "cpu" and not followed:
+        return Derivatives(*fused_derivatives(q, points3d, rotation, translation, NEAR))
     rotated = points3d @ rotation.mT
     y = rotated + translation.unsqueeze(-2)
     d = torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(NEAR)
