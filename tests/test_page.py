@@ -40,7 +40,7 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
     written = [write_run(tmp_path / name, 20, seed) for seed, name in enumerate(("a", "b"))]
     page = write_page([tmp_path / "a" / "test", tmp_path / "b"], tmp_path / "out" / "report.html", paper="megadepth")
     data = json.loads(Elements(page.read_text(encoding="utf-8")).scripts[0])
-    assert [run["name"] for run in data["runs"]] == ["a/test", "b/test"]
+    assert [run["name"] for run in data["runs"]] == ["a", "b"]
     assert data["ids"] == [[HOSTILE, *(f"scene/{i:04d}" for i in range(1, 20))]]
     for run, results in zip(data["runs"], written, strict=True):
         assert unpacked(run["sizes"]["n"]).tolist() == [row.n for row in results.rows if row.estimate == "pnp"]

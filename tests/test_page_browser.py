@@ -46,7 +46,7 @@ def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Results]]:
     folder = tmp_path_factory.mktemp("runs")
-    results = {f"{name}/test": write_run(folder / name, COUNT, seed) for seed, name in enumerate(("first", "second"))}
+    results = {name: write_run(folder / name, COUNT, seed) for seed, name in enumerate(("first", "second"))}
     return write_page([folder / name for name in results], folder / "report.html", paper="modelnet40"), results
 
 
@@ -138,25 +138,25 @@ def test_runs_are_switched_off_and_on(page: Callable[..., Any]) -> None:
 
 
 def test_the_worst_pairs_come_first_and_filters_narrow_them(page: Callable[..., Any], written: Any) -> None:
-    rotation = column(written[1]["first/test"], "ransac", "rotation_error_deg")
+    rotation = column(written[1]["first"], "ransac", "rotation_error_deg")
     shown = texts(page, "#pair-table tbody td:nth-child(2)")
     assert shown == [number(value) for value in np.sort(rotation)[::-1][: len(shown)]]
     press(page, "#pair-table [data-key='reprojection_error_deg']")
     press(page, "#pair-table [data-key='reprojection_error_deg']")
-    reprojection = column(written[1]["first/test"], "ransac", "reprojection_error_deg")
+    reprojection = column(written[1]["first"], "ransac", "reprojection_error_deg")
     for _ in range(3):
         press(page, "#page-on")
     ordered = np.sort(reprojection)
     assert texts(page, "#pair-table tbody td:nth-child(5)") == [number(value) for value in ordered[75:].tolist()]
     page("const e = document.getElementById('pair-cause'); e.value = 2; e.dispatchEvent(new Event('input'))")
     assert set(texts(page, "#pair-table td.words")) == {"no pose"}
-    without = sum(not row.found for row in written[1]["first/test"].rows) // 2
+    without = sum(not row.found for row in written[1]["first"].rows) // 2
     assert f"{without} pairs" in texts(page, "#pager")[0]
 
 
 def test_shares_of_causes_are_those_of_the_rows(page: Callable[..., Any], written: Any) -> None:
     row = texts(page, "#cause-table tbody tr:nth-child(2) td")[1:]
-    results = written[1]["first/test"]
+    results = written[1]["first"]
     found, converged = (column(results, "pnp", key).astype(bool) for key in ("found", "converged"))
     good = column(results, "pnp", "rotation_error_deg") <= 5
     fits = column(results, "pnp", "inliers") >= 0.5 * column(results, "pnp", "m")
@@ -243,8 +243,8 @@ def test_a_pair_opens_from_the_keyboard_and_from_its_address(browser: Any, page:
 
 def test_the_pose_loss_is_marked_where_it_joins(page: Callable[..., Any]) -> None:
     assert texts(page, "#training-charts figure:first-child .mark-text") == [
-        "first/test: pose loss",
-        "second/test: pose loss",
+        "first: pose loss",
+        "second: pose loss",
     ]
     frame, mark = page(
         "const f = document.querySelector('#training-charts figure');"

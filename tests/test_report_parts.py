@@ -9,6 +9,7 @@ from report_data import rows, write_run
 
 from bpnp.report import cause_of, cause_shares, read_training_log, table
 from bpnp.report.palette import DARK, DARK_BACKGROUND, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.runs import named_runs
 
 # Machado, Oliveira, Fernandes 2009, severity 1.0, on linear RGB: how the three kinds of dichromats see.
 SEEN = {
@@ -98,6 +99,31 @@ def test_a_resumed_training_is_one_curve_and_a_repeated_one_the_newest(tmp_path:
     assert log.curves["train/loss"] == ([0, 10, 20], [1.0] * 3)
     assert log.switch_step is None
     assert read_training_log(tmp_path) is None
+
+
+def test_a_training_too_short_to_log_its_loss_shows_its_validation(tmp_path: Path) -> None:
+    for version, lines in enumerate((["0,0.9"], ["19,0.6", "39,0.5"])):
+        path = tmp_path / "short" / "logs" / f"version_{version}" / "metrics.csv"
+        path.parent.mkdir(parents=True)
+        path.write_text("\n".join(["step,val/correspondence_loss", *lines]))
+    log = read_training_log(tmp_path / "short")
+    assert log is not None
+    assert log.curves == {"val/correspondence_loss": ([19, 39], [0.6, 0.5])}
+    write_log(tmp_path / "short", 2, range(0, 50, 10), 2.0)  # a longer one is all that counts
+    log = read_training_log(tmp_path / "short")
+    assert log is not None
+    assert list(log.curves) == ["train/loss"]
+
+
+def test_names_are_what_paths_do_not_share(tmp_path: Path) -> None:
+    def names(*paths: str) -> list[str]:
+        return list(named_runs([tmp_path / path for path in paths]))
+
+    assert names("a/test", "b/test") == ["a", "b"]
+    assert names("x/a/test", "x/b/c/test") == ["a", "b/c"]
+    assert names("a/test", "a/untrained") == ["test", "untrained"]
+    assert names("a/test", "test") == ["a/test", "test"]
+    assert names("a/test") == ["test"]
 
 
 def test_long_curves_are_thinned_without_moving_their_mean(tmp_path: Path) -> None:

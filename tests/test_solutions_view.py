@@ -62,7 +62,12 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Pat
         path.write_text(json.dumps(content | change))
         with pytest.raises(ValueError, match=message):
             view_command([str(path)], Console(quiet=True))
-    for text, message in (("", "JSON of a solution"), ("[]", "no points2d"), ('{"rotation": 1}', "no points2d")):
+    for text, message in (
+        ("", "JSON of a solution"),
+        ("[]", "no points2d"),
+        ('{"images": []}', "its pictures are in"),
+        ('{"rotation": 1}', "no points2d"),
+    ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
             view_command([str(path)], Console(quiet=True))

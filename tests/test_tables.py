@@ -95,7 +95,7 @@ def test_a_report_names_runs_by_what_their_paths_do_not_share(tmp_path: Path) ->
             [tmp_path / name / "test" for name in ("first", "second")], console, untrained=tmp_path / "first" / "test"
         )
     text = capture.get()
-    assert text.count("first/test: pnp") == text.count("second/test: pnp") == 2
+    assert text.count("first: pnp") == text.count("second: pnp") == 2
     assert str(tmp_path) not in text
     assert "untrained" in text
     assert "paper" not in text

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
-    """Results folders by what their paths do not share. Of a run's folder, its `test`.
+    """Results folders by what their paths do not share, at the start or at the end. Of a run's folder, its `test`.
 
     Raises ValueError if there is none.
     """
@@ -24,7 +24,10 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
         for path in folders
     ]
     shared = os.path.commonpath([path.parent for path in folders])
-    return {os.path.relpath(path, shared): path for path in folders}
+    parts = [Path(os.path.relpath(path, shared)).parts for path in folders]
+    while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    return {os.path.join(*own): path for own, path in zip(parts, folders, strict=True)}
 
 
 def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":

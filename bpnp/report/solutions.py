@@ -45,6 +45,11 @@ def read_solution(path: Path | str) -> PairView:
     except (OSError, ValueError) as error:
         raise ValueError(f"expected the JSON of a solution in {path}, got {error}") from error
     if not isinstance(content, dict) or any(name not in content for name in NEEDED):
+        if isinstance(content, dict) and "images" in content:
+            raise ValueError(
+                f"expected one solution in {path}, got the results of `bpnp localize`; its pictures are in "
+                f"{path.parent / 'pictures'}"
+            )
         missing = [name for name in NEEDED if not isinstance(content, dict) or name not in content]
         raise ValueError(f"expected a solution in {path}, got no {', '.join(missing)}; try `bpnp solve` again")
     try:

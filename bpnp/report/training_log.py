@@ -2,6 +2,7 @@
 
 import csv
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -35,14 +36,15 @@ class TrainingLog:
 def read_training_log(results: Path | str) -> TrainingLog | None:
     """The log of the run that a results folder belongs to: in `logs` or `lightning_logs` of it or of its parent.
 
-    Of several versions the newest that trained counts, with those before it that it continues (a resumed run). None if
-    nothing was trained. Raises ValueError that names the file if a value is no number.
+    Of several versions the newest that trained counts, with those before it that it continues (a resumed run); of a
+    training too short to log its loss, what was validated. None if nothing was trained. Raises ValueError that names
+    the file if a value is no number.
     """
     folder = Path(results).absolute()
     for place in (folder, folder.parent):
         files = [file for name in FOLDERS for file in (place / name).glob("version_*/metrics.csv")]
         logs = [(file, _read(file)) for file in sorted(files, key=_version)]
-        trained = [(file, log) for file, log in logs if LOSS in log]
+        trained = [own for own in logs if LOSS in own[1]] or [own for own in logs if _steps(own[1])]
         if trained:
             return _joined(trained)
     return None
@@ -54,7 +56,7 @@ def _joined(logs: list[tuple[Path, dict[str, dict[int, float]]]]) -> TrainingLog
     curves: dict[str, dict[int, float]] = {}
     start = math.inf
     for file, log in reversed(logs):
-        first = min(log[LOSS])
+        first = _steps(log)[0]
         if first < start:
             files.append(file)
             for name, values in log.items():
@@ -67,6 +69,13 @@ def _joined(logs: list[tuple[Path, dict[str, dict[int, float]]]]) -> TrainingLog
         switch_step=min(marks, default=None),
         files=tuple(reversed(files)),
     )
+
+
+def _steps(log: Mapping[str, Mapping[int, float]]) -> list[int]:
+    """The steps that were trained, as far as they were logged; untrained weights are at step 0."""
+    if LOSS in log:
+        return sorted(log[LOSS])
+    return sorted({step for values in log.values() for step in values if step > 0})
 
 
 def _read(path: Path) -> dict[str, dict[int, float]]:

@@ -63,8 +63,10 @@ function unpackedView(view) {
 }
 
 function camerasOf(view, run) {
-  const estimates = Object.entries(view.estimates).filter(([, pose]) => pose !== null).map(([name, pose]) => ({
-    name, pose, colour: SERIES.find((series) => series.run === run && series.estimate === name)?.colour ?? "var(--c0)" }));
+  const estimates = Object.entries(view.estimates).filter(([, pose]) => pose !== null).map(([name, pose]) => {
+    const { colour, dashes } = SERIES.find((series) => series.run === run && series.estimate === name) ?? { colour: "var(--c0)", dashes: "" };
+    return { name, pose, colour, dashes: dashes.split(" ").filter(Boolean).map(Number) };
+  });
   return view.pose === null ? estimates : [{ name: "true pose", pose: view.pose, colour: "var(--text)", upright: true }, ...estimates];
 }
 

@@ -59,7 +59,7 @@ function drawPairs() {
   const rows = listed.slice(pairPage * ROWS, (pairPage + 1) * ROWS).map((i) =>
     element("tr", {}, element("th", { scope: "row" },
       element("button", { type: "button", class: hasPoints(series.run, i) ? "link drawn" : "link", onclick: () => openPair(i) },
-        series.ids[i] || "(no name)")),
+        ...breakable(series.ids[i] || "(no name)"))),
       ...PAIR_COLUMNS.map(([key]) => element("td", {}, pairText(key, pairColumn(series, key)[i]))),
       element("td", { class: "words" }, DATA.causes[series.get("cause")[i]])));
   const sortAgain = () => {
@@ -76,6 +76,9 @@ function drawPairs() {
   byId("pair-kept").textContent = `Points to look at (◉): of ${kept === series.ids.length ? "all" : kept} of the `
     + `${series.ids.length} pairs; of ${Object.keys(series.run.views).length} up to 300 a side, of the others up to 24.`;
 }
+
+// A path that does not fit in a line is broken behind a slash.
+const breakable = (name) => name.split(/(?<=\/)/).flatMap((part, k) => (k ? [element("wbr"), part] : [part]));
 
 function drawPager(pages) {
   const turn = (by) => () => {

@@ -4,7 +4,7 @@ const PERCENT = { label: "pairs", domain: [0, 1], percent: true };
 const RECALLS = [
   { title: "Rotation", key: "rotation_error_deg", label: "rotation error, degrees", linear: 20, log: [0.01, 180] },
   { title: "Translation", key: "translation_error", label: "translation error, scene units", linear: 1, log: [0.001, 10] },
-  { title: "Rotation, with translation error up to 0.5", key: "rotation_error_deg", joint: 0.5,
+  { title: "Rotation, translation within 0.5", key: "rotation_error_deg", joint: 0.5,
     label: "rotation error, degrees", linear: 20, log: [0.01, 180] },
   { title: "Reprojection", key: "reprojection_error_deg", label: "reprojection error, degrees", linear: 2, log: [0.01, 180] },
 ];

@@ -58,7 +58,7 @@ function drawScene(view, cameras) {
       pen.fillRect(x - 1.2, y - 1.2, 2.4, 2.4);
     }
     const taken = [];
-    for (const { corners, colour, name } of shapes) drawCamera(pen, corners.map(place), resolved(colour), name, taken);
+    for (const { corners, ...camera } of shapes) drawCamera(pen, corners.map(place), camera, taken);
   };
   turning.draw();
   const absent = cameras.filter((camera) => !drawn.includes(camera)).map(({ name }) => name);
@@ -68,9 +68,11 @@ function drawScene(view, cameras) {
 }
 
 // taken: the boxes [left, right, y] of the names drawn so far, which this one evades downwards.
-function drawCamera(pen, [centre, ...corners], colour, name, taken) {
-  pen.strokeStyle = pen.fillStyle = colour;
-  pen.lineWidth = 1.8;
+// Dashes are those of the estimate's curves; the true camera, drawn first, is wider: where they agree both are seen.
+function drawCamera(pen, [centre, ...corners], { colour, dashes = [], name, upright }, taken) {
+  pen.strokeStyle = pen.fillStyle = resolved(colour);
+  pen.lineWidth = upright ? 3.5 : 1.8;
+  pen.setLineDash(dashes);
   pen.beginPath();
   corners.forEach((corner, i) => {
     pen.moveTo(...centre);
@@ -78,6 +80,7 @@ function drawCamera(pen, [centre, ...corners], colour, name, taken) {
     pen.lineTo(...corners[(i + 1) % 4]);
   });
   pen.stroke();
+  pen.setLineDash([]);
   pen.font = "12px system-ui, sans-serif";
   // The name stands behind the camera, out of its way.
   const back = centre.map((value, i) => value - corners.reduce((sum, corner) => sum + corner[i], 0) / 4);
