@@ -4,6 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 from lightning import LightningModule, Trainer
+from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
 
 from bpnp.datamodules.colmap import ColmapDataModule
@@ -162,6 +163,8 @@ def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:
     for stage in ("fit", "validate"):
         with pytest.raises(ValueError, match=f"expected scenes for {stage}, got none left of s0"):
             data.setup(stage)
+    with pytest.raises(ValueError, match="expected scenes for fit, got"):
+        data.setup(TrainerFn.FITTING)
 
 
 class OneWeight(LightningModule):

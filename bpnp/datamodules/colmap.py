@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from lightning import LightningDataModule
+from lightning.pytorch.trainer.states import TrainerFn
 from torch.utils.data import DataLoader
 
 from bpnp.datamodules.batching import PairSource, pair_loader
@@ -125,8 +126,9 @@ class ColmapDataModule(LightningDataModule):
                 fresh = self.fresh_subsets and part == "train"
                 self.sources[part] = harder(source, outliers, seed=self.seed, fresh=fresh)
             elif stage is not None and (stage, part) != ("fit", "val"):
+                name = stage.value if isinstance(stage, TrainerFn) else stage
                 raise ValueError(
-                    f"expected scenes for {stage}, got none left of {', '.join(scenes)}; try to name them in the "
+                    f"expected scenes for {name}, got none left of {', '.join(scenes)}; try to name them in the "
                     "*_scenes arguments, or other fractions"
                 )
 
