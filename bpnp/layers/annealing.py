@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.layers import alignment
+from bpnp.layers.alignment import descend as descend_in_torch
 from bpnp.layers.kernels import descend
 from bpnp.layers.pool import SAME_DEG, SAME_SHIFT, Pool, distinct
 from bpnp.layers.scene import Scene
@@ -96,7 +96,7 @@ def _descend(
     if scene.device is not None:
         f, a, p, b = (torch.as_tensor(x, device=scene.device) for x in clusters)
         turns, shifts = (torch.as_tensor(x, device=scene.device) for x in (rotation, translation))
-        ends = alignment.descend(f.T, a, p.T, b, turns, shifts, scales.tolist(), float(outlier), float(RELAXATION))
+        ends = descend_in_torch(f.T, a, p.T, b, turns, shifts, scales.tolist(), float(outlier), float(RELAXATION))
         rotation[:], translation[:], score[:] = (x.cpu().numpy() for x in ends)
         return
     spread(
