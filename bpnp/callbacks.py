@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -61,6 +62,46 @@ class PoseLossWarmup(Callback):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.switched_at = state_dict["switched_at"]
+
+
+class LearningRateSchedule(Callback):
+    """Linear warm-up, then the model's learning rate, then a half cosine down to `final` of it.
+
+    The rate depends on the step alone, so that a resumed run goes on where it was, or on another schedule.
+
+    Args:
+        warmup_steps: optimiser steps until the full rate.
+        decay_start: step at which the rate begins to fall; null for never.
+        decay_steps: steps of the fall.
+        final: factor on the rate from then on.
+    """
+
+    def __init__(
+        self, warmup_steps: int = 200, decay_start: int | None = None, decay_steps: int = 1000, final: float = 0.02
+    ) -> None:
+        if warmup_steps < 0 or (decay_start or 0) < 0 or decay_steps < 1 or not 0 <= final <= 1:
+            raise ValueError(
+                "expected warmup_steps, decay_start >= 0, decay_steps >= 1 and final in [0, 1], got "
+                f"{warmup_steps}, {decay_start}, {decay_steps} and {final}"
+            )
+        self.warmup_steps = warmup_steps
+        self.decay_start = decay_start
+        self.decay_steps = decay_steps
+        self.final = final
+
+    def factor(self, step: int) -> float:
+        """On the learning rate, at a step."""
+        rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
+        if self.decay_start is None:
+            return rise
+        done = min(1.0, max(0.0, (step - self.decay_start) / self.decay_steps))
+        return rise * (self.final + (1 - self.final) * (1 + math.cos(math.pi * done)) / 2)
+
+    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
+        rate = float(pl_module.learning_rate) * self.factor(trainer.global_step)  # type: ignore[arg-type]
+        for optimizer in trainer.optimizers:
+            for group in optimizer.param_groups:
+                group["lr"] = rate
 
 
 class CompileNets(Callback):
