@@ -6,6 +6,7 @@ from torch import Tensor
 
 from bpnp.layers import memory
 from bpnp.layers.fused import conjugate_gradients, moments, outer_products, projected, square_product
+from bpnp.layers.laplacian import times, transpose_times
 
 LIMIT = 200
 
@@ -121,3 +122,15 @@ def test_large_results_can_be_used_like_others(dtype: torch.dtype, monkeypatch: 
     others = [memory.empty(torch.Size((3, 100, 11)), dtype=dtype, device=torch.device("cpu")).zero_() for _ in range(9)]
     assert torch.equal(kept, expected)
     assert all((other == 0).all() for other in others)
+
+
+@pytest.mark.parametrize("shape", [(20_000, 3), (3, 20_000), (4097, 4100)])
+def test_long_sums_keep_their_digits(shape: tuple[int, int]) -> None:
+    """Sums of thousands of terms to the rounding of their result, as float64 gives them."""
+    torch.manual_seed(3)
+    matrix = torch.rand(2, *shape)
+    x, y = torch.rand(2, shape[1]), torch.rand(2, shape[0])
+    exact = (matrix.double() @ x.double().unsqueeze(-1)).squeeze(-1)
+    assert ((times(matrix, x) - exact).abs() / exact).max() < 4e-7
+    exact = (y.double().unsqueeze(-2) @ matrix.double()).squeeze(-2)
+    assert ((transpose_times(matrix, y) - exact).abs() / exact).max() < 4e-7

@@ -24,6 +24,7 @@ COMPILE: dict[str, Any] = {
     "nogil": True,
     "cache": True,
 }
+SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
 
 
 def compiled(function: Callable[..., Any]) -> Any:
@@ -99,8 +100,8 @@ def _moments(start: int, stop: int, plan: Any, gradient: Any, rows: Any, means: 
     m, n = plan.shape[1:]
     for s in range(start, stop):
         mass, pull = cols[s], centred[s]
-        mass[:] = 0
-        pull[:] = 0
+        short_mass, short_pull = np.zeros_like(mass), np.zeros_like(pull)
+        long_mass, long_pull = np.zeros(n), np.zeros(n)
         for i in range(m):
             row, slope = plan[s, i], gradient[s, i]
             total, weighted = mass.dtype.type(0), mass.dtype.type(0)
@@ -110,8 +111,13 @@ def _moments(start: int, stop: int, plan: Any, gradient: Any, rows: Any, means: 
             mean = weighted / total if total > 0 else mass.dtype.type(0)
             rows[s, i], means[s, i] = total, mean
             for j in range(n):
-                mass[j] += row[j]
-                pull[j] += row[j] * (slope[j] - mean)
+                short_mass[j] += row[j]
+                short_pull[j] += row[j] * (slope[j] - mean)
+            if i % SHORT_COLUMN == SHORT_COLUMN - 1 or i == m - 1:
+                _flush(short_mass, long_mass)
+                _flush(short_pull, long_pull)
+        mass[:] = long_mass
+        pull[:] = long_pull
 
 
 @compiled
@@ -149,35 +155,57 @@ def _project(start: int, stop: int, plan: Any, gradient: Any, a: Any, b: Any, fa
 
 
 @compiled
-def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, total: Any) -> None:
-    """y = before . (K x) and total = K^T (after . y), four rows at a time."""
+def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, total: Any) -> None:
+    """y = before . (K x) and total = K^T (after . y), four rows at a time.
+
+    Sums of thousands of terms in float32 lose the digits in which the Laplacian's terms differ: they are kept short,
+    and added up in float64 (`total`).
+    """
     m, n = kernel.shape
+    zero = part.dtype.type(0)
     total[:] = 0
+    part[:] = 0
     whole = m - m % 4
     for i in range(0, whole, 4):
         row0, row1, row2, row3 = kernel[i], kernel[i + 1], kernel[i + 2], kernel[i + 3]
-        dot0 = dot1 = dot2 = dot3 = total.dtype.type(0)
-        for j in range(n):
-            dot0 += row0[j] * x[j]
-            dot1 += row1[j] * x[j]
-            dot2 += row2[j] * x[j]
-            dot3 += row3[j] * x[j]
+        dot0 = dot1 = dot2 = dot3 = 0.0
+        for start in range(0, n, SHORT_ROW):
+            sum0 = sum1 = sum2 = sum3 = zero
+            for j in range(start, min(start + SHORT_ROW, n)):
+                sum0 += row0[j] * x[j]
+                sum1 += row1[j] * x[j]
+                sum2 += row2[j] * x[j]
+                sum3 += row3[j] * x[j]
+            dot0 += sum0
+            dot1 += sum1
+            dot2 += sum2
+            dot3 += sum3
         y[i], y[i + 1], y[i + 2], y[i + 3] = dot0, dot1, dot2, dot3
         for k in range(i, i + 4):
             y[k] *= before[k]
-        dot0, dot1 = after[i] * y[i], after[i + 1] * y[i + 1]
-        dot2, dot3 = after[i + 2] * y[i + 2], after[i + 3] * y[i + 3]
+        mean0, mean1 = after[i] * y[i], after[i + 1] * y[i + 1]
+        mean2, mean3 = after[i + 2] * y[i + 2], after[i + 3] * y[i + 3]
         for j in range(n):
-            total[j] += (dot0 * row0[j] + dot1 * row1[j]) + (dot2 * row2[j] + dot3 * row3[j])
+            part[j] += (mean0 * row0[j] + mean1 * row1[j]) + (mean2 * row2[j] + mean3 * row3[j])
+        if i % SHORT_COLUMN == SHORT_COLUMN - 4:
+            _flush(part, total)
     for i in range(whole, m):
         row = kernel[i]
-        dot = total.dtype.type(0)
+        dot0 = 0.0
         for j in range(n):
-            dot += row[j] * x[j]
-        y[i] = before[i] * dot
-        dot = after[i] * y[i]
+            dot0 += row[j] * x[j]
+        y[i] = before[i] * dot0
+        mean0 = after[i] * y[i]
         for j in range(n):
-            total[j] += dot * row[j]
+            part[j] += mean0 * row[j]
+    _flush(part, total)
+
+
+@compiled
+def _flush(part: Any, total: Any) -> None:
+    for j in range(len(part)):
+        total[j] += part[j]
+        part[j] = 0
 
 
 @compiled
@@ -190,14 +218,14 @@ def _solve(
         unit = np.where(cols[s] > 0, 1 / cols[s], 0).astype(rhs.dtype)
         before = np.where(rows[s] > 0, alpha[s] / rows[s], 0).astype(rhs.dtype)
         r, p = rhs[s].copy(), inverse * rhs[s]
-        y, total = np.empty_like(rows[s]), np.empty_like(r)
+        y, part, total = np.empty_like(rows[s]), np.empty_like(r), np.empty(len(r))
         rz, target = (r * p).sum(), (unit * r * r).sum() * tolerance[s] ** 2
         solved[s] = not rz > 0
         for _ in range(limit[s]):
             if solved[s]:
                 break
-            _products(kernel[s], beta[s] * p, before, alpha[s], y, total)
-            sp = cols[s] * p - beta[s] * total
+            _products(kernel[s], beta[s] * p, before, alpha[s], y, part, total)
+            sp = (cols[s] * p - beta[s] * total).astype(rhs.dtype)
             curvature = (p * sp).sum()
             if not curvature > 0:
                 break
