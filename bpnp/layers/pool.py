@@ -12,7 +12,7 @@ from bpnp.layers.starts import Array
 SAME_DEG, SAME_SHIFT = 3.0, 0.05  # poses closer than this, in degrees and in extents of the scene, are one
 OTHER_DEG = 10.0  # poses farther apart than this answer differently
 FAR_AHEAD, FAR_HITS, AHEAD, SAFE_HITS = 100.0, 2, 20.0, 4  # nats, and batches that found the pose
-SAFE_MATCHED, OVER_CHANCE, PLAUSIBLE = 0.2, 6.0, 2.0
+SAFE_MATCHED, OVER_CHANCE, PLAUSIBLE, PLAUSIBLE_MATCHED = 0.2, 6.0, 2.0, 0.25
 MOST_STALLED, BETTER = 4, 0.002  # batches, and nats a bearing
 
 
@@ -85,9 +85,14 @@ def unique(pool: Pool, scene: Scene) -> bool:
 
 
 def plausible(pool: Pool, scene: Scene) -> bool:
-    """Whether the residuals are about the spacing of the bearings or less: larger ones say that only a shape fits."""
+    """Whether the residuals are about the spacing of the bearings or less, and enough points are matched.
+
+    Larger residuals say that only a shape fits. Any pose has some neighbours: wrong ones of sparse points had up to a
+    quarter of the points matched.
+    """
+    _, matched, scale = pool.result[0]
     spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.bearings))
-    return float(pool.result[0, 2]) < PLAUSIBLE * spacing
+    return bool(scale < PLAUSIBLE * spacing and matched > PLAUSIBLE_MATCHED)
 
 
 def lead(pool: Pool, scene: Scene) -> float:

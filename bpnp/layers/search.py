@@ -29,7 +29,7 @@ class Candidates(NamedTuple):
     score: mean log-likelihood of the bearings, nats. matched: expected share of min(m, n) that is matched.
     scale: standard deviation of the residuals per axis, radians, at which score and matched were taken.
     stats: iterations are batches of starts; converged where more of them would hardly have changed the best pose.
-    plausible: whether the best pose's residuals are about the spacing of the bearings or less.
+    plausible: whether the best pose fits about as closely as the bearings lie and matches enough of them.
     """
 
     rotation: Float[Tensor, "b c 3 3"]
