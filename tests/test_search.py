@@ -163,3 +163,16 @@ def test_a_time_limit_ends_the_search():
     *_, stats = search(f, p, time_limit=1e-6)
     assert stats.iterations.item() == 0
     assert np.isinf(stats.residual.item())
+
+
+def test_points_at_the_end_of_the_world_do_not_matter(problem):
+    """A reconstruction's few points far away decide neither where the search starts nor its scale."""
+    torch.manual_seed(5)
+    points3d, rays = problem.points3d[:1].clone(), problem.bearings[:1].clone()
+    far = torch.randperm(points3d.shape[1])[:4]
+    points3d[0, far] *= 1e5
+    camera = points3d[0, far] @ problem.rotation[0].T + problem.translation[0]
+    rays[0, far] = torch.nn.functional.normalize(camera, dim=-1)
+    rotation, _, stats = search(rays, points3d, max_batches=8)
+    assert bool(stats.converged[0])
+    assert rotation_error(rotation, problem.rotation[:1]).item() < 1

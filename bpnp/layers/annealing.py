@@ -46,7 +46,7 @@ SHARES = (0.03, 0.6)  # of outliers, tried at the end beside the expected one
 
 def run_batch(scene: Scene, recipe: Recipe, prior: Prior | None, pool: Pool | None, fine_outliers: float) -> Pool:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    rotation, translation = draw_poses(scene.bearings, scene.points3d, STARTS, recipe.spread, prior, scene.rng)
+    rotation, translation = draw_poses(scene.bearings, scene.near3d, STARTS, recipe.spread, prior, scene.rng)
     score = np.empty(len(rotation), np.float32)
     outlier = scene.outlier_density(recipe.outliers)
     scales = _scales(scene.spread, recipe.first_scale, COARSE_SCALE, COARSE_ROUNDS)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,11 +15,15 @@ from bpnp.layers.starts import Array, GravityPrior, Prior, angular_spread, solid
 SAMPLED = 8  # points a cluster, from which its centre is found
 ITERATIONS = 5
 MINIMUM = 4  # points of either side
+FAR = 20.0
 FLAT = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Scene:
     """One pair, centred and scaled to unit extent, each side in a random order, and its clusters.
+
+    The few points of a reconstruction that lie orders of magnitude away decide neither centre nor extent (`near3d` are
+    the others).
 
     device: where starts are aligned to clusters, in torch; None for compiled loops on the host.
     """
@@ -32,10 +37,12 @@ class Scene:
     ) -> None:
         self.device = device
         self.rng = np.random.default_rng(seed)
-        self.centre = points3d.mean(0)
-        self.size = max(float(np.sqrt(((points3d - self.centre) ** 2).sum(-1).mean())), 1e-30)
+        near = points3d[_is_near(points3d)]
+        self.centre = near.mean(0)
+        self.size = max(float(np.sqrt(((near - self.centre) ** 2).sum(-1).mean())), 1e-30)
         self.bearings = self.rng.permutation(bearings).astype(np.float32)
         self.points3d = self.rng.permutation((points3d - self.centre) / self.size).astype(np.float32)
+        self.near3d = self.points3d[_is_near(self.points3d)]
         self.spread, self.solid_angle = angular_spread(self.bearings), solid_angle(self.bearings)
 
     def outlier_density(self, share: float) -> np.float32:
@@ -74,6 +81,12 @@ def degenerate(points: NDArray[np.float64]) -> bool:
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     extent = max(float(np.abs(points).max()), float(values[0]))
     return bool(values[0] <= 1e-9 * extent or values[1] <= FLAT * values[0])
+
+
+def _is_near(points: NDArray[Any]) -> NDArray[np.bool_]:
+    """Which points are within FAR median distances of the median."""
+    distance = np.linalg.norm(points - np.median(points, 0), axis=-1)
+    return np.asarray(distance <= FAR * max(float(np.median(distance)), 1e-30))
 
 
 def _clusters(points: Array, count: int, rng: np.random.Generator) -> tuple[Array, Array]:
