@@ -16,6 +16,7 @@ from bpnp.layers.refine import Refine
 from bpnp.layers.sinkhorn import Sinkhorn
 from bpnp.models.checkpoint import read_checkpoint
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
+from bpnp.models.pretrained import pretrained_path
 from bpnp.types import Batch, Pose, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
@@ -131,6 +132,14 @@ class BPnPNet(nn.Module):
         state = {k.removeprefix(prefix): v for k, v in content["state_dict"].items() if k.startswith(prefix)}
         net.load_state_dict(state)
         return net.eval()
+
+    @classmethod
+    def from_pretrained(cls, name: str) -> "BPnPNet":
+        """A network with weights of this package, in evaluation mode; `docs/model-card.md` tells what they can do.
+
+        name: "procedural-so3". Raises ValueError that lists the names for any other. Nothing is downloaded.
+        """
+        return cls.from_checkpoint(pretrained_path(name))
 
 
 @full_precision

@@ -9,16 +9,21 @@ import torch
 
 from bpnp.layers.starts import GravityPrior, PosePrior
 from bpnp.models import BPnPNet
+from bpnp.models.pretrained import LEARNED
 
 Prior = PosePrior | GravityPrior | BPnPNet
 
 
 def checked_prior(given: Any) -> Prior | None:
-    """A prior with its numbers as float64 tensors, or the net of a checkpoint. Raises ValueError for anything else."""
+    """A prior with its numbers as float64 tensors, or a net: itself, of a checkpoint, or "learned", the packaged one.
+
+    Raises ValueError for anything else.
+    """
     if given is None or isinstance(given, BPnPNet):
         return given
     if isinstance(given, (str, Path)):
-        return BPnPNet.from_checkpoint(given)
+        learned = str(given) == "learned"
+        return BPnPNet.from_pretrained(LEARNED) if learned else BPnPNet.from_checkpoint(given)
     if isinstance(given, PosePrior):
         rotation = _tensor("prior.rotation", given.rotation, (3, 3))
         if (rotation @ rotation.mT - torch.eye(3)).abs().max() > 1e-3 or torch.linalg.det(rotation) < 0:
@@ -34,7 +39,9 @@ def checked_prior(given: Any) -> Prior | None:
         if not (camera.norm() > 0 and scene.norm() > 0 and given.sigma_deg > 0):
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {given}")
         return GravityPrior(camera, scene, given.sigma_deg)
-    raise ValueError(f"expected `prior` as PosePrior, GravityPrior, BPnPNet or its checkpoint, got {given!r:.60}")
+    raise ValueError(
+        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, its checkpoint or 'learned', got {given!r:.60}"
+    )
 
 
 def _tensor(name: str, values: Any, shape: tuple[int, ...]) -> torch.Tensor:

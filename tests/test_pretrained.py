@@ -1,0 +1,90 @@
+"""The packaged weights: found by name, offline, and good on shapes that they were not trained on."""
+
+import tomllib
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bpnp import Batch, BPnPNet, solve
+from bpnp.datamodules import MeshDataModule
+from bpnp.metrics import rotation_error
+from bpnp.models.pretrained import LEARNED, pack, pretrained_names, pretrained_path
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """Views of test shapes from every side, scaled by 7 and moved: the units of a scene are its own."""
+    data = MeshDataModule(
+        rotation="so3",
+        num_points=64,
+        pool_size=64,
+        test_shapes=24,
+        batch_size=24,
+        cache_dir=str(tmp_path_factory.mktemp("c")),
+    )
+    data.setup("test")
+    return next(iter(data.test_dataloader()))
+
+
+def test_every_packaged_file_is_in_the_wheel() -> None:
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["bpnp"]
+    files = sorted((ROOT / "bpnp" / "weights").iterdir())
+    assert f"{LEARNED}.ckpt" in [file.name for file in files]
+    for file in files:
+        assert any(fnmatch(f"weights/{file.name}", pattern) for pattern in patterns), file
+        assert file.stat().st_size < 8e6
+    assert LEARNED in pretrained_names()
+    assert pretrained_path(LEARNED).is_file()
+
+
+def test_an_unknown_name_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match="expected the name of packaged weights, got '../x'; try .*procedural-so3"):
+        BPnPNet.from_pretrained("../x")
+
+
+def test_the_weights_find_unseen_shapes_from_every_side(unseen: Batch) -> None:
+    """Median rotation error; chance is beyond 120 degrees."""
+    assert unseen.rotation is not None
+    net = BPnPNet.from_pretrained(LEARNED)
+    assert not net.training
+    with torch.no_grad():
+        poses = net(unseen).poses
+    assert float(rotation_error(poses["ransac"].rotation, unseen.rotation).median()) < 5
+    assert float(rotation_error(poses["refined"].rotation, unseen.rotation).median()) < 1
+
+
+def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -> None:
+    assert unseen.rotation is not None
+    x, p = unseen.points2d[0], 7 * unseen.points3d[0] + torch.tensor([5.0, -3.0, 1.0])
+    solution = solve(x, p, prior="learned")
+    of_net = solve(x, p, prior=BPnPNet.from_pretrained(LEARNED))
+    np.testing.assert_array_equal(solution.rotation, of_net.rotation)
+    assert solution.verdict == "confident"
+    relative = torch.as_tensor(solution.rotation)[None]
+    assert float(rotation_error(relative, unseen.rotation[:1].double())) < 1
+
+
+def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) -> None:
+    net = BPnPNet(channels=16, blocks=2, normalise_scene=True).eval()
+    content = {
+        "solver": {"class": "BPnPNet", "settings": net.settings},
+        "state_dict": {f"solver.{key}": value for key, value in net.state_dict().items()} | {"skipped": torch.zeros(2)},
+        "optimizer_states": [torch.zeros(1000)],
+    }
+    torch.save(content, tmp_path / "whole.ckpt")
+    pack(tmp_path / "whole.ckpt", tmp_path / "out" / "packed.ckpt")
+    assert set(torch.load(tmp_path / "out" / "packed.ckpt", weights_only=True)) == {"solver", "state_dict"}
+    assert (tmp_path / "out" / "packed.ckpt").stat().st_size < 0.6 * (tmp_path / "whole.ckpt").stat().st_size
+    packed = BPnPNet.from_checkpoint(tmp_path / "out" / "packed.ckpt")
+    with torch.no_grad():
+        np.testing.assert_allclose(packed.cost(unseen), net.cost(unseen), atol=5e-3)
+    content["state_dict"]["solver.features2d.enter.bias"] = torch.full((16,), 1e6)
+    torch.save(content, tmp_path / "large.ckpt")
+    with pytest.raises(ValueError, match="within float16's range, got others in solver.features2d.enter.bias"):
+        pack(tmp_path / "large.ckpt", tmp_path / "large_packed.ckpt")
+    assert not (tmp_path / "large_packed.ckpt").exists()
