@@ -33,9 +33,8 @@ def main() -> None:
         error = float(rotation_error(torch.as_tensor(solution.rotation), torch.as_tensor(np.asarray(pair.rotation))))
         figure = solution_picture(solution, title=f"{pair.name}: {error:.3g} deg off")
         path = save_figure(figure, options.output / f"solve-{data}-{number}.png")
-        print(
-            f"{path}: {solution.verdict}, {error:.3g} deg off, {solution.inlier_count} matches, {solution.seconds:.1f} s"
-        )
+        count, seconds = solution.inlier_count, solution.seconds
+        print(f"{path}: {solution.verdict}, {error:.3g} deg off, {count} matches, {seconds:.1f} s")
 
 
 if __name__ == "__main__":
