@@ -3,7 +3,6 @@
 import csv
 import io
 import math
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
+from bpnp.files import written_whole
 from bpnp.models.checkpoint import read_checkpoint
 from bpnp.report import report
 from bpnp.report.results import PairRow, write_results
@@ -220,10 +220,8 @@ def _write_poses(path: Path, rows: Sequence[Sequence[Any]]) -> None:
     writer = csv.writer(table)
     writer.writerow(POSE_COLUMNS)
     writer.writerows(rows)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    temporary.write_text(table.getvalue(), encoding="utf-8")
-    os.replace(temporary, path)
+    with written_whole(path) as temporary:
+        temporary.write_text(table.getvalue(), encoding="utf-8")
 
 
 def _checkpoint(trainer: Trainer) -> str | None:

@@ -14,6 +14,7 @@ from rich.console import Console
 
 from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
 from bpnp.datamodules.preprocessed import prepare_preprocessed
+from bpnp.files import written_whole
 from bpnp.models.released import load_released
 from bpnp.task import BlindPnPTask
 
@@ -47,13 +48,8 @@ def convert_weights(arguments: list[str]) -> None:
         "state_dict": task.state_dict(),
     }
     task.on_save_checkpoint(checkpoint)
-    chosen.out.parent.mkdir(parents=True, exist_ok=True)
-    temporary = chosen.out.with_name(f".{chosen.out.name}.{os.getpid()}")
-    try:
+    with written_whole(chosen.out) as temporary:
         torch.save(checkpoint, temporary)
-        os.replace(temporary, chosen.out)
-    finally:
-        temporary.unlink(missing_ok=True)
     logger.info("wrote %s", chosen.out)
 
 

@@ -171,7 +171,7 @@ def test_a_failed_write_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.
     def fail(*_: object) -> None:
         raise OSError("disk full")
 
-    monkeypatch.setattr("bpnp.report.results.os.replace", fail)
+    monkeypatch.setattr("bpnp.files.os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_results(tmp_path, [row(0), row(1)])
     assert [path.name for path in tmp_path.iterdir()] == ["pairs.csv"]

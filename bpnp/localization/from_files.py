@@ -2,7 +2,6 @@
 
 import argparse
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bpnp.api import solve
+from bpnp.files import written_whole
 from bpnp.layers.starts import PosePrior
 from bpnp.localization.point_files import read_camera, read_points
 from bpnp.localization.slow_progress import SlowProgress
@@ -141,13 +141,8 @@ def solution_table(solution: Solution) -> Table:
 
 def write_text(path: Path, text: str) -> Path:
     """Write a file whole or not at all."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

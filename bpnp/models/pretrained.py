@@ -1,12 +1,12 @@
 """The weights that come with the package: found by name, without a download."""
 
-import os
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from bpnp.files import written_whole
 from bpnp.models.checkpoint import read_checkpoint
 
 WEIGHTS = resources.files("bpnp") / "weights"
@@ -42,11 +42,5 @@ def pack(checkpoint: str | Path, out: str | Path) -> None:
             state[key] = value.half() if value.is_floating_point() else value
             if not state[key].isfinite().all():
                 raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
-    file = Path(out)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    temporary = file.with_name(f".{file.name}.{os.getpid()}")
-    try:
+    with written_whole(Path(out)) as temporary:
         torch.save({key: content[key] for key in KEPT if key in content} | {"state_dict": state}, temporary)
-        os.replace(temporary, file)
-    finally:
-        temporary.unlink(missing_ok=True)

@@ -4,13 +4,13 @@ Figures are made without pyplot: they need no display, no backend, and no closin
 """
 
 import io
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from bpnp.files import written_whole
 from bpnp.report.palette import DASHES, LIGHT, styles
 from bpnp.report.photos import box_of
 from bpnp.report.results import Results, read_results
@@ -115,13 +115,8 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
         raise ValueError(f"expected a file name that ends in {', '.join(SUFFIXES)}, got {path.name!r}")
     content = io.BytesIO()
     figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with written_whole(path) as temporary:
         temporary.write_bytes(content.getvalue())
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
     return path
 
 

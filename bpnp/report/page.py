@@ -6,7 +6,6 @@ pairs stay under 20 MB. What is drawn from them is in `assets`.
 
 import html
 import json
-import os
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from bpnp.files import written_whole
 from bpnp.report.causes import CAUSES, SOLVED_DEG, cause_of
 from bpnp.report.page_views import packed, page_sketches, page_view
 from bpnp.report.palette import DARK, DARK_BACKGROUND, DASHES, LIGHT, LIGHT_BACKGROUND, styles
@@ -54,13 +54,8 @@ def write_page(
     """
     output = Path(output)
     text = page_html(paths, paper=paper, photo=photo)
-    output.parent.mkdir(parents=True, exist_ok=True)
-    temporary = output.with_name(f".{output.name}.{os.getpid()}")
-    try:
+    with written_whole(output) as temporary:
         temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, output)
-    finally:
-        temporary.unlink(missing_ok=True)
     return output
 
 

@@ -8,7 +8,6 @@ import csv
 import io
 import json
 import math
-import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -19,6 +18,7 @@ from typing import Any
 
 import torch
 
+from bpnp.files import written_whole
 from bpnp.metrics import PoseErrors, RecallThresholds, quartiles, recalls
 
 FORMAT = 1
@@ -226,13 +226,9 @@ def _version() -> str:
 
 
 def _write(path: Path, text: str) -> None:
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
+    with written_whole(path) as temporary:
         # File names that are not UTF-8 reach us, and leave, as surrogates.
         temporary.write_text(text, encoding="utf-8", errors="surrogateescape", newline="")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _read(path: Path) -> str:

@@ -4,13 +4,13 @@
 """
 
 import io
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from bpnp.files import written_whole
 from bpnp.report.views import Array, PairView
 
 FORMAT = 1
@@ -102,14 +102,8 @@ def write_sketches(folder: Path | str, sketches: Sketches) -> None:
     arrays |= {f"estimate.{name}": poses for name, poses in sketches.estimates.items()}
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, format=np.array(FORMAT), **arrays)  # type: ignore[arg-type, unused-ignore]
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".{FILE}.{os.getpid()}"
-    try:
+    with written_whole(Path(folder) / FILE) as temporary:
         temporary.write_bytes(content.getvalue())
-        os.replace(temporary, folder / FILE)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_sketches(folder: Path | str) -> Sketches | None:

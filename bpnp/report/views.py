@@ -4,7 +4,6 @@ A test of ten thousand pairs keeps a few dozen. Which ones does not depend on th
 """
 
 import io
-import os
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from bpnp.files import written_whole
 from bpnp.metrics import rotation_error
 from bpnp.types import Batch, Prediction
 
@@ -137,14 +137,8 @@ def write_views(folder: Path | str, views: Iterable[PairView]) -> None:
         arrays |= {f"{number}.{name}": np.asarray(value) for name, value in parts.items()}
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".{FILE}.{os.getpid()}"
-    try:
+    with written_whole(Path(folder) / FILE) as temporary:
         temporary.write_bytes(content.getvalue())
-        os.replace(temporary, folder / FILE)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def read_views(folder: Path | str) -> tuple[PairView, ...]:
