@@ -4,32 +4,20 @@
 while it is in the cache, samples run on different cores without waiting for each other, and each stops by itself.
 """
 
-import inspect
-from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.layers.compiling import compiler
 from bpnp.layers.memory import empty
 from bpnp.layers.threads import spread
 
 # Sums in any order, as in `bpnp.layers.kernels`, but NaN and infinity keep their meaning: they flag a sample.
-COMPILE: dict[str, Any] = {
-    "fastmath": {"reassoc", "contract", "arcp", "nsz"},
-    "error_model": "numpy",
-    "nogil": True,
-    "cache": True,
-}
+compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Compile at the first call, without the wrappers that a type checker puts around a function at import."""
-    return numba.njit(inspect.unwrap(function), **COMPILE)
 
 
 def moments(

@@ -5,23 +5,17 @@ float32 and coordinate-major, (3, m) bearings and (3, n) points, so that loops o
 independent of each other, so that shares of them go to several threads.
 """
 
-import inspect
 import math
-from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 
+from bpnp.layers.compiling import compiler
+
 F = np.float32
-COMPILE: dict[str, Any] = {"fastmath": True, "nogil": True, "cache": True, "boundscheck": False}
+compiled = compiler(fastmath=True, boundscheck=False)
 LARGEST_TURN = 0.5  # radians in one step
 POWER = 256  # of the kernel: eight squarings
-
-
-def compiled(function: Callable[..., Any]) -> Any:
-    """Compile for the CPU, without the wrappers that a type checker puts around a function when it is imported."""
-    return numba.njit(inspect.unwrap(function), **COMPILE)
 
 
 @compiled

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.layers.fused import conjugate_gradients, moments, square_product
+from bpnp.layers.fused import SHORT_ROW, conjugate_gradients, moments, square_product
 from bpnp.layers.pacing import unfinished, waits
 
 CG_ITERATIONS = 150
@@ -19,7 +19,6 @@ CG_TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}
 CG_TOLERANCE_PROMOTED = 1e-8  # in float64 for float32 data
 SHARP = 16.0  # mass per sum of the degrees, beyond which float32 loses the gradient's fifth digit
 RIDGE = 1e-13
-SHORT = 2048  # terms that are added up in float32
 LOST = 100.0  # a degree of so many units of rounding has no digits as a difference
 
 
@@ -228,12 +227,12 @@ def transpose_times(matrix: Float[Tensor, "b m n"], a: Float[Tensor, "b m"]) -> 
 
 
 def _is_long(matrix: Tensor) -> bool:
-    return matrix.dtype == torch.float32 and matrix.device.type == "cpu" and max(matrix.shape[-2:]) > 2 * SHORT
+    return matrix.dtype == torch.float32 and matrix.device.type == "cpu" and max(matrix.shape[-2:]) > 2 * SHORT_ROW
 
 
 def _long_product(matrix: Float[Tensor, "b m n"], a: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
     """a^T M, its short sums added up in float64: one float32 sum of 15,000 terms is wrong by 1e-6."""
-    parts = zip(matrix.split(SHORT, -2), a.split(SHORT, -1), strict=True)
+    parts = zip(matrix.split(SHORT_ROW, -2), a.split(SHORT_ROW, -1), strict=True)
     total = torch.stack([(vector.unsqueeze(-2) @ rows).squeeze(-2) for rows, vector in parts])
     return total.sum(0, dtype=torch.float64).to(matrix.dtype)
 
