@@ -65,7 +65,7 @@ def refine_batch(scene: Scene, pool: Pool, outliers: float) -> Pool:
     """From the poses of a pool, and from poses shaken around them, through the finer clusters to all points."""
     rotation, translation = shaken(scene, pool)
     rotation, translation = np.concatenate([pool.rotation, rotation]), np.concatenate([pool.translation, translation])
-    clustered = _descend_further(scene, rotation.copy(), translation.copy(), 0, outliers, outliers)
+    clustered = _descend_further(scene, rotation, translation, 0, outliers, outliers)
     # A start that is right already needs no clusters, which would only shake it.
     direct = polish(
         scene, pool.rotation, pool.translation, pool.hits, MIDDLE_SCALE * scene.spread, outliers, bearings=FINE
@@ -124,7 +124,7 @@ def polish(
     scales = (first_scale * SHRINK ** np.arange(rounds)).astype(np.float32)
     result = np.empty((len(rotation), 3), np.float32)
     grid = build_grid(scene.bearings[:bearings], float(scales[-1]))
-    rotation, translation = np.ascontiguousarray(rotation), np.ascontiguousarray(translation)
+    rotation, translation = rotation.copy(), translation.copy()
     points, outlier = np.ascontiguousarray(scene.points3d.T), scene.outlier_density(outliers)
     spread(
         lambda i, j: descend_sparse(
@@ -147,8 +147,8 @@ def finish(scene: Scene, pool: Pool, outliers: float) -> Pool:
 
 def _again(scene: Scene, pool: Pool, i: int, outliers: float) -> Pool:
     first_scale = FINISH_SCALES * float(pool.result[i, 2])
-    rotation, translation = pool.rotation[[i]].copy(), pool.translation[[i]].copy()
-    return polish(scene, rotation, translation, pool.hits[[i]], first_scale, outliers, bearings=None)
+    own = pool.rotation[[i]], pool.translation[[i]], pool.hits[[i]]
+    return polish(scene, *own, first_scale, outliers, bearings=None)
 
 
 def _scales(spread: float, first: float, last: float, rounds: int) -> Array:

@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,7 +14,7 @@ from bpnp.layers.starts import Array, GravityPrior, Prior, angular_spread, solid
 SAMPLED = 8  # points a cluster, from which its centre is found
 ITERATIONS = 5
 MINIMUM = 4  # points of either side
-FAR = 20.0
+FAR = 20.0  # median distances from the median
 FLAT = 1e-6  # second singular value over the first, below which points lie on a line
 
 
@@ -37,12 +36,14 @@ class Scene:
     ) -> None:
         self.device = device
         self.rng = np.random.default_rng(seed)
-        near = points3d[_is_near(points3d)]
+        is_near = _is_near(points3d)
+        near = points3d[is_near]
         self.centre = near.mean(0)
         self.size = max(float(np.sqrt(((near - self.centre) ** 2).sum(-1).mean())), 1e-30)
         self.bearings = self.rng.permutation(bearings).astype(np.float32)
-        self.points3d = self.rng.permutation((points3d - self.centre) / self.size).astype(np.float32)
-        self.near3d = self.points3d[_is_near(self.points3d)]
+        order = self.rng.permutation(len(points3d))
+        self.points3d = ((points3d - self.centre) / self.size)[order].astype(np.float32)
+        self.near3d = self.points3d[is_near[order]]
         self.spread, self.solid_angle = angular_spread(self.bearings), solid_angle(self.bearings)
 
     def outlier_density(self, share: float) -> np.float32:
@@ -83,7 +84,7 @@ def degenerate(points: NDArray[np.float64]) -> bool:
     return bool(values[0] <= 1e-9 * extent or values[1] <= FLAT * values[0])
 
 
-def _is_near(points: NDArray[Any]) -> NDArray[np.bool_]:
+def _is_near(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which points are within FAR median distances of the median."""
     distance = np.linalg.norm(points - np.median(points, 0), axis=-1)
     return np.asarray(distance <= FAR * max(float(np.median(distance)), 1e-30))
