@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from bpnp.layers.search import Progress
 from bpnp.solving.arguments import device_from, each_camera, each_of, each_set, source_from
 from bpnp.solving.matching import count_one_to_one, fit_pose, mutual_nearest, one_to_one
 from bpnp.solving.priors import Prior, checked_prior
@@ -18,7 +18,6 @@ from bpnp.solving.problem import FEWEST, Array, Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, no_pose
 from bpnp.solving.sources import Found, Options, found_by
 
-Progress = Callable[[int, int, float], None]  # pair, batch of starts, seconds
 SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
 FIT_ROUNDS = 5
 SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand

@@ -5,9 +5,9 @@ from typing import Literal
 
 import torch
 
+from bpnp.accuracy import rotation_error
 from bpnp.layers.pool import AHEAD, OTHER_DEG
 from bpnp.layers.search import Candidates
-from bpnp.metrics import rotation_error
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 

@@ -80,9 +80,6 @@ def solve_parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--surface", type=int, metavar="COUNT", help="points to draw from a mesh; default: its vertices"
     )
-    parser.add_argument(
-        "--solver", default="search", help="search, or the checkpoint of a BPnPNet (default: %(default)s)"
-    )
     parser.add_argument("--prior", type=Path, metavar="FILE", help="rough pose: JSON of a solution, or a checkpoint")
     parser.add_argument("--prior-degrees", type=float, default=10.0, help="of its rotation (default: %(default)s)")
     parser.add_argument("--prior-distance", type=float, help="of its translation, scene units (default: unknown)")
@@ -93,6 +90,9 @@ def solve_parser() -> argparse.ArgumentParser:
 
 def add_search_options(parser: argparse.ArgumentParser) -> None:
     """The options of a search that `bpnp solve` and `bpnp localize` have in common."""
+    parser.add_argument(
+        "--solver", default="search", help="search, or the checkpoint of a BPnPNet (default: %(default)s)"
+    )
     parser.add_argument(
         "--inlier-threshold", "--inlier_threshold", type=float, help="largest error of a match, px with a camera"
     )

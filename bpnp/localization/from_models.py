@@ -109,9 +109,6 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, default=Path("runs/localize"), metavar="FOLDER", help="(default: %(default)s)"
     )
     parser.add_argument("--no-pictures", action="store_true", help="write no pictures")
-    parser.add_argument(
-        "--solver", default="search", help="search, or the checkpoint of a BPnPNet (default: %(default)s)"
-    )
     add_search_options(parser)
     return parser
 

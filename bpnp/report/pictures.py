@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bpnp.cameras import in_front
 from bpnp.report.palette import LIGHT
 from bpnp.report.photos import MARGIN, Box
 from bpnp.report.views import Array
@@ -47,7 +48,7 @@ def solution_picture(solution: Any, *, title: str | None = None, photo: Array | 
     size = float(np.clip(80 / np.sqrt(len(points2d)), 1.5, 6))
     axes.plot(*points2d.T, "o", mfc="none", mec="black", mew=0.6, ms=size, label="image points", zorder=3)
     if np.isfinite(solution.rotation).all() and np.isfinite(solution.translation).all():
-        projected = _projected(solution)
+        projected = in_front(np.asarray(solution.points3d) @ solution.rotation.T + solution.translation)[:, :2]
         free = np.ones(len(projected), bool)
         free[matches[:, 1]] = False
         axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
@@ -61,12 +62,6 @@ def solution_picture(solution: Any, *, title: str | None = None, photo: Array | 
     axes.set_xlabel(str(solution.reason).replace("$", r"\$"), fontsize=8, color=QUIET, wrap=True)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
-
-
-def _projected(solution: Any) -> Array:
-    camera = np.asarray(solution.points3d) @ solution.rotation.T + solution.translation
-    depth = np.where(camera[:, 2:] > 0, camera[:, 2:], np.nan)
-    return camera[:, :2] / depth
 
 
 def _described(solution: Any) -> str:

@@ -1,6 +1,7 @@
 """One problem from a user's arrays: checked, undistorted, and with the plane in which its residuals are measured."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -40,7 +41,7 @@ class Problem:
     camera: Camera | None
     degenerate: str | None
 
-    @property
+    @cached_property
     def local3d(self) -> Array:
         """The 3D points around `origin`."""
         return self.points3d - self.origin

@@ -4,15 +4,15 @@ import json
 import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from bpnp.solving.problem import Unit
+from bpnp.verdict import Verdict
 
 Array = npt.NDArray[np.float64]
-Verdict = Literal["confident", "ambiguous", "failed"]
 FORMAT = 1
 
 

@@ -1,7 +1,7 @@
 """Where the candidate poses of a solution come from: the search, a trained module, or one after the other."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -10,14 +10,14 @@ import roma
 import torch
 from torch import Tensor, nn
 
-from bpnp.layers.search import Candidates, search_candidates
+from bpnp.layers.search import Candidates, Progress, search_candidates
 from bpnp.layers.starts import GravityPrior, PosePrior
 from bpnp.models import BPnPNet
 from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
 from bpnp.solving.scoring import merged, scored
-from bpnp.solving.solution import Verdict
 from bpnp.types import Batch
+from bpnp.verdict import Verdict, judge
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
@@ -32,7 +32,7 @@ class Options(NamedTuple):
     seed: int
     time_limit: float | None
     device: torch.device
-    progress: Callable[[int, int, float], None] | None
+    progress: Progress | None
 
 
 class Found(NamedTuple):
@@ -100,7 +100,7 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
     return around if bool(around.stats.converged[0]) else merged(problem, around, run())
 
 
-def _report(report: Callable[[int, int, float], None], number: int, _: int, batch: int, seconds: float) -> None:
+def _report(report: Progress, number: int, _: int, batch: int, seconds: float) -> None:
     report(number, batch, seconds)
 
 
@@ -143,8 +143,6 @@ def _asked(module: nn.Module, members: list[Problem], options: Options) -> list[
 
 def _found(candidates: Candidates, problem: Problem, seconds: float) -> Found:
     """The filled slots, as rotations to the last digit, and the verdict."""
-    from bpnp.verdict import judge  # brings torchmetrics and matplotlib, which `import bpnp` does without
-
     verdict, reason = judge(candidates, 0, len(problem.bearings), len(problem.points3d))
     rotation, translation = candidates.rotation[0].double(), candidates.translation[0].double()
     filled = rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
