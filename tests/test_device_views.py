@@ -177,3 +177,8 @@ def test_meshes_that_a_camera_may_be_inside_are_refused() -> None:
         pairs = source(distance=1.0)
     with pytest.raises(ValueError, match="radius of 1 at `distance` 1.0; try views_on_device false"):
         DeviceViews(pairs, None, device=CPU)
+
+
+def test_outliers_drawn_for_each_pair_are_left_to_the_loader() -> None:
+    with pytest.raises(ValueError, match=r"one `ratio`.* got Outliers\(ratio=\(0.0, 1.0\).*try views_on_device false"):
+        DeviceViews(source(), Outliers(ratio=(0.0, 1.0)), device=CPU)

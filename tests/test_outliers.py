@@ -1,10 +1,14 @@
 """Outliers and occlusion: counts, bounds and distributions of the protocol; true pairs stay true."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
+from jsonargparse import ArgumentParser
 from scipy import stats
 
+from bpnp.datamodules import MeshDataModule
 from bpnp.datamodules.batching import Pair, PairSource
 from bpnp.datamodules.outliers import Outliers, harder, select, with_outliers
 
@@ -86,7 +90,60 @@ def test_a_source_with_outliers_is_deterministic() -> None:
     assert not np.array_equal(fresh.pair(0, 0).points2d, fresh.pair(0, 1).points2d)
 
 
-@pytest.mark.parametrize("bad", [{"ratio": -1.0}, {"ratio": np.nan}, {"occlusion": 1.0}])
-def test_wrong_options_are_named(bad: dict[str, float]) -> None:
+WRONG = [
+    {"ratio": -1.0}, {"ratio": np.nan}, {"ratio": (0.5, 0.2)}, {"ratio": (0.0, np.inf)}, {"occlusion": 1.0},
+    {"occlusion": (0.0, 1.0)},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("bad", WRONG)
+def test_wrong_options_are_named(bad: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
-        Outliers(**bad)
+        Outliers(**bad)  # type: ignore[arg-type]
+
+
+def test_ranges_are_drawn_uniformly_for_each_pair() -> None:
+    """Counts follow their ranges: ratio uniform in (0.2, 1.4), occlusion in (0.1, 0.5), each side a third."""
+    outliers = Outliers(ratio=(0.2, 1.4), side="random", occlusion=(0.1, 0.5), occluded_side="3d")
+    pair, added, left, sides = planted(), [], [], []
+    for seed in range(600):
+        result = with_outliers(pair, outliers, np.random.default_rng(seed))
+        true = int((result.match3d >= 0).sum())
+        outliers2d, outliers3d = len(result.points2d) - 60, len(result.points3d) - true
+        left.append(true / 60)
+        added.append(max(outliers2d, outliers3d) / true)
+        sides.append((outliers2d > 0) + 2 * (outliers3d > 0))
+        assert np.abs(residuals(result)).max() < 1e-6
+    assert 0.2 - 1 / 30 < min(added) < 0.25
+    assert 1.35 < max(added) <= 1.4
+    assert np.mean(added) == pytest.approx(0.8, abs=0.06)  # 4 standard errors
+    assert stats.kstest(1 - np.array(left), "uniform", (0.1, 0.4)).statistic < 0.08
+    assert stats.chisquare(np.bincount(sides)[1:]).pvalue > 1e-3
+    assert stats.spearmanr(added, left).pvalue > 1e-3
+
+
+def test_a_number_takes_none_of_the_random_numbers_of_a_range() -> None:
+    for same in (Outliers(ratio=(0.5, 0.5), occlusion=(0.25, 0.25)), Outliers(ratio=0.5, occlusion=0.25)):
+        result = with_outliers(planted(), same, np.random.default_rng(0))
+        assert (len(result.points2d), len(result.points3d)) == (45 + 22, 60 + 22)
+        assert same.fixed == (0.5, "both", 0.25, "2d")
+    assert Outliers(side="random").fixed is None
+    assert Outliers(occlusion=(0.0, 0.1)).fixed is None
+
+
+def test_a_source_of_drawn_ratios_is_deterministic_and_bounds_its_sizes() -> None:
+    fresh = harder(Planted(), Outliers(ratio=(0.0, 1.0)), seed=3, fresh=True)
+    counts = [len(fresh.pair(0, epoch).points2d) for epoch in range(40)]
+    assert counts == [len(fresh.pair(0, epoch).points2d) for epoch in range(40)]
+    assert len(set(counts)) > 20
+    assert max(counts) <= fresh.sizes[0] == 120
+
+
+def test_ranges_come_from_yaml(tmp_path: Path) -> None:
+    (tmp_path / "data.yaml").write_text("train_outliers: {ratio: [0, 1], side: random, occlusion: [0.1, 0.3]}\n")
+    parser = ArgumentParser()
+    parser.add_class_arguments(MeshDataModule, "data")
+    options = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'data.yaml'}"]))
+    assert options.data.outliers["train"] == Outliers((0.0, 1.0), "random", (0.1, 0.3))
+    options = parser.instantiate_classes(parser.parse_args(["--data.train_outliers={ratio: 0.5}"]))
+    assert options.data.outliers["train"] == Outliers(0.5)

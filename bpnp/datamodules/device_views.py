@@ -19,7 +19,7 @@ from torch import Tensor
 
 from bpnp.datamodules.batching import Key, PairDataset
 from bpnp.datamodules.mesh_source import MeshSource
-from bpnp.datamodules.outliers import MIN_TRUE, Outliers
+from bpnp.datamodules.outliers import MIN_TRUE, Amounts, Outliers
 from bpnp.datamodules.seeded import normal, permutations, row_keys, uniform
 from bpnp.datamodules.views import Views
 from bpnp.geometry import project, transform
@@ -64,7 +64,8 @@ class KeyDataset(PairDataset):
 class DeviceViews:
     """Makes the batches of a `MeshSource`, with outliers if there are any, on one device.
 
-    Raises ValueError if a camera could come too near to a point: a batch of one size cannot leave points out.
+    Raises ValueError if a camera could come too near to a point, or for outliers whose number is drawn for each pair:
+    a batch of one size cannot leave points out.
     """
 
     def __init__(self, source: MeshSource, outliers: Outliers | None, *, device: torch.device) -> None:
@@ -74,7 +75,13 @@ class DeviceViews:
                 f"{source.pools.radius:.3g} at `distance` {source.views.distance}; try views_on_device false, "
                 "normalisation unit_sphere or a larger distance"
             )
-        self.views, self.outliers = source.views, outliers or Outliers()
+        amounts = (outliers or Outliers()).fixed
+        if amounts is None:
+            raise ValueError(
+                f"expected outliers of one `ratio`, `occlusion` and side, to make views on the device, got {outliers}; "
+                "try views_on_device false"
+            )
+        self.views, self.outliers = source.views, amounts
         self.num_points, self.seed = source.num_points, source.seed
         self.samples = _on_device(source.pools.points, device)
 
@@ -125,9 +132,7 @@ def draw_poses(views: Views, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 
     return rotation, offset
 
 
-def _with_outliers(
-    points2d: Tensor, points3d: Tensor, outliers: Outliers, stream: Any
-) -> tuple[Tensor, Tensor, Tensor]:
+def _with_outliers(points2d: Tensor, points3d: Tensor, outliers: Amounts, stream: Any) -> tuple[Tensor, Tensor, Tensor]:
     """As `outliers.with_outliers`, for pairs whose 3D point j is 2D point j; the order of the true points is random."""
     n = points3d.shape[1]
     hidden = max(0, min(round(outliers.occlusion * n), n - MIN_TRUE))

@@ -37,7 +37,8 @@ class MeshDataModule(LightningDataModule):
         train_pairs: training pairs; pair i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed pairs of the paper.
         views_on_device: let a Trainer make the fresh training views in batches on its device; none for wherever that is
-            not a CPU. They have the distribution of the views that the loader draws, but are others.
+            not a CPU and every pair gets as many outliers. They have the distribution of the views that the loader
+            draws, but are others.
         val_fraction: share of the training meshes that is held out for validation.
         val_pairs: validation pairs, fixed; none for one per held-out mesh.
         test_pairs: test pairs, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
@@ -155,8 +156,9 @@ class MeshDataModule(LightningDataModule):
             return False
         if self.views_on_device is not None:
             return self.views_on_device
-        # A batch made at once has no room for points that a camera misses.
+        # A batch made at once has no room for points that a camera misses, or for pairs of different sizes.
         whole = self._viewed.views.sees_all(self._viewed.pools.radius)
+        whole &= self.outliers["train"] is None or self.outliers["train"].fixed is not None
         return whole and self.trainer.strategy.root_device.type != "cpu"
 
     def _loader(

@@ -1,7 +1,7 @@
 """Pairs made harder: subsets of their points, uniform outliers on either side, and occluded points."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,8 +9,19 @@ from numpy.typing import NDArray
 from bpnp.datamodules.batching import Pair, PairSource
 
 Side = Literal["both", "2d", "3d"]
+DrawnSide = Literal["both", "2d", "3d", "random"]
+Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each pair
 MIN_TRUE = 4  # pairs that occlusion leaves; fewer do not fix a pose
 STREAM = 7  # of random numbers, apart from those that drew the pair
+
+
+class Amounts(NamedTuple):
+    """What one pair gets of `Outliers`."""
+
+    ratio: float
+    side: Side
+    occlusion: float
+    occluded_side: Side
 
 
 @dataclass(frozen=True)
@@ -19,25 +30,66 @@ class Outliers:
 
     Args:
         ratio: rho, synthetic outliers as a ratio to the true pairs: int(rho * pairs) points, uniform in the
-            axis-aligned bounding box of the true points of that side; 1 makes half of the points outliers.
-        side: the side that gets them, both, 2d or 3d.
-        occlusion: share of the true pairs that lose one of their two points, so that the other has no partner.
-        occluded_side: where they lose it, 2d, 3d, or both for half of them here and half there.
+            axis-aligned bounding box of the true points of that side; 1 makes half of the points outliers. Two numbers,
+            [low, high], draw it for each pair, uniformly.
+        side: the side that gets them, both, 2d or 3d, or random for one of the three in each pair.
+        occlusion: share of the true pairs that lose one of their two points, so that the other has no partner; a number
+            or [low, high], as ratio.
+        occluded_side: where they lose it, 2d, 3d, or both for half of them here and half there; or random.
     """
 
-    ratio: float = 0.0
-    side: Side = "both"
-    occlusion: float = 0.0
-    occluded_side: Side = "2d"
+    ratio: Drawn = 0.0
+    side: DrawnSide = "both"
+    occlusion: Drawn = 0.0
+    occluded_side: DrawnSide = "2d"
 
     def __post_init__(self) -> None:
-        if not 0 <= self.ratio < np.inf:
-            raise ValueError(f"expected an outlier `ratio` of 0 or more, got {self.ratio}; 1 doubles the points")
-        if not 0 <= self.occlusion < 1:
-            raise ValueError(f"expected `occlusion` in [0, 1), got {self.occlusion}; 0.1 hides one point in ten")
+        low, high = bounds(self.ratio)
+        if not 0 <= low <= high < np.inf:
+            raise ValueError(
+                f"expected an outlier `ratio` of 0 or more, or (low, high), got {self.ratio}; 1 doubles the points"
+            )
+        low, high = bounds(self.occlusion)
+        if not 0 <= low <= high < 1:
+            raise ValueError(
+                f"expected `occlusion` in [0, 1), or (low, high), got {self.occlusion}; 0.1 hides one point in ten"
+            )
         for name in ("side", "occluded_side"):
-            if getattr(self, name) not in ("both", "2d", "3d"):
-                raise ValueError(f'expected `{name}` "both", "2d" or "3d", got {getattr(self, name)!r}')
+            if getattr(self, name) not in ("both", "2d", "3d", "random"):
+                raise ValueError(f'expected `{name}` "both", "2d", "3d" or "random", got {getattr(self, name)!r}')
+
+    @property
+    def fixed(self) -> Amounts | None:
+        """What every pair gets; none if it is drawn for each."""
+        ratio, occlusion = bounds(self.ratio), bounds(self.occlusion)
+        if ratio[0] < ratio[1] or occlusion[0] < occlusion[1] or "random" in (self.side, self.occluded_side):
+            return None
+        return self.drawn(np.random.default_rng())
+
+    def drawn(self, rng: np.random.Generator) -> Amounts:
+        """What a pair gets; takes numbers of `rng` for what is not fixed only."""
+        return Amounts(
+            draw(self.ratio, rng), draw_side(self.side, rng), draw(self.occlusion, rng),
+            draw_side(self.occluded_side, rng),
+        )  # fmt: skip
+
+
+def bounds(value: Drawn) -> tuple[float, float]:
+    """(low, high) of what `draw` gives."""
+    low, high = value if isinstance(value, (tuple, list)) else (value, value)
+    return low, high
+
+
+def draw(value: Drawn, rng: np.random.Generator) -> float:
+    """The number, or one between the two, uniformly."""
+    low, high = bounds(value)
+    return float(rng.uniform(low, high)) if low < high else low
+
+
+def draw_side(side: DrawnSide, rng: np.random.Generator) -> Side:
+    """The side, or for "random" each of the three equally often."""
+    sides: tuple[Side, ...] = ("both", "2d", "3d")
+    return sides[rng.integers(3)] if side == "random" else side
 
 
 def select(pair: Pair, kept2d: NDArray[np.int64], kept3d: NDArray[np.int64]) -> Pair:
@@ -57,9 +109,10 @@ def with_outliers(pair: Pair, outliers: Outliers, rng: np.random.Generator) -> P
 
     Occlusion leaves at least 4 true pairs. The outliers count relative to the true pairs that are left.
     """
+    amounts = outliers.drawn(rng)
     true3d = np.flatnonzero(pair.match3d >= 0)
-    hidden = max(0, min(round(outliers.occlusion * len(true3d)), len(true3d) - MIN_TRUE))
-    split = {"2d": hidden, "3d": 0, "both": hidden // 2}[outliers.occluded_side]
+    hidden = max(0, min(round(amounts.occlusion * len(true3d)), len(true3d) - MIN_TRUE))
+    split = {"2d": hidden, "3d": 0, "both": hidden // 2}[amounts.occluded_side]
     hidden3d = rng.permutation(true3d)[:hidden]
     pair = select(
         pair,
@@ -67,8 +120,8 @@ def with_outliers(pair: Pair, outliers: Outliers, rng: np.random.Generator) -> P
         np.setdiff1d(np.arange(len(pair.points3d)), hidden3d[split:]),
     )
     true3d = np.flatnonzero(pair.match3d >= 0)
-    count = int(outliers.ratio * len(true3d))
-    count2d, count3d = count * (outliers.side != "3d"), count * (outliers.side != "2d")
+    count = int(amounts.ratio * len(true3d))
+    count2d, count3d = count * (amounts.side != "3d"), count * (amounts.side != "2d")
     pair = replace(
         pair,
         points2d=np.concatenate([pair.points2d, _uniform(pair.points2d[pair.match3d[true3d]], count2d, rng)]),
@@ -95,7 +148,7 @@ class OutlierSource:
     def sizes(self) -> NDArray[np.int64]:
         """Most points of the larger side of each pair."""
         sizes = np.asarray(self.source.sizes)
-        return sizes + (self.outliers.ratio * sizes).astype(np.int64)
+        return sizes + (bounds(self.outliers.ratio)[1] * sizes).astype(np.int64)
 
     def pair(self, index: int, epoch: int) -> Pair:
         rng = np.random.default_rng([self.seed, STREAM, epoch if self.fresh else 0, index])
