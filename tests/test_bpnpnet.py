@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
+from bpnp.layers.annealing import SHAKES
 from bpnp.losses import correspondence_loss, pose_loss
 from bpnp.models.bpnpnet import pairwise_distance
 
@@ -62,6 +63,26 @@ def test_only_evaluation_refines_and_only_if_asked() -> None:
     assert tuple(BPnPNet(**SMALL).train()(batch).poses) == ("ransac", "pnp")
     without = BPnPNet(refine=False, **SMALL).eval()
     assert tuple(without(batch).poses) == without.estimates == ("ransac", "pnp")
+
+
+def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
+    batch = different_sizes(30, dtype=torch.float32)
+    torch.manual_seed(0)
+    net = BPnPNet(**SMALL).eval()
+    crowd = net(batch).poses["refined"].stats.iterations
+    net.hypotheses = 0
+    alone = net(batch).poses["refined"].stats.iterations
+    assert int(alone) <= 2 * (1 + SHAKES) < int(crowd)
+    with pytest.raises(ValueError, match="expected a number of `hypotheses`, got -1"):
+        BPnPNet(**SMALL, hypotheses=-1)
+
+
+def test_a_checkpoint_from_before_the_hypotheses_has_the_default(tmp_path: Path) -> None:
+    net = BPnPNet(**SMALL)
+    settings = {key: value for key, value in net.settings.items() if key != "hypotheses"}
+    state = {f"solver.{key}": value for key, value in net.state_dict().items()}
+    torch.save({"solver": {"class": "BPnPNet", "settings": settings}, "state_dict": state}, tmp_path / "old.ckpt")
+    assert BPnPNet.from_checkpoint(tmp_path / "old.ckpt").hypotheses == net.hypotheses
 
 
 def test_without_poses_none_is_solved() -> None:

@@ -1,14 +1,42 @@
-"""Pose refinement without correspondences: anneal the soft assignment from poses that are roughly right."""
+"""Pose refinement without correspondences: anneal the soft assignment from poses of which one is roughly right."""
+
+import math
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.layers.annealing import FINE_OUTLIERS, SHAKES, finish, refine_batch
-from bpnp.layers.pool import Pool, is_safe
+from bpnp.layers.annealing import (
+    COARSE,
+    COARSE_ROUNDS,
+    COARSE_SCALE,
+    FINE_OUTLIERS,
+    MIDDLE,
+    MIDDLE_ROUNDS,
+    MIDDLE_SCALE,
+    RECIPES,
+    RELAXATION,
+    SHAKEN,
+    SHAKES,
+    finish,
+    refine_batch,
+)
+from bpnp.layers.kernels import descend
+from bpnp.layers.pool import SAME_DEG, Pool, distinct, is_safe
 from bpnp.layers.scene import Scene, degenerate
+from bpnp.layers.starts import Array
+from bpnp.layers.threads import spread
 from bpnp.types import SolveStats
+
+FEW = 8  # starts that are annealed on all points; more compete on clusters for these places
+COMPETITORS = 32  # from the coarse clusters to the finer ones
+# Clusters of each side, first and last scale in spreads of the bearings, rounds, starts that go on.
+HEATS = (
+    (COARSE, RECIPES[0].first_scale, COARSE_SCALE, COARSE_ROUNDS, COMPETITORS),
+    (MIDDLE, COARSE_SCALE, MIDDLE_SCALE, MIDDLE_ROUNDS, FEW),
+)
 
 
 def refine(
@@ -24,7 +52,8 @@ def refine(
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
     """The likeliest pose that annealing reaches from s starts of each sample and from poses shaken around them.
 
-    The objective is that of `bpnp.layers.search_candidates`; a start may be some 10 degrees off. bearings: unit
+    The objective is that of `bpnp.layers.search_candidates`; a start may be some 10 degrees off, and more where there
+    are many: those beyond 8 are first annealed on clusters, as the search does, and the likeliest go on. bearings: unit
     vectors. points3d: any unit. rotation, translation: the starts; NaN for one that is missing.
     outliers: share of the points without a partner to expect, in (0, 1).
 
@@ -49,15 +78,39 @@ def refine(
         scene = Scene(image, cloud, seed)
         turns, shifts = rotation[i][found].detach().double(), translation[i][found].detach().double()
         starts = scene.enter(turns.cpu().numpy(), shifts.cpu().numpy())
-        hits = np.zeros(len(starts[0]), np.int64)
-        pool = refine_batch(scene, Pool(*starts, np.zeros((len(hits), 3), np.float32), hits), outliers)
+        crowd = len(turns)
+        if crowd > FEW:
+            starts = _winnowed(scene, *starts, outliers)
+        few = len(starts[0])
+        annealed[i] = crowd + min(few, SHAKEN) * SHAKES
+        none = np.zeros((few, 3), np.float32), np.zeros(few, np.int64)
+        pool = refine_batch(scene, Pool(*starts, *none), outliers) if few else Pool(*starts, *none)
         if len(pool.hits):
             pool = finish(scene, pool, outliers)
             turned, shifted = scene.leave(pool.rotation[:1], pool.translation[:1])
             out_r[i], out_t[i], scale[i], safe[i] = turned[0], shifted[0], pool.result[0, 2], is_safe(pool, scene)
-        annealed[i] = len(hits) * (1 + SHAKES)
     stats = SolveStats(*(torch.as_tensor(x, device=bearings.device) for x in (annealed, scale, safe)))
     return torch.as_tensor(out_r).to(points3d), torch.as_tensor(out_t).to(points3d), stats
+
+
+def _winnowed(scene: Scene, rotation: Array, translation: Array, outliers: float) -> tuple[Array, Array]:
+    """The starts that are likeliest when annealed on clusters, where they ended, best first."""
+    outlier = scene.outlier_density(outliers)
+    for count, first, last, rounds, kept in HEATS:
+        clusters, score = scene.clusters(count), np.empty(len(rotation), np.float32)
+        scales = (scene.spread * np.geomspace(first, last, rounds)).astype(np.float32)
+        ends = rotation.copy(), translation.copy()
+        spread(partial(_descend, clusters, *ends, scales, outlier, score), len(rotation))
+        best = distinct(*ends, score, kept, SAME_DEG, math.inf)
+        rotation, translation = ends[0][best], ends[1][best]
+    return rotation, translation
+
+
+def _descend(
+    clusters: tuple[Array, Array, Array, Array], rotation: Array, translation: Array, scales: Array,
+    outlier: np.float32, score: Array, i: int, j: int,
+) -> None:  # fmt: skip
+    descend(*clusters, rotation[i:j], translation[i:j], scales, outlier, RELAXATION, score[i:j])
 
 
 class Refine(nn.Module):

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from bpnp.geometry import bearings
+from bpnp.layers.hypotheses import pose_hypotheses
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.precision import full_precision
 from bpnp.layers.ransac import Backend, RansacPnP
@@ -43,7 +44,9 @@ class BPnPNet(nn.Module):
         pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
         pnp_method: newton, or lbfgs as in the paper.
         pnp_iterations: most iterations of the PnP layer.
-        refine: give a third pose in evaluation, "refined", annealed from the other two without the assignment.
+        refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
+            poses that the assignment proposes.
+        hypotheses: poses that the assignment proposes for it, at most; 0 for none.
     """
 
     estimates: tuple[str, ...] = ("ransac", "pnp", "refined")
@@ -68,6 +71,7 @@ class BPnPNet(nn.Module):
         pnp_method: Method = "newton",
         pnp_iterations: int = 50,
         refine: bool = True,
+        hypotheses: int = 192,
     ) -> None:
         super().__init__()
         self.settings: dict[str, Any] = {
@@ -88,6 +92,9 @@ class BPnPNet(nn.Module):
         )
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
         self.refine = Refine() if refine else None
+        if hypotheses < 0:
+            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
+        self.hypotheses = hypotheses
         if not refine:
             self.estimates = ("ransac", "pnp")
 
@@ -102,11 +109,8 @@ class BPnPNet(nn.Module):
         pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
         estimates = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
-            rotations = torch.stack([ransac.rotation, pnp.rotation], 1)
-            translations = torch.stack([ransac.translation, pnp.translation], 1)
-            estimates["refined"] = Pose(
-                *self.refine(rays, batch.points3d, rotations, translations, batch.mask2d, batch.mask3d)
-            )
+            starts = self._starts(assignment, batch, [ransac, pnp])
+            estimates["refined"] = Pose(*self.refine(rays, batch.points3d, *starts, batch.mask2d, batch.mask3d))
         return Prediction(assignment, assignment_stats, estimates)
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
@@ -116,6 +120,20 @@ class BPnPNet(nn.Module):
         z2d = self.features2d(self.image_scale * batch.points2d, batch.mask2d)
         z3d = self.features3d(self.align(points3d, batch.mask3d), batch.mask3d)
         return pairwise_distance(z2d, z3d)
+
+    def _starts(
+        self, assignment: Float[Tensor, "b m n"], batch: Batch, poses: list[Pose]
+    ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
+        """The estimates, and the poses that the assignment proposes."""
+        rotation = torch.stack([pose.rotation for pose in poses], 1)
+        translation = torch.stack([pose.translation for pose in poses], 1)
+        if not self.hypotheses:
+            return rotation, translation
+        turns, shifts, _ = pose_hypotheses(
+            assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
+            mask3d=batch.mask3d,
+        )  # fmt: skip
+        return torch.cat([rotation, turns.to(rotation)], 1), torch.cat([translation, shifts.to(translation)], 1)
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> "BPnPNet":
