@@ -7,7 +7,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.geometry import angle_between, bearings, rotation_angle, transform
+from bpnp.types import Batch, Prediction
 
+SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
 RELEASED_BOUNDS = (math.pi / 2, 1.0)  # radians and scene units, as in the authors' code
 
 
@@ -20,6 +22,38 @@ def correspondence_loss(
     """
     matched = assignment.gather(1, match3d.clamp_min(0).unsqueeze(1)).squeeze(1)
     return assignment.sum((-2, -1)) - 2 * (matched * (match3d >= 0)).sum(-1)
+
+
+def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
+    """Negative log likelihood of the true partner of each point, -log P(j | i) and -log P(i | j), in nats.
+
+    A mean over the true pairs (both directions) plus, where the assignment has bins, a mean over the points without a
+    partner of -log P(bin | i): balanced, whatever their numbers. Its gradient does not vanish where the probability of
+    the true pair is small, as that of `correspondence_loss` does; otherwise it asks for the same optimum. Raises
+    ValueError for a prediction without an assignment or a batch without its pairs.
+    """
+    assignment, match3d = prediction.assignment, batch.match3d
+    if assignment is None or match3d is None:
+        raise ValueError("expected an assignment and a batch with `match3d`, got None")
+    partner = match3d.clamp_min(0)
+    paired = (match3d >= 0).to(assignment.dtype)
+    paired2d = torch.zeros_like(assignment[:, :, 0]).scatter_add(1, partner, paired)
+    rows, cols = assignment.sum(2), assignment.sum(1)
+    rows = rows if prediction.unmatched2d is None else rows + prediction.unmatched2d
+    cols = cols if prediction.unmatched3d is None else cols + prediction.unmatched3d
+    joint = _log(assignment.gather(1, partner.unsqueeze(1)).squeeze(1))
+    both = 2 * joint - _log(cols) - _log(rows).gather(1, partner)
+    loss = -(both * paired).sum(1) / (2 * paired.sum(1)).clamp_min(1)
+    if prediction.unmatched2d is None or prediction.unmatched3d is None:
+        return loss
+    lone2d, lone3d = batch.mask2d * (1 - paired2d), batch.mask3d * (1 - paired)
+    left = ((_log(prediction.unmatched2d) - _log(rows)) * lone2d).sum(1)
+    left = left + ((_log(prediction.unmatched3d) - _log(cols)) * lone3d).sum(1)
+    return loss - left / (lone2d.sum(1) + lone3d.sum(1)).clamp_min(1)
+
+
+def _log(probability: Tensor) -> Tensor:
+    return probability.clamp_min(SMALLEST).log()
 
 
 def correspondence_loss_from_pose(

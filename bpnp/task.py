@@ -9,7 +9,13 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
-from bpnp.losses import RELEASED_BOUNDS, correspondence_loss, correspondence_loss_from_pose, pose_loss
+from bpnp.losses import (
+    RELEASED_BOUNDS,
+    correspondence_loss,
+    correspondence_loss_from_pose,
+    matching_likelihood_loss,
+    pose_loss,
+)
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.checkpoint import check_solver
@@ -34,8 +40,10 @@ class BlindPnPTask(LightningModule):
         pose_weight: gamma_p of Eq. 13. While it is 0 no pose is solved in training; `PoseLossWarmup` raises it.
         pose_estimate: the estimate that L_p looks at.
         bounded_pose_loss: clamp L_p at pi/2 and 1.0 as the released code does; the paper's loss is unbounded.
-        correspondence_angle: supervise by the pose alone: pairs within this angle (radians) count as correspondences;
-            null for the true ones.
+        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9), likelihood for the
+            negative log likelihood of each point's partner (`bpnp.losses.matching_likelihood_loss`).
+        correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
+            correspondences; null for the true ones.
         max_skipped_steps: end the run after so many steps in a row without a finite loss and gradient.
     """
 
@@ -48,6 +56,7 @@ class BlindPnPTask(LightningModule):
         pose_weight: float = 0.0,
         pose_estimate: str = "pnp",
         bounded_pose_loss: bool = False,
+        matching_loss: Literal["correspondence", "likelihood"] = "correspondence",
         correspondence_angle: float | None = None,
         max_skipped_steps: int = 20,
     ) -> None:
@@ -58,6 +67,9 @@ class BlindPnPTask(LightningModule):
         self.pose_weight = pose_weight
         self.pose_estimate = pose_estimate
         self.pose_bounds = RELEASED_BOUNDS if bounded_pose_loss else None
+        if matching_loss == "likelihood" and correspondence_angle is not None:
+            raise ValueError("expected `correspondence_angle` with matching_loss correspondence, got likelihood")
+        self.matching_loss = matching_loss
         self.correspondence_angle = correspondence_angle
         self.max_skipped_steps = max_skipped_steps
         # Steps left out in all, and in a row: on the device, so that counting them never waits for it.
@@ -95,11 +107,15 @@ class BlindPnPTask(LightningModule):
 
     def losses(self, prediction: Prediction, batch: Batch, stage: Stage) -> Tensor:
         """L_c + gamma_p L_p per sample; a sample whose pose did not converge has no L_p, and is counted."""
-        matching = self.correspondence_losses(prediction, batch)
-        if matching is None:
+        correspondence = self.correspondence_losses(prediction, batch)
+        if correspondence is None:
             raise ValueError("expected a solver with an assignment to train, got none; try bpnp.models.BPnPNet")
+        likely = self.matching_loss == "likelihood"
+        matching = matching_likelihood_loss(prediction, batch) if likely else correspondence
         if stage == "train":
-            self._log_train(correspondence_loss=matching.mean(), **_assignment_stats(prediction))
+            self._log_train(correspondence_loss=correspondence.mean(), **_assignment_stats(prediction))
+            if likely:
+                self._log_train(matching_loss=matching.mean())
         if self.pose_weight == 0:
             return matching
         pose = prediction.poses[self.pose_estimate]

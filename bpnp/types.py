@@ -50,11 +50,16 @@ class Pose:
 
 @dataclass(frozen=True)
 class Prediction:
-    """A solver's answer: the joint probability of every pair, and each pose estimate by name."""
+    """A solver's answer: the joint probability of every pair, and each pose estimate by name.
+
+    unmatched2d, unmatched3d: the probability that a point has no partner, of an assignment with bins for them.
+    """
 
     assignment: Float[Tensor, "b m n"] | None = None
     assignment_stats: SolveStats | None = None
     poses: dict[str, Pose] = field(default_factory=dict)
+    unmatched2d: Float[Tensor, "b m"] | None = None
+    unmatched3d: Float[Tensor, "b n"] | None = None
 
     def to(self, *args: Any, **kwargs: Any) -> "Prediction":
         return _moved(self, *args, **kwargs)

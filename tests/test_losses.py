@@ -6,15 +6,18 @@ from planted import Planted, plant
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bpnp import Batch
 from bpnp.geometry import bearings, rotation_angle, transform
 from bpnp.losses import (
     RELEASED_BOUNDS,
     correspondence_loss,
     correspondence_loss_from_pose,
+    matching_likelihood_loss,
     pairs_within,
     pose_loss,
     reprojection_loss,
 )
+from bpnp.types import Prediction
 
 
 def random_assignment(planted: Planted, *, seed: int = 0) -> Tensor:
@@ -146,3 +149,77 @@ def test_a_point_at_the_camera_centre_spoils_no_gradient() -> None:
     reprojection_loss(assignment, planted.points2d, planted.points3d, planted.rotation, translation).sum().backward()
     assert translation.grad is not None
     assert translation.grad.isfinite().all()
+
+
+def _with_bins(planted: Planted, *, seed: int = 0) -> tuple[Prediction, Batch]:
+    """A random plan with bins, as nested lists would have it: rows and columns of one total mass."""
+    b, m, n = len(planted.points2d), planted.points2d.shape[1], planted.points3d.shape[1]
+    plan = torch.rand(b, m + 1, n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    plan = plan / plan.sum((-2, -1), keepdim=True)
+    prediction = Prediction(plan[:, :-1, :-1], unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
+    return prediction, planted.batch()
+
+
+def test_matching_likelihood_loss_is_the_sum_over_points_written_out() -> None:
+    planted = plant(3, 6, outliers2d=2, outliers3d=4)
+    prediction, batch = _with_bins(planted)
+    losses = matching_likelihood_loss(prediction, batch)
+    for b in range(3):
+        p, left2d, left3d = prediction.assignment[b], prediction.unmatched2d[b], prediction.unmatched3d[b]
+        partner = planted.match3d[b].tolist()
+        paired, alone = [], []
+        for j, i in enumerate(partner):
+            to_j = float(p[:, j].sum() + left3d[j])
+            if i < 0:
+                alone.append(-math.log(float(left3d[j]) / to_j))
+                continue
+            to_i = float(p[i].sum() + left2d[i])
+            paired.append(-math.log(float(p[i, j]) / to_j))
+            paired.append(-math.log(float(p[i, j]) / to_i))
+        for i in set(range(p.shape[0])) - set(partner):
+            alone.append(-math.log(float(left2d[i] / (p[i].sum() + left2d[i]))))
+        assert float(losses[b]) == pytest.approx(sum(paired) / len(paired) + sum(alone) / len(alone))
+
+
+def test_matching_likelihood_loss_of_the_truth_is_zero_with_and_without_bins() -> None:
+    planted = plant(2, 8)
+    truth = planted.permutation()
+    none = torch.zeros(2, 8, dtype=torch.float64)
+    for bins in ({}, {"unmatched2d": none, "unmatched3d": none}):
+        loss = matching_likelihood_loss(Prediction(truth, **bins), planted.batch())
+        torch.testing.assert_close(loss, torch.zeros(2, dtype=torch.float64))
+
+
+def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> None:
+    alone, padded = plant(1, 5, outliers3d=2), plant(1, 5, outliers3d=2)
+    prediction, batch = _with_bins(alone)
+    wide = [torch.nn.functional.pad(x, (0, 3)) for x in (padded.match3d.float(), batch.mask3d.float())]
+    larger = Batch(
+        points2d=torch.nn.functional.pad(batch.points2d, (0, 0, 0, 2)),
+        points3d=torch.nn.functional.pad(batch.points3d, (0, 0, 0, 3)),
+        mask2d=torch.nn.functional.pad(batch.mask2d, (0, 2)),
+        mask3d=wide[1].bool(),
+        focal=batch.focal,
+        index=batch.index,
+        ids=batch.ids,
+        match3d=torch.where(wide[1].bool(), wide[0].long(), -1),
+    )
+    grown = Prediction(
+        torch.nn.functional.pad(prediction.assignment, (0, 3, 0, 2)),
+        unmatched2d=torch.nn.functional.pad(prediction.unmatched2d, (0, 2)),
+        unmatched3d=torch.nn.functional.pad(prediction.unmatched3d, (0, 3)),
+    )
+    torch.testing.assert_close(matching_likelihood_loss(grown, larger), matching_likelihood_loss(prediction, batch))
+
+    def loss(p: Tensor, left2d: Tensor, left3d: Tensor) -> Tensor:
+        return matching_likelihood_loss(Prediction(p, unmatched2d=left2d, unmatched3d=left3d), batch)
+
+    values = (prediction.assignment, prediction.unmatched2d, prediction.unmatched3d)
+    assert torch.autograd.gradcheck(loss, tuple(x.clone().requires_grad_() for x in values))
+
+
+def test_matching_likelihood_loss_wants_pairs_to_compare_with() -> None:
+    prediction, batch = _with_bins(plant(1, 5))
+    batch.match3d = None
+    with pytest.raises(ValueError, match="expected an assignment and a batch with `match3d`, got None"):
+        matching_likelihood_loss(prediction, batch)

@@ -1,5 +1,6 @@
 """Solvers: modules from a `Batch` to a `Prediction`."""
 
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.matcher import Matcher
 
-__all__ = ["BPnPNet"]
+__all__ = ["BPnPNet", "Matcher"]

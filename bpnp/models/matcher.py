@@ -1,0 +1,142 @@
+"""A matcher for clutter: attention within and between the two sets, and a bin for every point without a partner."""
+
+import math
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from bpnp.layers.sinkhorn import sinkhorn
+from bpnp.models.attention import ExchangeBlock, Neighbourhood
+from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.models.pose_stage import PoseStage
+from bpnp.types import Batch, Prediction, SolveStats
+
+FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
+
+
+class RobustFrame(NamedTuple):
+    """Where a set lies: median of each coordinate, and median distance from it."""
+
+    centre: Float[Tensor, "b 1 d"]
+    radius: Float[Tensor, "b 1 1"]
+
+
+class Matcher(nn.Module):
+    """Pose from unmatched points of which many have no partner.
+
+    Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours; blocks
+    of self and cross attention let both sets know of each other, which BPnPNet's features do not; an inlier head gives
+    each point its own cost of staying without a partner; entropic transport with these bins is the assignment, and
+    RANSAC, the weighted PnP layer and the refinement make poses of it as in `BPnPNet`.
+
+    Args:
+        channels: width, a multiple of heads.
+        blocks: attention blocks.
+        heads: of each attention.
+        neighbours: nearest neighbours that a point is described by; 0 for none.
+        mu: entropy weight of the transport at the start of a training; it is learned.
+        sinkhorn_tolerance: L1 error of the marginals at which the transport stops.
+        pose: options of the pose stage, as a mapping; `bpnp.models.pose_stage.PoseStage` lists them.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: int = 128,
+        blocks: int = 6,
+        heads: int = 4,
+        neighbours: int = 8,
+        mu: float = 0.1,
+        sinkhorn_tolerance: float = 1e-6,
+        pose: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.settings: dict[str, Any] = {
+            k: v for k, v in locals().items() if k not in ("self", "__class__")
+        }  # fmt: skip
+        if not mu > 0:
+            raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+        self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
+        self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
+        around = {"neighbours": neighbours}
+        self.around2d = Neighbourhood(2, channels, **around) if neighbours else None
+        self.around3d = Neighbourhood(3, channels, **around) if neighbours else None
+        self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(blocks))
+        self.norm = nn.LayerNorm(channels)
+        self.project = nn.Linear(channels, channels)
+        self.leave = nn.Linear(channels, 1)
+        self.bin_cost = nn.Parameter(torch.ones(()))
+        self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))
+        self.sinkhorn_tolerance = sinkhorn_tolerance
+        self.pose_stage = PoseStage(**(pose or {}))
+        self.estimates = self.pose_stage.estimates
+
+    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+        """Prediction with the assignment, its bins and, if `poses`, the estimates of the pose stage."""
+        plan, stats = self.transport(batch)
+        assignment = plan[:, :-1, :-1]
+        prediction = Prediction(assignment, stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
+        if not poses:
+            return prediction
+        return self.pose_stage(prediction, batch)
+
+    def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
+        """Plan over the points and one bin on each side (last row, last column).
+
+        Every real point has the mass 1 / (m + n), each bin that of the other side's points. A pair costs the distance
+        of the unit features, a point its own cost to leave.
+        """
+        batch = batch.to(self.bin_cost.dtype)
+        z2d, z3d = self.features(batch)
+        cost = pairwise_distance(self._unit(z2d, batch.mask2d), self._unit(z3d, batch.mask3d))
+        leave2d, leave3d = self.bin_cost + self.leave(z2d), self.bin_cost + self.leave(z3d)
+        corner = self.bin_cost.expand(len(batch), 1, 1)
+        cost = torch.cat([torch.cat([cost, leave2d], 2), torch.cat([leave3d.mT, corner], 2)], 1)
+        with_bin = nn.functional.pad
+        mask2d, mask3d = with_bin(batch.mask2d, (0, 1), value=True), with_bin(batch.mask3d, (0, 1), value=True)
+        total = (batch.count2d + batch.count3d).unsqueeze(-1).to(cost.dtype)
+        rows = torch.cat([batch.mask2d / total, batch.count3d.unsqueeze(-1) / total], 1)
+        cols = torch.cat([batch.mask3d / total, batch.count2d.unsqueeze(-1) / total], 1)
+        return sinkhorn(
+            cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, mask2d=mask2d, mask3d=mask3d,
+            tolerance=self.sinkhorn_tolerance,
+        )  # fmt: skip
+
+    def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
+        """Features of both sides after the last block, normalised by layer, not to unit length."""
+        frame2d, frame3d = robust_frame(batch.points2d, batch.mask2d), robust_frame(batch.points3d, batch.mask3d)
+        local2d = (batch.points2d - frame2d.centre) / frame2d.radius
+        local3d = (batch.points3d - frame3d.centre) / frame3d.radius
+        where = torch.cat([frame2d.centre, frame2d.radius.log()], -1).expand(-1, local2d.shape[1], -1)
+        x2d, x3d = self.enter2d(torch.cat([encode(local2d), where], -1)), self.enter3d(encode(local3d))
+        if self.around2d is not None and self.around3d is not None:
+            x2d, x3d = x2d + self.around2d(local2d, batch.mask2d), x3d + self.around3d(local3d, batch.mask3d)
+        for block in self.blocks:
+            x2d, x3d = block(x2d, x3d, batch.mask2d, batch.mask3d)
+        return self.norm(x2d), self.norm(x3d)
+
+    def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
+        z, weight = self.project(z), mask.unsqueeze(-1).to(z.dtype)
+        centre = (z * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+        return nn.functional.normalize(z - centre, dim=-1)
+
+
+def robust_frame(points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> RobustFrame:
+    """Median of each coordinate and median distance from it: half of the points may be clutter. Padding is not seen.
+
+    A set whose points coincide has radius one.
+    """
+    hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
+    centre = hidden.nanmedian(1, keepdim=True).values
+    radius = torch.linalg.vector_norm(hidden - centre, dim=-1).nanmedian(1).values[:, None, None]
+    return RobustFrame(centre, torch.where(radius > 0, radius, 1))
+
+
+def encode(points: Float[Tensor, "b k d"]) -> Float[Tensor, "b k e"]:
+    """Coordinates, and their sines and cosines at rising frequencies."""
+    turns = math.pi / 2 * math.sqrt(2) ** torch.arange(FREQUENCIES, dtype=points.dtype, device=points.device)
+    phase = (points.unsqueeze(-1) * turns).flatten(-2)
+    return torch.cat([points, phase.sin(), phase.cos()], -1)

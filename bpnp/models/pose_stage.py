@@ -1,0 +1,65 @@
+"""From an assignment to poses: RANSAC on its best pairs, weighted PnP on all of them, annealing without them."""
+
+from dataclasses import replace
+
+import torch
+from torch import nn
+
+from bpnp.geometry import bearings
+from bpnp.layers.pnp import Method, WeightedPnP
+from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.layers.refine import Refine
+from bpnp.types import Batch, Pose, Prediction
+
+
+class PoseStage(nn.Module):
+    """The poses of an assignment: "ransac", "pnp" (differentiable in the assignment) and, in evaluation, "refined".
+
+    Args:
+        ransac_backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole
+            batch on its device), or auto (torch on cuda, else poselib).
+        ransac_iterations: most hypotheses.
+        threshold: inlier threshold of RANSAC, normalised image coordinates.
+        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
+        pnp_method: newton, or lbfgs as in the paper.
+        pnp_iterations: most iterations of the PnP layer.
+        refine: give a third pose in evaluation, "refined", annealed from the other two without the assignment.
+    """
+
+    def __init__(
+        self,
+        *,
+        ransac_backend: Backend = "auto",
+        ransac_iterations: int = 1000,
+        threshold: float = 0.01,
+        pairs_factor: float = 1.5,
+        pnp_method: Method = "newton",
+        pnp_iterations: int = 50,
+        refine: bool = True,
+    ) -> None:
+        super().__init__()
+        self.ransac = RansacPnP(
+            backend=ransac_backend,
+            pairs_factor=pairs_factor,
+            threshold=threshold,
+            max_iterations=ransac_iterations,
+        )
+        self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
+        self.refine = Refine() if refine else None
+        self.estimates = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
+
+    def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
+        """The prediction with its poses."""
+        assignment = prediction.assignment
+        assert assignment is not None
+        rays = bearings(batch.points2d)
+        ransac = Pose(*self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
+        pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
+        poses = {"ransac": ransac, "pnp": pnp}
+        if self.refine is not None and not self.training:
+            rotations = torch.stack([ransac.rotation, pnp.rotation], 1)
+            translations = torch.stack([ransac.translation, pnp.translation], 1)
+            poses["refined"] = Pose(
+                *self.refine(rays, batch.points3d, rotations, translations, batch.mask2d, batch.mask3d)
+            )
+        return replace(prediction, poses=poses)
