@@ -2,11 +2,11 @@
 
 from bpnp.api import solve, solve_many
 from bpnp.layers.starts import GravityPrior, PosePrior
-from bpnp.models import BPnPNet
+from bpnp.models import BPnPNet, Matcher
 from bpnp.solving.solution import Solution
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 __all__ = [
-    "BPnPNet", "Batch", "GravityPrior", "Pose", "PosePrior", "Prediction", "Solution", "SolveStats", "solve",
-    "solve_many",
+    "BPnPNet", "Batch", "GravityPrior", "Matcher", "Pose", "PosePrior", "Prediction", "Solution", "SolveStats",
+    "solve", "solve_many",
 ]  # fmt: skip

@@ -44,8 +44,9 @@ def solve(
     points3d: (n, 3) points of the scene, in any unit.
     camera: 3x3 matrix K; (COLMAP model, parameters) or (model, width, height, parameters); or a pycolmap.Camera.
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
-    solver: "search", which needs no training; a module from `Batch` to `Prediction`; or a checkpoint of a BPnPNet.
-    prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet (or its checkpoint) whose pose is tried first.
+    solver: "search", which needs no training; a module from `Batch` to `Prediction`; or a checkpoint of a
+        BPnPNet or a Matcher.
+    prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.
     clutter: share of the points that is expected to have no partner, if known.

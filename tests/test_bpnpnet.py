@@ -70,7 +70,7 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     torch.manual_seed(0)
     net = BPnPNet(**SMALL).eval()
     crowd = net(batch).poses["refined"].stats.iterations
-    net.hypotheses = 0
+    net.pose_stage.hypotheses = 0
     alone = net(batch).poses["refined"].stats.iterations
     assert int(alone) <= 2 * (1 + SHAKES) < int(crowd)
     with pytest.raises(ValueError, match="expected a number of `hypotheses`, got -1"):
@@ -82,13 +82,13 @@ def test_a_checkpoint_from_before_the_hypotheses_has_the_default(tmp_path: Path)
     settings = {key: value for key, value in net.settings.items() if key != "hypotheses"}
     state = {f"solver.{key}": value for key, value in net.state_dict().items()}
     torch.save({"solver": {"class": "BPnPNet", "settings": settings}, "state_dict": state}, tmp_path / "old.ckpt")
-    assert BPnPNet.from_checkpoint(tmp_path / "old.ckpt").hypotheses == net.hypotheses
+    assert BPnPNet.from_checkpoint(tmp_path / "old.ckpt").pose_stage.hypotheses == net.pose_stage.hypotheses
 
 
 def test_without_poses_none_is_solved() -> None:
     batch = different_sizes(8, dtype=torch.float32)
     net = BPnPNet(**SMALL)
-    del net.ransac, net.pnp
+    del net.pose_stage
     prediction = net(batch, poses=False)
     assert prediction.poses == {}
     assert prediction.assignment is not None

@@ -1,13 +1,14 @@
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 from planted import plant
 from torch import Tensor
 
-from bpnp import Batch
+from bpnp import Batch, BPnPNet
 from bpnp.losses import matching_likelihood_loss
-from bpnp.models import Matcher
+from bpnp.models import Matcher, load_network
 from bpnp.models.attention import Attention, Neighbourhood
 from bpnp.models.matcher import robust_frame
 
@@ -122,3 +123,17 @@ def test_says_what_is_wrong_with_its_options() -> None:
         Attention(30, 4)
     with pytest.raises(ValueError, match=r"expected `mu` > 0, got 0"):
         Matcher(mu=0.0)
+
+
+def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -> None:
+    net, batch = small().float(), cluttered(9).to(torch.float32)
+    for name, solver in (("matcher", net), ("other", BPnPNet(channels=8, blocks=1))):
+        saved = {"class": type(solver).__name__, "settings": solver.settings}
+        state = {f"solver.{key}": value for key, value in solver.state_dict().items()}
+        torch.save({"solver": saved, "state_dict": state}, tmp_path / f"{name}.ckpt")
+    expected = net(batch, poses=False).assignment
+    for again in (Matcher.from_checkpoint(tmp_path / "matcher.ckpt"), load_network(tmp_path / "matcher.ckpt")):
+        torch.testing.assert_close(again(batch, poses=False).assignment, expected)
+    assert isinstance(load_network(tmp_path / "other.ckpt"), BPnPNet)
+    with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
+        Matcher.from_checkpoint(tmp_path / "other.ckpt")

@@ -1,6 +1,7 @@
 """Solvers: modules from a `Batch` to a `Prediction`."""
 
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.loading import TrainedNet, load_network, load_pretrained
 from bpnp.models.matcher import Matcher
 
-__all__ = ["BPnPNet", "Matcher"]
+__all__ = ["BPnPNet", "Matcher", "TrainedNet", "load_network", "load_pretrained"]

@@ -8,17 +8,15 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from bpnp.geometry import bearings
-from bpnp.layers.hypotheses import pose_hypotheses
-from bpnp.layers.pnp import Method, WeightedPnP
+from bpnp.layers.pnp import Method
 from bpnp.layers.precision import full_precision
-from bpnp.layers.ransac import Backend, RansacPnP
-from bpnp.layers.refine import Refine
+from bpnp.layers.ransac import Backend
 from bpnp.layers.sinkhorn import Sinkhorn
-from bpnp.models.checkpoint import read_checkpoint
+from bpnp.models.checkpoint import restored
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
+from bpnp.models.pose_stage import PoseStage
 from bpnp.models.pretrained import pretrained_path
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.types import Batch, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
 
@@ -84,34 +82,24 @@ class BPnPNet(nn.Module):
         self.features3d = PointFeatures(3, **shape)  # type: ignore[arg-type]
         self.align = InputTransform()
         self.sinkhorn = Sinkhorn(mu=mu, learn_mu=learn_mu, dustbin=dustbin, tolerance=sinkhorn_tolerance)
-        self.ransac = RansacPnP(
-            backend=ransac_backend,
-            pairs_factor=pairs_factor,
+        self.pose_stage = PoseStage(
+            ransac_backend=ransac_backend,
+            ransac_iterations=ransac_iterations,
             threshold=threshold,
-            max_iterations=ransac_iterations,
+            pairs_factor=pairs_factor,
+            pnp_method=pnp_method,
+            pnp_iterations=pnp_iterations,
+            refine=refine,
+            hypotheses=hypotheses,
         )
-        self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
-        self.refine = Refine() if refine else None
-        if hypotheses < 0:
-            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
-        self.hypotheses = hypotheses
-        if not refine:
-            self.estimates = ("ransac", "pnp")
+        self.estimates = self.pose_stage.estimates
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
         """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"; in evaluation "refined"."""
         cost = self.cost(batch)
         assignment, assignment_stats = self.sinkhorn(cost, batch.mask2d, batch.mask3d)
-        if not poses:
-            return Prediction(assignment, assignment_stats)
-        rays = bearings(batch.points2d)
-        ransac = Pose(*self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
-        pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
-        estimates = {"ransac": ransac, "pnp": pnp}
-        if self.refine is not None and not self.training:
-            starts = self._starts(assignment, batch, [ransac, pnp])
-            estimates["refined"] = Pose(*self.refine(rays, batch.points3d, *starts, batch.mask2d, batch.mask3d))
-        return Prediction(assignment, assignment_stats, estimates)
+        prediction = Prediction(assignment, assignment_stats)
+        return self.pose_stage(prediction, batch) if poses else prediction
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
         """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2], in the network's dtype."""
@@ -121,35 +109,13 @@ class BPnPNet(nn.Module):
         z3d = self.features3d(self.align(points3d, batch.mask3d), batch.mask3d)
         return pairwise_distance(z2d, z3d)
 
-    def _starts(
-        self, assignment: Float[Tensor, "b m n"], batch: Batch, poses: list[Pose]
-    ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
-        """The estimates, and the poses that the assignment proposes."""
-        rotation = torch.stack([pose.rotation for pose in poses], 1)
-        translation = torch.stack([pose.translation for pose in poses], 1)
-        if not self.hypotheses:
-            return rotation, translation
-        turns, shifts, _ = pose_hypotheses(
-            assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
-            mask3d=batch.mask3d,
-        )  # fmt: skip
-        return torch.cat([rotation, turns.to(rotation)], 1), torch.cat([translation, shifts.to(translation)], 1)
-
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> "BPnPNet":
         """The network of a checkpoint that `bpnp fit` wrote, in evaluation mode.
 
         Raises FileNotFoundError, or ValueError naming the file if it holds no BPnPNet.
         """
-        content = read_checkpoint(path)
-        solver = content.get("solver", {})
-        if solver.get("class") != cls.__name__:
-            raise ValueError(f"expected a checkpoint of BPnPNet, got {solver.get('class', 'another file')} in {path}")
-        net = cls(**solver["settings"])
-        prefix = "solver."
-        state = {k.removeprefix(prefix): v for k, v in content["state_dict"].items() if k.startswith(prefix)}
-        net.load_state_dict(state)
-        return net.eval()
+        return restored(path, cls)
 
     @classmethod
     def from_pretrained(cls, name: str) -> "BPnPNet":

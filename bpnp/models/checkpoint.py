@@ -3,11 +3,14 @@
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import nn
 
 SHAPING = ("channels", "blocks", "batch_norm", "learn_mu")  # settings that the shapes of the weights depend on
+
+Network = TypeVar("Network", bound=nn.Module)
 
 
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
@@ -41,3 +44,21 @@ def check_solver(saved: Mapping[str, Any], name: str, settings: Mapping[str, Any
     if differing:
         told = ", ".join(f"{k}={stored[k]}" for k in differing)
         raise ValueError(f"expected a checkpoint of the configured {name}, got one with {told}; try these settings")
+
+
+def restored(path: str | Path, *classes: type[Network]) -> Network:
+    """The network of a checkpoint that `bpnp fit` wrote, in evaluation mode: whichever of the classes it is of.
+
+    Raises FileNotFoundError, or ValueError naming the file if it holds none of them.
+    """
+    content = read_checkpoint(path)
+    solver = content.get("solver", {})
+    known = {cls.__name__: cls for cls in classes}
+    if solver.get("class") not in known:
+        wanted = " or ".join(known)
+        raise ValueError(f"expected a checkpoint of {wanted}, got {solver.get('class', 'another file')} in {path}")
+    net = known[solver["class"]](**solver["settings"])
+    prefix = "solver."
+    state = {k.removeprefix(prefix): v for k, v in content["state_dict"].items() if k.startswith(prefix)}
+    net.load_state_dict(state)
+    return net.eval()

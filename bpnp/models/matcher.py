@@ -1,6 +1,7 @@
 """A matcher for clutter: attention within and between the two sets, and a bin for every point without a partner."""
 
 import math
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -10,7 +11,9 @@ from torch import Tensor, nn
 from bpnp.layers.sinkhorn import sinkhorn
 from bpnp.models.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.models.checkpoint import restored
 from bpnp.models.pose_stage import PoseStage
+from bpnp.models.pretrained import pretrained_path
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
@@ -78,9 +81,7 @@ class Matcher(nn.Module):
         plan, stats = self.transport(batch)
         assignment = plan[:, :-1, :-1]
         prediction = Prediction(assignment, stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
-        if not poses:
-            return prediction
-        return self.pose_stage(prediction, batch)
+        return self.pose_stage(prediction, batch) if poses else prediction
 
     def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
         """Plan over the points and one bin on each side (last row, last column).
@@ -116,6 +117,22 @@ class Matcher(nn.Module):
         for block in self.blocks:
             x2d, x3d = block(x2d, x3d, batch.mask2d, batch.mask3d)
         return self.norm(x2d), self.norm(x3d)
+
+    @classmethod
+    def from_checkpoint(cls, path: str | Path) -> "Matcher":
+        """The matcher of a checkpoint that `bpnp fit` wrote, in evaluation mode.
+
+        Raises FileNotFoundError, or ValueError naming the file if it holds no Matcher.
+        """
+        return restored(path, cls)
+
+    @classmethod
+    def from_pretrained(cls, name: str) -> "Matcher":
+        """A matcher with weights of this package, in evaluation mode; `docs/model-card.md` tells what they can do.
+
+        name: "matcher-procedural". Raises ValueError that lists the names for any other. Nothing is downloaded.
+        """
+        return cls.from_checkpoint(pretrained_path(name))
 
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""

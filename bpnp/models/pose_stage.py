@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import torch
-from torch import nn
+from jaxtyping import Float
+from torch import Tensor, nn
 
 from bpnp.geometry import bearings
+from bpnp.layers.hypotheses import pose_hypotheses
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.refine import Refine
@@ -23,7 +25,9 @@ class PoseStage(nn.Module):
         pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
         pnp_method: newton, or lbfgs as in the paper.
         pnp_iterations: most iterations of the PnP layer.
-        refine: give a third pose in evaluation, "refined", annealed from the other two without the assignment.
+        refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
+            poses that the assignment proposes.
+        hypotheses: poses that the assignment proposes for it, at most; 0 for none.
     """
 
     def __init__(
@@ -36,8 +40,11 @@ class PoseStage(nn.Module):
         pnp_method: Method = "newton",
         pnp_iterations: int = 50,
         refine: bool = True,
+        hypotheses: int = 192,
     ) -> None:
         super().__init__()
+        if hypotheses < 0:
+            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
         self.ransac = RansacPnP(
             backend=ransac_backend,
             pairs_factor=pairs_factor,
@@ -46,7 +53,8 @@ class PoseStage(nn.Module):
         )
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
         self.refine = Refine() if refine else None
-        self.estimates = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
+        self.hypotheses = hypotheses
+        self.estimates: tuple[str, ...] = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
 
     def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
         """The prediction with its poses."""
@@ -57,9 +65,20 @@ class PoseStage(nn.Module):
         pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
         poses = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
-            rotations = torch.stack([ransac.rotation, pnp.rotation], 1)
-            translations = torch.stack([ransac.translation, pnp.translation], 1)
-            poses["refined"] = Pose(
-                *self.refine(rays, batch.points3d, rotations, translations, batch.mask2d, batch.mask3d)
-            )
+            starts = self._starts(assignment, batch, [ransac, pnp])
+            poses["refined"] = Pose(*self.refine(rays, batch.points3d, *starts, batch.mask2d, batch.mask3d))
         return replace(prediction, poses=poses)
+
+    def _starts(
+        self, assignment: Float[Tensor, "b m n"], batch: Batch, poses: list[Pose]
+    ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
+        """The estimates, and the poses that the assignment proposes."""
+        rotation = torch.stack([pose.rotation for pose in poses], 1)
+        translation = torch.stack([pose.translation for pose in poses], 1)
+        if not self.hypotheses:
+            return rotation, translation
+        turns, shifts, _ = pose_hypotheses(
+            assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
+            mask3d=batch.mask3d,
+        )  # fmt: skip
+        return torch.cat([rotation, turns.to(rotation)], 1), torch.cat([translation, shifts.to(translation)], 1)

@@ -8,10 +8,10 @@ import roma
 import torch
 
 from bpnp.layers.starts import GravityPrior, PosePrior
-from bpnp.models import BPnPNet
+from bpnp.models import TrainedNet, load_network, load_pretrained
 from bpnp.models.pretrained import LEARNED
 
-Prior = PosePrior | GravityPrior | BPnPNet
+Prior = PosePrior | GravityPrior | TrainedNet
 
 
 def checked_prior(given: Any) -> Prior | None:
@@ -19,11 +19,11 @@ def checked_prior(given: Any) -> Prior | None:
 
     Raises ValueError for anything else.
     """
-    if given is None or isinstance(given, BPnPNet):
+    if given is None or isinstance(given, TrainedNet):
         return given
     if isinstance(given, (str, Path)):
         learned = str(given) == "learned"
-        return BPnPNet.from_pretrained(LEARNED) if learned else BPnPNet.from_checkpoint(given)
+        return load_pretrained(LEARNED) if learned else load_network(given)
     if isinstance(given, PosePrior):
         rotation = _tensor("prior.rotation", given.rotation, (3, 3))
         if (rotation @ rotation.mT - torch.eye(3)).abs().max() > 1e-3 or torch.linalg.det(rotation) < 0:
@@ -40,7 +40,7 @@ def checked_prior(given: Any) -> Prior | None:
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {given}")
         return GravityPrior(camera, scene, given.sigma_deg)
     raise ValueError(
-        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, its checkpoint or 'learned', got {given!r:.60}"
+        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned', got {given!r:.60}"
     )
 
 

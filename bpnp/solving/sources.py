@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from bpnp.layers.search import Candidates, Progress, search_candidates
 from bpnp.layers.starts import GravityPrior, PosePrior
-from bpnp.models import BPnPNet
+from bpnp.models import TrainedNet
 from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
 from bpnp.solving.scoring import merged, scored
@@ -91,7 +91,7 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
         device=options.device,
         progress=None if options.progress is None else partial(_report, options.progress, number),
     )
-    if not isinstance(prior, BPnPNet):
+    if not isinstance(prior, TrainedNet):
         return run(prior=_around_origin(prior, problem))
     known = _net_prior(prior, problem, options)
     if known is None:
@@ -110,7 +110,7 @@ def _around_origin(prior: PosePrior | GravityPrior | None, problem: Problem) -> 
     return prior._replace(translation=prior.translation + prior.rotation @ torch.as_tensor(problem.origin))
 
 
-def _net_prior(net: BPnPNet, problem: Problem, options: Options) -> PosePrior | None:
+def _net_prior(net: TrainedNet, problem: Problem, options: Options) -> PosePrior | None:
     """The net's pose, None if it has none."""
     (asked,) = _asked(net, [problem], options)
     rotation, translation = asked.rotation[0, 0], asked.translation[0, 0]

@@ -20,7 +20,7 @@ from bpnp.table.work import Block, run
 DESCRIPTION = """Run several methods on the same test pairs and print the paper's table. Started again, it goes on where
 it was; a longer --limit adds to what is there. `--data.NAME=VALUE` overrides the recipe's data."""
 METHODS_HELP = f"""[LABEL=]METHOD[@CHECKPOINT]: {", ".join(SHORT_NAMES)}, a class path, or a .yaml file with
-model.solver. bpnpnet and hungarian need a checkpoint to be more than untrained."""
+model.solver. bpnpnet, matcher and hungarian need a checkpoint to be more than untrained."""
 
 
 def table_command(arguments: Sequence[str], console: Console | None = None) -> None:

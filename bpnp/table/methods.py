@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from torch import nn
 
-from bpnp.models import BPnPNet
+from bpnp.models import load_network
 from bpnp.table.settings import build
 
 SHORT_NAMES = {
@@ -19,8 +19,11 @@ SHORT_NAMES = {
     "gopac": "bpnp.models.baselines.GOPAC",
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
+    "matcher": "bpnp.models.Matcher",
     "search": "bpnp.layers.Search",
 }
+
+TRAINED = (SHORT_NAMES["bpnpnet"], SHORT_NAMES["matcher"])
 
 
 @dataclass(frozen=True)
@@ -44,8 +47,8 @@ class Method:
 
     def build(self) -> nn.Module:
         """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
-        if self.class_path == SHORT_NAMES["bpnpnet"] and self.checkpoint is not None:
-            return BPnPNet.from_checkpoint(self.checkpoint)
+        if self.class_path in TRAINED and self.checkpoint is not None:
+            return load_network(self.checkpoint)
         given = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
         solver: nn.Module = build(nn.Module, "solver", {"class_path": self.class_path, "init_args": given})
         if self.time_limit is not None and "time_limit" in vars(solver):

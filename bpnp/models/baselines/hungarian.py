@@ -34,8 +34,8 @@ class Hungarian(nn.Module):
         self.ransac = RansacPnP(
             backend=ransac_backend,
             pairs_factor=1.0,
-            threshold=self.net.ransac.threshold,
-            max_iterations=self.net.ransac.max_iterations,
+            threshold=self.net.pose_stage.ransac.threshold,
+            max_iterations=self.net.pose_stage.ransac.max_iterations,
         )
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
@@ -46,7 +46,7 @@ class Hungarian(nn.Module):
         masks = batch.mask2d, batch.mask3d
         start = Pose(*self.ransac(assignment, batch.points2d, batch.points3d, *masks))
         rays = bearings(batch.points2d)
-        final = Pose(*self.net.pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
+        final = Pose(*self.net.pose_stage.pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
         return Prediction(assignment, None, {"ransac": start, "pnp": final})
 
 
