@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.geometry import angle_between, bearings, rotation_angle, transform
-from bpnp.types import Batch, Prediction
+from bpnp.types import Batch, Pose, Prediction
 
 SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
 RELEASED_BOUNDS = (math.pi / 2, 1.0)  # radians and scene units, as in the authors' code
@@ -118,3 +118,19 @@ def reprojection_loss(
     """sum_ij P_ij angle(f_i, R p_j + t) in radians (Eq. 2 with P for C): no correspondence and no pose is given."""
     directions = transform(rotation, translation, points3d)
     return (assignment * angle_between(bearings(points2d).unsqueeze(2), directions.unsqueeze(1))).sum((-2, -1))
+
+
+def self_supervised_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
+    """`reprojection_loss` under a pose that was solved from the assignment, a mean over the mass that it assigns.
+
+    Neither the true pose nor the true pairs are looked at (paper section 5). The gradient reaches the assignment itself
+    and, through a differentiable solver, the pose. A sample whose pose did not converge has loss zero and no gradient:
+    leave it out of means by `pose.stats.converged`.
+    """
+    solved = pose.stats.converged
+    identity = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
+    rotation = torch.where(solved[:, None, None], pose.rotation, identity)
+    translation = torch.where(solved[:, None], pose.translation, 0)
+    real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
+    angles = reprojection_loss(assignment * real, batch.points2d, batch.points3d, rotation, translation)
+    return torch.where(solved, angles / assignment.sum((-2, -1)), 0)

@@ -9,16 +9,11 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
-from bpnp.losses import (
-    RELEASED_BOUNDS,
-    correspondence_loss,
-    correspondence_loss_from_pose,
-    matching_likelihood_loss,
-    pose_loss,
-)
+from bpnp.losses import RELEASED_BOUNDS, pose_loss
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.checkpoint import check_solver
+from bpnp.supervision import MatchingLoss, correspondence_losses, known_values, matching_losses
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["train", "val", "test"]
@@ -40,8 +35,9 @@ class BlindPnPTask(LightningModule):
         pose_weight: gamma_p of Eq. 13. While it is 0 no pose is solved in training; `PoseLossWarmup` raises it.
         pose_estimate: the estimate that L_p looks at.
         bounded_pose_loss: clamp L_p at pi/2 and 1.0 as the released code does; the paper's loss is unbounded.
-        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9), likelihood for the
-            negative log likelihood of each point's partner (`bpnp.losses.matching_likelihood_loss`).
+        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
+            negative log likelihood of each point's partner (`bpnp.losses.matching_likelihood_loss`); reprojection for
+            the angle between the pairs under the solved pose_estimate, without labels (Eq. 2).
         correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
             correspondences; null for the true ones.
         max_skipped_steps: end the run after so many steps in a row without a finite loss and gradient.
@@ -56,7 +52,7 @@ class BlindPnPTask(LightningModule):
         pose_weight: float = 0.0,
         pose_estimate: str = "pnp",
         bounded_pose_loss: bool = False,
-        matching_loss: Literal["correspondence", "likelihood"] = "correspondence",
+        matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
         max_skipped_steps: int = 20,
     ) -> None:
@@ -67,8 +63,8 @@ class BlindPnPTask(LightningModule):
         self.pose_weight = pose_weight
         self.pose_estimate = pose_estimate
         self.pose_bounds = RELEASED_BOUNDS if bounded_pose_loss else None
-        if matching_loss == "likelihood" and correspondence_angle is not None:
-            raise ValueError("expected `correspondence_angle` with matching_loss correspondence, got likelihood")
+        if matching_loss != "correspondence" and correspondence_angle is not None:
+            raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
         self.matching_loss = matching_loss
         self.correspondence_angle = correspondence_angle
         self.max_skipped_steps = max_skipped_steps
@@ -89,7 +85,7 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        prediction = self.solver(batch, poses=self.pose_weight > 0)
+        prediction = self.solver(batch, poses=self.pose_weight > 0 or self.matching_loss == "reprojection")
         loss = self.losses(prediction, batch, "train").mean()
         self._log_train(loss=loss, skipped_steps=self.skipped[0].float())
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
@@ -107,20 +103,25 @@ class BlindPnPTask(LightningModule):
 
     def losses(self, prediction: Prediction, batch: Batch, stage: Stage) -> Tensor:
         """L_c + gamma_p L_p per sample; a sample whose pose did not converge has no L_p, and is counted."""
-        correspondence = self.correspondence_losses(prediction, batch)
-        if correspondence is None:
-            raise ValueError("expected a solver with an assignment to train, got none; try bpnp.models.BPnPNet")
-        likely = self.matching_loss == "likelihood"
-        matching = matching_likelihood_loss(prediction, batch) if likely else correspondence
+        matching, trained = matching_losses(
+            prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle, estimate=self.pose_estimate
+        )
         if stage == "train":
-            self._log_train(correspondence_loss=correspondence.mean(), **_assignment_stats(prediction))
-            if likely:
-                self._log_train(matching_loss=matching.mean())
+            known = self.correspondence_losses(prediction, batch)
+            logged = {} if known is None else {"correspondence_loss": known.mean()}
+            if self.matching_loss != "correspondence":
+                logged |= {"matching_loss": matching.sum() / trained.sum(), "left_out": 1 - trained.float().mean()}
+            self._log_train(**logged, **_assignment_stats(prediction))
+        # A mean over the batch is then one over the samples that have a loss; without any it is NaN, and no step.
+        matching = matching * (len(trained) / trained.sum())
         if self.pose_weight == 0:
             return matching
         pose = prediction.poses[self.pose_estimate]
         solved = pose.stats.converged
-        rotation_gt, translation_gt = _known(batch.rotation, "rotation"), _known(batch.translation, "translation")
+        rotation_gt, translation_gt = (
+            known_values(batch.rotation, "rotation"),
+            known_values(batch.translation, "translation"),
+        )
         # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
         rotation = torch.where(solved[:, None, None], pose.rotation, rotation_gt)
         translation = torch.where(solved[:, None], pose.translation, translation_gt)
@@ -131,18 +132,7 @@ class BlindPnPTask(LightningModule):
 
     def correspondence_losses(self, prediction: Prediction, batch: Batch) -> Tensor | None:
         """L_c per sample; None if the solver has no assignment or the batch nothing to compare it with."""
-        if prediction.assignment is None:
-            return None
-        if self.correspondence_angle is None:
-            return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-        return correspondence_loss_from_pose(
-            prediction.assignment,
-            batch.points2d,
-            batch.points3d,
-            _known(batch.rotation, "rotation"),
-            _known(batch.translation, "translation"),
-            angle=self.correspondence_angle,
-        )
+        return correspondence_losses(prediction, batch, angle=self.correspondence_angle)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
@@ -232,12 +222,6 @@ def _assignment_stats(prediction: Prediction) -> dict[str, Tensor]:
         "sinkhorn_iterations": stats.iterations.float().mean(),
         "sinkhorn_unconverged": 1 - stats.converged.float().mean(),
     }
-
-
-def _known(value: Tensor | None, name: str) -> Tensor:
-    if value is None:
-        raise ValueError(f"expected a batch with its true `{name}`, got None")
-    return value
 
 
 def _wait(device: torch.device) -> None:

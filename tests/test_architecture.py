@@ -14,7 +14,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 # A part imports from parts of its own row and of rows above it.
 ROWS = [
     ["bpnp.geometry", "bpnp.types", "bpnp.cameras", "bpnp.files"],
-    ["bpnp.layers", "bpnp.losses", "bpnp.metrics", "bpnp.accuracy", "bpnp.verdict"],
+    ["bpnp.layers", "bpnp.losses", "bpnp.supervision", "bpnp.metrics", "bpnp.accuracy", "bpnp.verdict"],
     ["bpnp.models"],
     ["bpnp.report"],
     ["bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.api", "bpnp.solving"],
