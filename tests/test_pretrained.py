@@ -1,6 +1,7 @@
 """The packaged weights: found by name, offline, and good on shapes that they were not trained on."""
 
 import tomllib
+from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -8,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from bpnp import Batch, BPnPNet, solve
+from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule
+from bpnp.datamodules.outliers import Outliers
 from bpnp.metrics import rotation_error
 from bpnp.models.pretrained import LEARNED, pack, pretrained_names, pretrained_path
 
@@ -67,6 +69,47 @@ def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -
     assert solution.verdict == "confident"
     relative = torch.as_tensor(solution.rotation)[None]
     assert float(rotation_error(relative, unseen.rotation[:1].double())) < 1
+
+
+@pytest.fixture(scope="module")
+def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """Views of test shapes as in the paper, with half as many outliers as pairs on each side; any scale and origin."""
+    data = MeshDataModule(
+        num_points=64,
+        pool_size=64,
+        test_shapes=16,
+        test_outliers=Outliers(ratio=0.5),
+        batch_size=16,
+        cache_dir=str(tmp_path_factory.mktemp("c")),
+    )
+    data.setup("test")
+    batch: Batch = next(iter(data.test_dataloader()))
+    return batch
+
+
+def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
+    """The most probable partner of a paired point is the true one or a near one; of 96, chance is in the middle."""
+    assert cluttered.rotation is not None
+    net = Matcher.from_pretrained("matcher-clutter")
+    moved = replace(cluttered, points3d=7 * cluttered.points3d + torch.tensor([5.0, -3.0, 1.0]))
+    with torch.no_grad():
+        prediction = net(moved)
+    partner = cluttered.match3d.clamp_min(0)
+    true = prediction.assignment.gather(1, partner.unsqueeze(1))
+    rank = (prediction.assignment > true).sum(1)[cluttered.match3d >= 0]
+    assert float(rank.float().median()) <= 1
+    alone = prediction.unmatched3d[(cluttered.match3d < 0) & cluttered.mask3d].median()
+    assert alone > 2 * prediction.unmatched3d[cluttered.match3d >= 0].median()
+    assert float(rotation_error(prediction.poses["ransac"].rotation, cluttered.rotation).median()) < 5
+    assert float(rotation_error(prediction.poses["refined"].rotation, cluttered.rotation).median()) < 1.5
+
+
+def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
+    assert cluttered.rotation is not None
+    points = cluttered.points2d[0], cluttered.points3d[0]
+    for way in ({"prior": Matcher.from_pretrained("matcher-clutter")}, {"solver": pretrained_path("matcher-clutter")}):
+        relative = torch.as_tensor(solve(*points, **way).rotation)[None]
+        assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
 
 
 def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) -> None:

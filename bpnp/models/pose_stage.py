@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.geometry import bearings
@@ -11,7 +11,8 @@ from bpnp.layers.hypotheses import pose_hypotheses
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.refine import Refine
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.layers.support import log_support
+from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
 class PoseStage(nn.Module):
@@ -26,7 +27,7 @@ class PoseStage(nn.Module):
         pnp_method: newton, or lbfgs as in the paper.
         pnp_iterations: most iterations of the PnP layer.
         refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
-            poses that the assignment proposes.
+            poses that the assignment proposes; from the other two alone where the assignment is against the result.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
     """
 
@@ -65,9 +66,33 @@ class PoseStage(nn.Module):
         pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
         poses = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
-            starts = self._starts(assignment, batch, [ransac, pnp])
-            poses["refined"] = Pose(*self.refine(rays, batch.points3d, *starts, batch.mask2d, batch.mask3d))
+            poses["refined"] = self._refined(prediction, batch, [ransac, pnp])
         return replace(prediction, poses=poses)
+
+    def _refined(self, prediction: Prediction, batch: Batch, poses: list[Pose]) -> Pose:
+        """Annealed from all starts; from the two estimates alone where the assignment is against the result."""
+        assert self.refine is not None
+        assert prediction.assignment is not None
+        rays, masks = bearings(batch.points2d), (batch.mask2d, batch.mask3d)
+        starts = self._starts(prediction.assignment, batch, poses)
+        found = Pose(*self.refine(rays, batch.points3d, *starts, *masks))
+        if not self.hypotheses:
+            return found
+        support = self._support(prediction, batch, found)
+        doubtful = support < 0
+        if not bool(doubtful.any()):
+            return found
+        two = [torch.where(_like(doubtful, start[:, :2]), start[:, :2], torch.nan) for start in starts]
+        own = Pose(*self.refine(rays, batch.points3d, *two, *masks))
+        better = doubtful & (self._support(prediction, batch, own) > 0)
+        return _chosen(better, own, found)
+
+    def _support(self, prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
+        assert prediction.assignment is not None
+        return log_support(
+            prediction.assignment, bearings(batch.points2d), batch.points3d, pose.rotation, pose.translation,
+            mask2d=batch.mask2d, mask3d=batch.mask3d, unmatched2d=prediction.unmatched2d,
+        )  # fmt: skip
 
     def _starts(
         self, assignment: Float[Tensor, "b m n"], batch: Batch, poses: list[Pose]
@@ -82,3 +107,22 @@ class PoseStage(nn.Module):
             mask3d=batch.mask3d,
         )  # fmt: skip
         return torch.cat([rotation, turns.to(rotation)], 1), torch.cat([translation, shifts.to(translation)], 1)
+
+
+def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
+    """The first pose of the chosen samples, the second of the others."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(_like(chosen, a), a, b)
+
+    stats = (getattr(pose.stats, name) for name in ("iterations", "residual", "converged") for pose in (first, second))
+    iterations, residual, converged = (pick(a, b) for a, b in zip(stats, stats, strict=True))
+    return Pose(
+        pick(first.rotation, second.rotation),
+        pick(first.translation, second.translation),
+        SolveStats(iterations, residual, converged),
+    )
+
+
+def _like(chosen: Bool[Tensor, " b"], values: Tensor) -> Tensor:
+    return chosen.reshape(-1, *[1] * (values.ndim - 1))
