@@ -76,7 +76,7 @@ def measure(points: int, *, poses: bool) -> Run:
         return hook
 
     net.sinkhorn.register_forward_pre_hook(lambda *_: ends("features, cost"))
-    for stage, layer in (("Sinkhorn", net.sinkhorn), ("RANSAC", net.ransac), ("PnP", net.pnp)):
+    for stage, layer in (("Sinkhorn", net.sinkhorn), ("RANSAC", net.pose_stage.ransac), ("PnP", net.pose_stage.pnp)):
         layer.register_forward_hook(solved(stage))
     training_losses(net, batch, poses).mean().backward()
     ends("backward")

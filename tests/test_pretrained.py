@@ -98,8 +98,8 @@ def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
     true = prediction.assignment.gather(1, partner.unsqueeze(1))
     rank = (prediction.assignment > true).sum(1)[cluttered.match3d >= 0]
     assert float(rank.float().median()) <= 1
-    alone = prediction.unmatched3d[(cluttered.match3d < 0) & cluttered.mask3d].median()
-    assert alone > 2 * prediction.unmatched3d[cluttered.match3d >= 0].median()
+    alone, paired = ((cluttered.match3d < 0) & cluttered.mask3d), cluttered.match3d >= 0
+    assert prediction.unmatched3d[alone].median() > 1.3 * prediction.unmatched3d[paired].median()
     assert float(rotation_error(prediction.poses["ransac"].rotation, cluttered.rotation).median()) < 5
     assert float(rotation_error(prediction.poses["refined"].rotation, cluttered.rotation).median()) < 1.5
 

@@ -115,7 +115,8 @@ class BPnPNet(nn.Module):
 
         Raises FileNotFoundError, or ValueError naming the file if it holds no BPnPNet.
         """
-        return restored(path, cls)
+        net: BPnPNet = restored(path, cls)
+        return net
 
     @classmethod
     def from_pretrained(cls, name: str) -> "BPnPNet":

@@ -3,14 +3,11 @@
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import torch
-from torch import nn
 
 SHAPING = ("channels", "blocks", "batch_norm", "learn_mu")  # settings that the shapes of the weights depend on
-
-Network = TypeVar("Network", bound=nn.Module)
 
 
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
@@ -46,7 +43,7 @@ def check_solver(saved: Mapping[str, Any], name: str, settings: Mapping[str, Any
         raise ValueError(f"expected a checkpoint of the configured {name}, got one with {told}; try these settings")
 
 
-def restored(path: str | Path, *classes: type[Network]) -> Network:
+def restored(path: str | Path, *classes: type[Any]) -> Any:
     """The network of a checkpoint that `bpnp fit` wrote, in evaluation mode: whichever of the classes it is of.
 
     Raises FileNotFoundError, or ValueError naming the file if it holds none of them.

@@ -15,7 +15,8 @@ def load_network(path: str | Path) -> TrainedNet:
 
     Raises FileNotFoundError, or ValueError naming the file if it holds neither.
     """
-    return restored(path, BPnPNet, Matcher)
+    net: TrainedNet = restored(path, BPnPNet, Matcher)
+    return net
 
 
 def load_pretrained(name: str) -> TrainedNet:

@@ -124,7 +124,8 @@ class Matcher(nn.Module):
 
         Raises FileNotFoundError, or ValueError naming the file if it holds no Matcher.
         """
-        return restored(path, cls)
+        net: Matcher = restored(path, cls)
+        return net
 
     @classmethod
     def from_pretrained(cls, name: str) -> "Matcher":
