@@ -36,7 +36,7 @@ def scored(problem: Problem, rotation: Array, translation: Array) -> Candidates:
 
 
 def merged(problem: Problem, around: Candidates, anywhere: Candidates) -> Candidates:
-    """The distinct poses of two searches, best first; safe if the second was, and the first has nothing better."""
+    """The distinct poses of two searches, best first; safe if both found the best one and one of them was sure."""
     rotation, translation, score, matched, scale = (
         torch.cat([first[0], second[0]]).double().numpy()
         for first, second in zip(_values(around), _values(anywhere), strict=True)
@@ -51,7 +51,7 @@ def merged(problem: Problem, around: Candidates, anywhere: Candidates) -> Candid
         translation[kept],
         np.stack([score, matched, scale], -1)[kept],
         int(around.stats.iterations[0] + anywhere.stats.iterations[0]),
-        safe=agree and bool(anywhere.stats.converged[0]),
+        safe=agree and bool(anywhere.stats.converged[0] | around.stats.converged[0]),
         fits=len(kept) > 0 and bool((around if kept[0] < second_best else anywhere).plausible[0]),
     )
 

@@ -97,7 +97,9 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
     if known is None:
         return run()
     around = run(prior=known, max_batches=NET_BATCHES)
-    return around if bool(around.stats.converged[0]) else merged(problem, around, run())
+    # Starts around one pose that end alike prove little; matches that are unique prove themselves.
+    proven = scored(problem, _host(around.rotation[0]), _host(around.translation[0]))
+    return around if bool(around.stats.converged[0] & proven.stats.converged[0]) else merged(problem, around, run())
 
 
 def _report(report: Progress, number: int, _: int, batch: int, seconds: float) -> None:
