@@ -13,6 +13,7 @@ from lightning import LightningDataModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
 from bpnp.commands import convert_weights, prepare
@@ -65,7 +66,9 @@ class BpnpCLI(LightningCLI):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A CSV log and a progress bar always, whatever else the configuration logs to."""
+        """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
+        if self._get(self.config, "trainer.enable_progress_bar") is False:
+            self.trainer_defaults["callbacks"] = []
         trainer = super().instantiate_trainer(**kwargs)
         wanted = self._get(self.config, "trainer.logger") is not False
         if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
@@ -99,7 +102,7 @@ def main(args: Sequence[str] | None = None) -> None:
             COMMANDS[arguments[0]](arguments[1:])
         else:
             _lightning(arguments)
-    except (ValueError, OSError, TrainingDivergedError) as error:
+    except (ValueError, OSError, TrainingDivergedError, MisconfigurationException) as error:
         if os.environ.get("BPNP_TRACEBACK"):
             raise
         print(f"bpnp: error: {error}", file=sys.stderr)

@@ -41,6 +41,7 @@ def test_options_of_the_network_are_explained(capsys: pytest.CaptureFixture[str]
         (["fit", *MESHES, "--data.nonsense=3"], "Option 'nonsense' is not accepted"),
         (["fit", *MESHES, "--data.root=nowhere"], "expected a folder with <class>/{train,test}"),
         (["fit", *MESHES, "--config=nowhere.yaml"], "File does not exist"),
+        (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
         (["report", "nowhere"], "expected a results folder"),
     ],
@@ -75,7 +76,11 @@ def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     logs = list((tmp_path / "run").rglob("metrics.csv"))
     assert "val/rotation_q2_deg" in logs[0].read_text().splitlines()[0]
     main(["test", *common, "--ckpt_path=last"])
-    main(["predict", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt"])
+    assert "━" in capsys.readouterr().out
+    main(
+        ["predict", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"]
+    )
+    assert "━" not in capsys.readouterr().out
     assert (tmp_path / "run" / "predict" / "poses.csv").is_file()
     capsys.readouterr()
     main(["report", f"{tmp_path}/run/test", "--paper=modelnet40"])

@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import wandb
 from lightning import LightningModule, Trainer
 from lightning.pytorch.loggers import CSVLogger
 from matplotlib.image import imread
@@ -108,6 +109,7 @@ def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None
 def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "")
     monkeypatch.setenv("WANDB_SILENT", "true")
+    wandb.finish()  # a run that another test left would be joined
     logger = OfflineWandbLogger(save_dir=str(tmp_path / "runs"))
     fit(tmp_path, TrainingMonitor(pairs=2, every=1), logger, epochs=1)
     assert logger.experiment.offline
