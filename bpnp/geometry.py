@@ -43,6 +43,20 @@ def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), (a * b).sum(-1))
 
 
+def chords(
+    bearings: Float[Tensor, "b m 3"],
+    points3d: Float[Tensor, "b n 3"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+) -> Float[Tensor, "b m n"]:
+    """|f_i - u_j|, u_j the direction of R p_j + t: 2 sin(angle / 2).
+
+    Keeps its digits at small angles and needs no cross products.
+    """
+    directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
+    return torch.cdist(bearings, directions, compute_mode="donot_use_mm_for_euclid_dist")
+
+
 def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """Angle of a^T b in radians, in [0, pi] (paper Eq. 11), by atan2 of twice its sine and twice its cosine.
 

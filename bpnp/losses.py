@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.geometry import angle_between, bearings, rotation_angle, transform
+from bpnp.geometry import angle_between, bearings, chords, rotation_angle, transform
 from bpnp.types import Batch, Pose, Prediction
 
 SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
@@ -79,13 +79,8 @@ def pairs_within(
     translation: Float[Tensor, "b 3"],
     angle: float,
 ) -> Bool[Tensor, "b m n"]:
-    """[angle(f_i, R p_j + t) <= angle] (Eq. 3).
-
-    By the chord between unit vectors, which keeps its digits at small angles and needs no cross products.
-    """
-    directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
-    chord = torch.cdist(bearings(points2d), directions, compute_mode="donot_use_mm_for_euclid_dist")
-    return chord <= 2 * math.sin(angle / 2)
+    """[angle(f_i, R p_j + t) <= angle] (Eq. 3), by the chord between unit vectors."""
+    return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
 def pose_loss(

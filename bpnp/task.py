@@ -107,9 +107,10 @@ class BlindPnPTask(LightningModule):
             prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle, estimate=self.pose_estimate
         )
         if stage == "train":
-            known = self.correspondence_losses(prediction, batch)
+            correspondence = self.matching_loss == "correspondence"
+            known = matching if correspondence else self.correspondence_losses(prediction, batch)
             logged = {} if known is None else {"correspondence_loss": known.mean()}
-            if self.matching_loss != "correspondence":
+            if not correspondence:
                 logged |= {"matching_loss": matching.sum() / trained.sum(), "left_out": 1 - trained.float().mean()}
             self._log_train(**logged, **_assignment_stats(prediction))
         # A mean over the batch is then one over the samples that have a loss; without any it is NaN, and no step.
@@ -118,10 +119,8 @@ class BlindPnPTask(LightningModule):
             return matching
         pose = prediction.poses[self.pose_estimate]
         solved = pose.stats.converged
-        rotation_gt, translation_gt = (
-            known_values(batch.rotation, "rotation"),
-            known_values(batch.translation, "translation"),
-        )
+        rotation_gt = known_values(batch.rotation, "rotation")
+        translation_gt = known_values(batch.translation, "translation")
         # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
         rotation = torch.where(solved[:, None, None], pose.rotation, rotation_gt)
         translation = torch.where(solved[:, None], pose.translation, translation_gt)

@@ -1,5 +1,6 @@
 """Planted problems: point sets whose pose and correspondences are known."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import roma
@@ -49,6 +50,12 @@ class Planted:
 
     def batch(self) -> Batch:
         return Batch.from_arrays(self.points2d, self.points3d, self.rotation, self.translation, self.match3d)
+
+
+def padded(scenes: Sequence[Planted]) -> Batch:
+    """The first pair of each, of different sizes, padded to the largest."""
+    fields = ("points2d", "points3d", "rotation", "translation", "match3d")
+    return Batch.from_arrays(*([getattr(scene, name)[0] for scene in scenes] for name in fields))
 
 
 def plant(

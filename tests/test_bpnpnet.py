@@ -3,7 +3,7 @@ from typing import Any
 
 import pytest
 import torch
-from planted import plant
+from planted import padded, plant
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
@@ -16,9 +16,7 @@ SMALL: dict[str, Any] = {"channels": 16, "blocks": 2}
 
 
 def different_sizes(*sizes: int, dtype: torch.dtype = torch.float64) -> Batch:
-    scenes = [plant(1, n, outliers2d=n // 4, seed=n, dtype=dtype) for n in sizes]
-    fields = ("points2d", "points3d", "rotation", "translation", "match3d")
-    return Batch.from_arrays(*([getattr(scene, name)[0] for scene in scenes] for name in fields))
+    return padded([plant(1, n, outliers2d=n // 4, seed=n, dtype=dtype) for n in sizes])
 
 
 @pytest.fixture(scope="module")

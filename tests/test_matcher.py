@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from planted import plant
+from planted import padded, plant
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
@@ -20,9 +20,7 @@ def small(seed: int = 0) -> Matcher:
 
 def cluttered(*sizes: int) -> Batch:
     """Pairs with a third of clutter on each side, padded to the largest."""
-    scenes = [plant(1, n, outliers2d=n // 3, outliers3d=n // 3 + 1, seed=n) for n in sizes]
-    fields = ("points2d", "points3d", "rotation", "translation", "match3d")
-    return Batch.from_arrays(*([getattr(scene, name)[0] for scene in scenes] for name in fields))
+    return padded([plant(1, n, outliers2d=n // 3, outliers3d=n // 3 + 1, seed=n) for n in sizes])
 
 
 def plan(net: Matcher, batch: Batch) -> Tensor:
@@ -40,8 +38,8 @@ def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
 
 
 def test_a_pair_depends_neither_on_its_batch_nor_on_padding() -> None:
-    net, together = small(), cluttered(9, 21, 14)
-    joint = net(together, poses=False).assignment
+    net, batch = small(), cluttered(9, 21, 14)
+    joint = net(batch, poses=False).assignment
     for i, size in enumerate((9, 21, 14)):
         alone = net(cluttered(size), poses=False).assignment[0]
         torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-8, atol=1e-14)

@@ -14,6 +14,7 @@ from bpnp.types import Batch
 
 Key = tuple[int, int]  # (epoch, index): with the source's seed, all that a pair depends on
 
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}  # their splits
 POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 

@@ -8,7 +8,7 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import PairDataset, PairSource, pair_loader
+from bpnp.datamodules.batching import STAGES, PairDataset, PairSource, pair_loader
 from bpnp.datamodules.device_views import DeviceViews, KeyDataset, ViewKeys
 from bpnp.datamodules.manifest import StoreError, is_store
 from bpnp.datamodules.mesh_folder import folder_pools
@@ -20,8 +20,6 @@ from bpnp.datamodules.surface_store import open_surfaces
 from bpnp.datamodules.surfaces import Normalisation
 from bpnp.datamodules.views import MIN_SEEN, Views
 from bpnp.types import Batch
-
-STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 
 class MeshDataModule(LightningDataModule):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
 from bpnp.datamodules.authors_files import FOCAL, SPLITS, find_parts, read_part
-from bpnp.datamodules.batching import Pair, PairSource, pair_loader
+from bpnp.datamodules.batching import STAGES, Pair, PairSource, pair_loader
 from bpnp.datamodules.manifest import fingerprint, is_store
 from bpnp.datamodules.mesh_source import hold_out
 from bpnp.datamodules.outliers import Outliers, harder
@@ -18,8 +18,6 @@ from bpnp.datamodules.prepare import Prepared, nothing_usable
 from bpnp.datamodules.shards import make_once
 from bpnp.datamodules.store_source import StoreSource
 from bpnp.types import Batch
-
-STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 
 def prepare_preprocessed(source: Path, output: Path, *, dataset: str | None = None) -> Prepared:

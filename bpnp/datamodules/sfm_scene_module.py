@@ -5,13 +5,11 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import Pair, PairSource, pair_loader
+from bpnp.datamodules.batching import STAGES, Pair, PairSource, pair_loader
 from bpnp.datamodules.outliers import Drawn, DrawnSide, Outliers, bounds, harder
 from bpnp.datamodules.procedural import SPLITS
 from bpnp.datamodules.sfm_views import SfmOptions, draw_sfm_pair
 from bpnp.types import Batch
-
-STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}
 
 
 class SfmSceneSource:

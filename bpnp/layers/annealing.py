@@ -49,8 +49,8 @@ def run_batch(scene: Scene, recipe: Recipe, prior: Prior | None, pool: Pool | No
     rotation, translation = draw_poses(scene.bearings, scene.near3d, STARTS, recipe.spread, prior, scene.rng)
     score = np.empty(len(rotation), np.float32)
     outlier = scene.outlier_density(recipe.outliers)
-    scales = _scales(scene.spread, recipe.first_scale, COARSE_SCALE, COARSE_ROUNDS)
-    _descend(scene, COARSE, rotation, translation, scales, outlier, score)
+    scales = cooling(scene.spread, recipe.first_scale, COARSE_SCALE, COARSE_ROUNDS)
+    descend_on_clusters(scene, COARSE, rotation, translation, scales, outlier, score)
 
     kept = distinct(rotation, translation, score, MIDDLE_STARTS, SAME_DEG, math.inf)
     rotation, translation = rotation[kept], translation[kept]
@@ -78,9 +78,9 @@ def _descend_further(
 ) -> Pool:
     """From coarse poses, of which the first `fresh` count as hits, through finer clusters to all points."""
     score = np.empty(len(rotation), np.float32)
-    scales = _scales(scene.spread, COARSE_SCALE, MIDDLE_SCALE, MIDDLE_ROUNDS)
+    scales = cooling(scene.spread, COARSE_SCALE, MIDDLE_SCALE, MIDDLE_ROUNDS)
     outlier = scene.outlier_density(outliers)
-    _descend(scene, MIDDLE, rotation, translation, scales, outlier, score)
+    descend_on_clusters(scene, MIDDLE, rotation, translation, scales, outlier, score)
     kept = distinct(rotation, translation, score, FINE_STARTS, 1.0, math.inf)
     return polish(
         scene, rotation[kept], translation[kept], kept < fresh, MIDDLE_SCALE * scene.spread, fine_outliers,
@@ -88,7 +88,7 @@ def _descend_further(
     )  # fmt: skip
 
 
-def _descend(
+def descend_on_clusters(
     scene: Scene, count: int, rotation: Array, translation: Array, scales: Array, outlier: np.float32, score: Array
 ) -> None:
     """Anneal poses on `count` clusters of each side, in place, with their scores."""
@@ -151,5 +151,6 @@ def _again(scene: Scene, pool: Pool, i: int, outliers: float) -> Pool:
     return polish(scene, *own, first_scale, outliers, bearings=None)
 
 
-def _scales(spread: float, first: float, last: float, rounds: int) -> Array:
+def cooling(spread: float, first: float, last: float, rounds: int) -> Array:
+    """Scales of the rounds, falling by the same factor each; `first` and `last` are relative to the spread."""
     return (spread * np.geomspace(first, last, rounds)).astype(np.float32)

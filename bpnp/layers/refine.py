@@ -1,7 +1,6 @@
 """Pose refinement without correspondences: anneal the soft assignment from poses of which one is roughly right."""
 
 import math
-from functools import partial
 
 import numpy as np
 import torch
@@ -17,17 +16,16 @@ from bpnp.layers.annealing import (
     MIDDLE_ROUNDS,
     MIDDLE_SCALE,
     RECIPES,
-    RELAXATION,
     SHAKEN,
     SHAKES,
+    cooling,
+    descend_on_clusters,
     finish,
     refine_batch,
 )
-from bpnp.layers.kernels import descend
 from bpnp.layers.pool import SAME_DEG, Pool, distinct, is_safe
 from bpnp.layers.scene import Scene, degenerate
 from bpnp.layers.starts import Array
-from bpnp.layers.threads import spread
 from bpnp.types import SolveStats
 
 FEW = 8  # starts that are annealed on all points; more compete on clusters for these places
@@ -97,20 +95,11 @@ def _winnowed(scene: Scene, rotation: Array, translation: Array, outliers: float
     """The starts that are likeliest when annealed on clusters, where they ended, best first."""
     outlier = scene.outlier_density(outliers)
     for count, first, last, rounds, kept in HEATS:
-        clusters, score = scene.clusters(count), np.empty(len(rotation), np.float32)
-        scales = (scene.spread * np.geomspace(first, last, rounds)).astype(np.float32)
-        ends = rotation.copy(), translation.copy()
-        spread(partial(_descend, clusters, *ends, scales, outlier, score), len(rotation))
+        ends, score = (rotation.copy(), translation.copy()), np.empty(len(rotation), np.float32)
+        descend_on_clusters(scene, count, *ends, cooling(scene.spread, first, last, rounds), outlier, score)
         best = distinct(*ends, score, kept, SAME_DEG, math.inf)
         rotation, translation = ends[0][best], ends[1][best]
     return rotation, translation
-
-
-def _descend(
-    clusters: tuple[Array, Array, Array, Array], rotation: Array, translation: Array, scales: Array,
-    outlier: np.float32, score: Array, i: int, j: int,
-) -> None:  # fmt: skip
-    descend(*clusters, rotation[i:j], translation[i:j], scales, outlier, RELAXATION, score[i:j])
 
 
 class Refine(nn.Module):

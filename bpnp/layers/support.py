@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.geometry import transform
+from bpnp.geometry import chords
 
 TRUST = 0.7  # of the assignment; the rest is a uniform one
 ALONE = 0.2  # share of the image points without a partner
@@ -36,8 +36,7 @@ def log_support(
     mass = assignment.sum(2) if unmatched2d is None else assignment.sum(2) + unmatched2d
     given = assignment / mass.clamp_min(torch.finfo(assignment.dtype).tiny).unsqueeze(2)
     prior = (TRUST * given + (1 - TRUST) / mask3d.sum(1)[:, None, None]) * real
-    directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1)
-    squared = torch.cdist(bearings, directions, compute_mode="donot_use_mm_for_euclid_dist").square()
+    squared = chords(bearings, points3d, rotation, translation).square()
     count = mask2d.sum(1)
     rays = bearings * mask2d.unsqueeze(2)
     spread = rays.square().sum((1, 2)) / count - (rays.sum(1) / count.unsqueeze(1)).square().sum(1)

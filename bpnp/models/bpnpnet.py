@@ -1,27 +1,25 @@
 """BPnPNet (Campbell, Liu, Gould, ECCV 2020): blind PnP end to end."""
 
-from pathlib import Path
 from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from bpnp.layers.pnp import Method
 from bpnp.layers.precision import full_precision
 from bpnp.layers.ransac import Backend
 from bpnp.layers.sinkhorn import Sinkhorn
-from bpnp.models.checkpoint import restored
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
 from bpnp.models.pose_stage import PoseStage
-from bpnp.models.pretrained import pretrained_path
+from bpnp.models.pretrained import Restorable
 from bpnp.types import Batch, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
 
 
-class BPnPNet(nn.Module):
+class BPnPNet(Restorable):
     """Features of both point sets, transport between them, RANSAC on the best pairs, weighted PnP on all of them.
 
     Args:
@@ -108,23 +106,6 @@ class BPnPNet(nn.Module):
         z2d = self.features2d(self.image_scale * batch.points2d, batch.mask2d)
         z3d = self.features3d(self.align(points3d, batch.mask3d), batch.mask3d)
         return pairwise_distance(z2d, z3d)
-
-    @classmethod
-    def from_checkpoint(cls, path: str | Path) -> "BPnPNet":
-        """The network of a checkpoint that `bpnp fit` wrote, in evaluation mode.
-
-        Raises FileNotFoundError, or ValueError naming the file if it holds no BPnPNet.
-        """
-        net: BPnPNet = restored(path, cls)
-        return net
-
-    @classmethod
-    def from_pretrained(cls, name: str) -> "BPnPNet":
-        """A network with weights of this package, in evaluation mode; `docs/model-card.md` tells what they can do.
-
-        name: "procedural-so3". Raises ValueError that lists the names for any other. Nothing is downloaded.
-        """
-        return cls.from_checkpoint(pretrained_path(name))
 
 
 @full_precision

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.models.normalisation import MaskedBatchNorm, context_norm
+from bpnp.models.normalisation import MaskedBatchNorm, centred, context_norm
 
 
 class ResidualBlock(nn.Module):
@@ -64,10 +64,7 @@ class PointFeatures(nn.Module):
         z = self.enter(points)
         for block in self.blocks:
             z = block(z, mask)
-        if self.centre:
-            weight = mask.unsqueeze(-1).to(z.dtype)
-            z = z - (z * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-        return nn.functional.normalize(z, dim=-1)
+        return nn.functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
 
 
 class InputTransform(nn.Module):
@@ -94,7 +91,6 @@ class InputTransform(nn.Module):
 def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
     """Centred at the mean, root mean square distance one: features that do not depend on the scene's units."""
     weight = mask.unsqueeze(-1).to(points3d.dtype)
-    count = weight.sum(1, keepdim=True)
-    centred = (points3d - (points3d * weight).sum(1, keepdim=True) / count) * weight
-    radius = ((centred**2).sum((1, 2), keepdim=True) / count).sqrt()
-    return centred / torch.where(radius > 0, radius, 1)
+    around = centred(points3d, mask) * weight
+    radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()
+    return around / torch.where(radius > 0, radius, 1)

@@ -1,7 +1,6 @@
 """A matcher for clutter: attention within and between the two sets, and a bin for every point without a partner."""
 
 import math
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
@@ -11,9 +10,9 @@ from torch import Tensor, nn
 from bpnp.layers.sinkhorn import sinkhorn
 from bpnp.models.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.checkpoint import restored
+from bpnp.models.normalisation import centred
 from bpnp.models.pose_stage import PoseStage
-from bpnp.models.pretrained import pretrained_path
+from bpnp.models.pretrained import Restorable
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
@@ -26,7 +25,7 @@ class RobustFrame(NamedTuple):
     radius: Float[Tensor, "b 1 1"]
 
 
-class Matcher(nn.Module):
+class Matcher(Restorable):
     """Pose from unmatched points of which many have no partner.
 
     Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours; blocks
@@ -118,28 +117,9 @@ class Matcher(nn.Module):
             x2d, x3d = block(x2d, x3d, batch.mask2d, batch.mask3d)
         return self.norm(x2d), self.norm(x3d)
 
-    @classmethod
-    def from_checkpoint(cls, path: str | Path) -> "Matcher":
-        """The matcher of a checkpoint that `bpnp fit` wrote, in evaluation mode.
-
-        Raises FileNotFoundError, or ValueError naming the file if it holds no Matcher.
-        """
-        net: Matcher = restored(path, cls)
-        return net
-
-    @classmethod
-    def from_pretrained(cls, name: str) -> "Matcher":
-        """A matcher with weights of this package, in evaluation mode; `docs/model-card.md` tells what they can do.
-
-        name: "matcher-procedural". Raises ValueError that lists the names for any other. Nothing is downloaded.
-        """
-        return cls.from_checkpoint(pretrained_path(name))
-
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
-        z, weight = self.project(z), mask.unsqueeze(-1).to(z.dtype)
-        centre = (z * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
-        return nn.functional.normalize(z - centre, dim=-1)
+        return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
 
 
 def robust_frame(points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> RobustFrame:

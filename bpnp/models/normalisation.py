@@ -49,6 +49,12 @@ class _ContextNorm(torch.autograd.Function):
         return dx.to(gradient.dtype), None
 
 
+def centred(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+    """x - mean over the real points of each set, per channel."""
+    weight = mask.unsqueeze(-1).to(x.dtype)
+    return x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+
+
 class MaskedBatchNorm(nn.BatchNorm1d):
     """Batch norm over the real points of (b, k, c), or over the samples of (b, c).
 

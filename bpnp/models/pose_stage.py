@@ -78,8 +78,7 @@ class PoseStage(nn.Module):
         found = Pose(*self.refine(rays, batch.points3d, *starts, *masks))
         if not self.hypotheses:
             return found
-        support = self._support(prediction, batch, found)
-        doubtful = support < 0
+        doubtful = self._support(prediction, batch, found) < 0
         if not bool(doubtful.any()):
             return found
         two = [torch.where(_like(doubtful, start[:, :2]), start[:, :2], torch.nan) for start in starts]
@@ -115,12 +114,15 @@ def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
     def pick(a: Tensor, b: Tensor) -> Tensor:
         return torch.where(_like(chosen, a), a, b)
 
-    stats = (getattr(pose.stats, name) for name in ("iterations", "residual", "converged") for pose in (first, second))
-    iterations, residual, converged = (pick(a, b) for a, b in zip(stats, stats, strict=True))
+    one, other = first.stats, second.stats
     return Pose(
         pick(first.rotation, second.rotation),
         pick(first.translation, second.translation),
-        SolveStats(iterations, residual, converged),
+        SolveStats(
+            pick(one.iterations, other.iterations),
+            pick(one.residual, other.residual),
+            pick(one.converged, other.converged),
+        ),
     )
 
 

@@ -2,20 +2,22 @@
 
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
+from torch import nn
 
 from bpnp.files import written_whole
-from bpnp.models.checkpoint import read_checkpoint
+from bpnp.models.checkpoint import read_checkpoint, restored
 
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 KEPT = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
+Net = TypeVar("Net", bound=nn.Module)
 
 
 def pretrained_names() -> list[str]:
-    """Names that `BPnPNet.from_pretrained` knows."""
+    """Names that `Restorable.from_pretrained` knows."""
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 
@@ -28,10 +30,32 @@ def pretrained_path(name: str) -> Path:
     return Path(str(WEIGHTS / f"{name}.ckpt"))
 
 
+class Restorable(nn.Module):
+    """A network that comes back from its checkpoint, in evaluation mode."""
+
+    @classmethod
+    def from_checkpoint(cls: type[Net], path: str | Path) -> Net:
+        """The network of a checkpoint that `bpnp fit` wrote.
+
+        Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
+        """
+        net: Net = restored(path, cls)
+        return net
+
+    @classmethod
+    def from_pretrained(cls: type[Net], name: str) -> Net:
+        """A network with weights of this package; `docs/model-card.md` has the names and what each can do.
+
+        Raises ValueError that lists the names for any other. Nothing is downloaded.
+        """
+        net: Net = restored(pretrained_path(name), cls)
+        return net
+
+
 def pack(checkpoint: str | Path, out: str | Path) -> None:
     """A checkpoint of `bpnp fit` with nothing but the net and its settings, in half precision: what the package holds.
 
-    `BPnPNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any other.
+    `Restorable.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any other.
 
     Weights beyond float16's range are a ValueError.
     """

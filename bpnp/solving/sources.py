@@ -80,7 +80,7 @@ def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
 
 
 def _searched(problem: Problem, number: int, prior: Prior | None, options: Options) -> Candidates:
-    """The search, after a net's pose around it: if that is not safe, everywhere."""
+    """The search, after a net's pose around it: unless what that finds is certain, everywhere too."""
     run = partial(
         search_candidates,
         torch.as_tensor(problem.bearings)[None],
@@ -97,9 +97,14 @@ def _searched(problem: Problem, number: int, prior: Prior | None, options: Optio
     if known is None:
         return run()
     around = run(prior=known, max_batches=NET_BATCHES)
-    # Starts around one pose that end alike prove little; matches that are unique prove themselves.
-    proven = scored(problem, _host(around.rotation[0]), _host(around.translation[0]))
-    return around if bool(around.stats.converged[0] & proven.stats.converged[0]) else merged(problem, around, run())
+    return around if _certain(problem, around) else merged(problem, around, run())
+
+
+def _certain(problem: Problem, around: Candidates) -> bool:
+    """Starts around one pose that end alike prove little; matches that are unique prove themselves."""
+    if not bool(around.stats.converged[0]):
+        return False
+    return bool(scored(problem, _host(around.rotation[0]), _host(around.translation[0])).stats.converged[0])
 
 
 def _report(report: Progress, number: int, _: int, batch: int, seconds: float) -> None:
