@@ -117,10 +117,15 @@ class Sinkhorn(nn.Module):
     ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
         return sinkhorn(
             cost,
-            mu=self.mu if self.log_mu is None else self.log_mu.exp(),
+            mu=self.entropy,
             mask2d=mask2d,
             mask3d=mask3d,
             dustbin=self.dustbin if self.bin_cost is None else self.bin_cost,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )
+
+    @property
+    def entropy(self) -> float | Tensor:
+        """mu, as it is now."""
+        return self.mu if self.log_mu is None else self.log_mu.exp()

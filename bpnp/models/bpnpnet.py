@@ -14,7 +14,8 @@ from bpnp.layers.sinkhorn import Sinkhorn
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
 from bpnp.models.pose_stage import PoseStage
 from bpnp.models.pretrained import Restorable
-from bpnp.types import Batch, Prediction
+from bpnp.models.rematching import cost_under_pose
+from bpnp.types import Batch, Pose, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
 
@@ -43,6 +44,8 @@ class BPnPNet(Restorable):
         refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
             poses that the assignment proposes.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
+        rounds: in evaluation, how often the points are matched again under the last pose, RANSAC's the first, and the
+            PnP layer run on the new assignment.
     """
 
     estimates: tuple[str, ...] = ("ransac", "pnp", "refined")
@@ -68,6 +71,7 @@ class BPnPNet(Restorable):
         pnp_iterations: int = 50,
         refine: bool = True,
         hypotheses: int = 192,
+        rounds: int = 0,
     ) -> None:
         super().__init__()
         self.settings: dict[str, Any] = {
@@ -89,15 +93,25 @@ class BPnPNet(Restorable):
             pnp_iterations=pnp_iterations,
             refine=refine,
             hypotheses=hypotheses,
+            rounds=rounds,
         )
         self.estimates = self.pose_stage.estimates
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
         """Prediction with the assignment and, if `poses`, the estimates "ransac" and "pnp"; in evaluation "refined"."""
         cost = self.cost(batch)
-        assignment, assignment_stats = self.sinkhorn(cost, batch.mask2d, batch.mask3d)
-        prediction = Prediction(assignment, assignment_stats)
-        return self.pose_stage(prediction, batch) if poses else prediction
+        prediction = self.match(cost, batch)
+        if not poses:
+            return prediction
+
+        def rematch(pose: Pose, width: float) -> Prediction:
+            return self.match(cost_under_pose(cost, batch, pose, width=width, mu=self.sinkhorn.entropy), batch)
+
+        return self.pose_stage(prediction, batch, rematch)
+
+    def match(self, cost: Float[Tensor, "b m n"], batch: Batch) -> Prediction:
+        """The assignment at which the transport of this cost ends."""
+        return Prediction(*self.sinkhorn(cost, batch.mask2d, batch.mask3d))
 
     def cost(self, batch: Batch) -> Float[Tensor, "b m n"]:
         """M_ij = ||z_i - z_j||_2 between the unit features of both sides, in [0, 2], in the network's dtype."""

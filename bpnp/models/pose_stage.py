@@ -1,5 +1,6 @@
 """From an assignment to poses: RANSAC on its best pairs, weighted PnP on all of them, annealing without them."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -12,7 +13,10 @@ from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.refine import Refine
 from bpnp.layers.support import log_support
+from bpnp.models.rematching import widths
 from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+Rematch = Callable[[Pose, float], Prediction]  # the assignment under a pose, and a width of its reprojections
 
 
 class PoseStage(nn.Module):
@@ -29,6 +33,8 @@ class PoseStage(nn.Module):
         refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
             poses that the assignment proposes; from the other two alone where the assignment is against the result.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
+        rounds: in evaluation, how often the points are matched again under the last pose, RANSAC's the first, and the
+            PnP layer run on the new assignment (`bpnp.models.rematching`); the last width is the threshold.
     """
 
     def __init__(
@@ -42,10 +48,12 @@ class PoseStage(nn.Module):
         pnp_iterations: int = 50,
         refine: bool = True,
         hypotheses: int = 192,
+        rounds: int = 0,
     ) -> None:
         super().__init__()
-        if hypotheses < 0:
-            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
+        for name, value in {"hypotheses": hypotheses, "rounds": rounds}.items():
+            if value < 0:
+                raise ValueError(f"expected a number of `{name}`, got {value}; try 0 for none")
         self.ransac = RansacPnP(
             backend=ransac_backend,
             pairs_factor=pairs_factor,
@@ -55,19 +63,27 @@ class PoseStage(nn.Module):
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
         self.refine = Refine() if refine else None
         self.hypotheses = hypotheses
+        self.widths = widths(rounds, threshold)
         self.estimates: tuple[str, ...] = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
 
-    def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
-        """The prediction with its poses."""
-        assignment = prediction.assignment
-        assert assignment is not None
-        rays = bearings(batch.points2d)
-        ransac = Pose(*self.ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
-        pnp = Pose(*self.pnp(assignment, rays, batch.points3d, ransac.rotation, ransac.translation))
+    def forward(self, prediction: Prediction, batch: Batch, rematch: Rematch) -> Prediction:
+        """The prediction with its poses, and with the assignment of the last round."""
+        assert prediction.assignment is not None
+        given = prediction.assignment.detach()
+        ransac = Pose(*self.ransac(given, batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
+        pose, pnp, last = ransac, self._solve(prediction, batch, ransac), prediction
+        for width in [] if self.training else self.widths:
+            last = rematch(pose, width)
+            pose = pnp = self._solve(last, batch, pose)
         poses = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
             poses["refined"] = self._refined(prediction, batch, [ransac, pnp])
-        return replace(prediction, poses=poses)
+        return replace(last, poses=poses)
+
+    def _solve(self, prediction: Prediction, batch: Batch, start: Pose) -> Pose:
+        """Weighted PnP."""
+        rays = bearings(batch.points2d)
+        return Pose(*self.pnp(prediction.assignment, rays, batch.points3d, start.rotation, start.translation))
 
     def _refined(self, prediction: Prediction, batch: Batch, poses: list[Pose]) -> Pose:
         """Annealed from all starts; from the two estimates alone where the assignment is against the result."""
