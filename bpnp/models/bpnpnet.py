@@ -1,5 +1,6 @@
 """BPnPNet (Campbell, Liu, Gould, ECCV 2020): blind PnP end to end."""
 
+from functools import partial
 from typing import Any
 
 import torch
@@ -14,7 +15,7 @@ from bpnp.layers.sinkhorn import Sinkhorn
 from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
 from bpnp.models.pose_stage import PoseStage
 from bpnp.models.pretrained import Restorable
-from bpnp.models.rematching import cost_under_pose
+from bpnp.models.rematching import cost_under_pose, widths
 from bpnp.types import Batch, Pose, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
@@ -45,7 +46,7 @@ class BPnPNet(Restorable):
             poses that the assignment proposes.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
         rounds: in evaluation, how often the points are matched again under the last pose, RANSAC's the first, and the
-            PnP layer run on the new assignment.
+            PnP layer run on the new assignment (`bpnp.models.rematching`); the last width is the threshold.
     """
 
     estimates: tuple[str, ...] = ("ransac", "pnp", "refined")
@@ -77,6 +78,8 @@ class BPnPNet(Restorable):
         self.settings: dict[str, Any] = {
             k: v for k, v in locals().items() if k not in ("self", "__class__")
         }  # fmt: skip
+        if rounds < 0:
+            raise ValueError(f"expected a number of `rounds`, got {rounds}; try 0 for none")
         self.image_scale = image_scale
         self.normalise_scene = normalise_scene
         shape = {"channels": channels, "blocks": blocks, "batch_norm": batch_norm, "centre": centre_features}
@@ -93,8 +96,8 @@ class BPnPNet(Restorable):
             pnp_iterations=pnp_iterations,
             refine=refine,
             hypotheses=hypotheses,
-            rounds=rounds,
         )
+        self.widths = widths(rounds, threshold)
         self.estimates = self.pose_stage.estimates
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
@@ -104,10 +107,11 @@ class BPnPNet(Restorable):
         if not poses:
             return prediction
 
-        def rematch(pose: Pose, width: float) -> Prediction:
+        def rematch(pose: Pose, *, width: float) -> Prediction:
             return self.match(cost_under_pose(cost, batch, pose, width=width, mu=self.sinkhorn.entropy), batch)
 
-        return self.pose_stage(prediction, batch, rematch)
+        rounds = [] if self.training else [partial(rematch, width=width) for width in self.widths]
+        return self.pose_stage(prediction, batch, rounds)
 
     def match(self, cost: Float[Tensor, "b m n"], batch: Batch) -> Prediction:
         """The assignment at which the transport of this cost ends."""

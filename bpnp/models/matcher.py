@@ -13,8 +13,7 @@ from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.normalisation import centred
 from bpnp.models.pose_stage import PoseStage
 from bpnp.models.pretrained import Restorable
-from bpnp.models.rematching import cost_under_pose
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
 
@@ -78,32 +77,21 @@ class Matcher(Restorable):
 
     def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
         """Prediction with the assignment, its bins and, if `poses`, the estimates of the pose stage."""
-        cost, leave2d, leave3d = self.costs(batch)
-        prediction = self.match(cost, leave2d, leave3d, batch)
-        if not poses:
-            return prediction
+        plan, stats = self.transport(batch)
+        assignment = plan[:, :-1, :-1]
+        prediction = Prediction(assignment, stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
+        return self.pose_stage(prediction, batch) if poses else prediction
 
-        def rematch(pose: Pose, width: float) -> Prediction:
-            under_pose = cost_under_pose(cost, batch, pose, width=width, mu=self.log_mu.exp())
-            return self.match(under_pose, leave2d, leave3d, batch)
+    def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
+        """Plan over the points and one bin on each side (last row, last column).
 
-        return self.pose_stage(prediction, batch, rematch)
-
-    def costs(self, batch: Batch) -> tuple[Float[Tensor, "b m n"], Float[Tensor, "b m 1"], Float[Tensor, "b n 1"]]:
-        """A pair's, the distance of the unit features, and each point's own to stay without a partner."""
+        Every real point has the mass 1 / (m + n), each bin that of the other side's points. A pair costs the distance
+        of the unit features, a point its own cost to leave.
+        """
         batch = batch.to(self.bin_cost.dtype)
         z2d, z3d = self.features(batch)
         cost = pairwise_distance(self._unit(z2d, batch.mask2d), self._unit(z3d, batch.mask3d))
-        return cost, self.bin_cost + self.leave(z2d), self.bin_cost + self.leave(z3d)
-
-    def match(
-        self, cost: Float[Tensor, "b m n"], leave2d: Float[Tensor, "b m 1"], leave3d: Float[Tensor, "b n 1"],
-        batch: Batch,
-    ) -> Prediction:  # fmt: skip
-        """Transport between the points and one bin on each side.
-
-        Every real point has the mass 1 / (m + n), each bin that of the other side's points.
-        """
+        leave2d, leave3d = self.bin_cost + self.leave(z2d), self.bin_cost + self.leave(z3d)
         corner = self.bin_cost.expand(len(batch), 1, 1)
         cost = torch.cat([torch.cat([cost, leave2d], 2), torch.cat([leave3d.mT, corner], 2)], 1)
         with_bin = nn.functional.pad
@@ -111,11 +99,10 @@ class Matcher(Restorable):
         total = (batch.count2d + batch.count3d).unsqueeze(-1).to(cost.dtype)
         rows = torch.cat([batch.mask2d / total, batch.count3d.unsqueeze(-1) / total], 1)
         cols = torch.cat([batch.mask3d / total, batch.count2d.unsqueeze(-1) / total], 1)
-        plan, stats = sinkhorn(
+        return sinkhorn(
             cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, mask2d=mask2d, mask3d=mask3d,
             tolerance=self.sinkhorn_tolerance,
         )  # fmt: skip
-        return Prediction(plan[:, :-1, :-1], stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
         """Features of both sides after the last block, normalised by layer, not to unit length."""

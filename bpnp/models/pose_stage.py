@@ -1,6 +1,6 @@
 """From an assignment to poses: RANSAC on its best pairs, weighted PnP on all of them, annealing without them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -13,10 +13,9 @@ from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.layers.refine import Refine
 from bpnp.layers.support import log_support
-from bpnp.models.rematching import widths
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
-Rematch = Callable[[Pose, float], Prediction]  # the assignment under a pose, and a width of its reprojections
+Rematch = Callable[[Pose], Prediction]  # the assignment under a pose
 
 
 class PoseStage(nn.Module):
@@ -33,8 +32,6 @@ class PoseStage(nn.Module):
         refine: give a third pose in evaluation, "refined", annealed without the assignment from the other two and from
             poses that the assignment proposes; from the other two alone where the assignment is against the result.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
-        rounds: in evaluation, how often the points are matched again under the last pose, RANSAC's the first, and the
-            PnP layer run on the new assignment (`bpnp.models.rematching`); the last width is the threshold.
     """
 
     def __init__(
@@ -48,12 +45,10 @@ class PoseStage(nn.Module):
         pnp_iterations: int = 50,
         refine: bool = True,
         hypotheses: int = 192,
-        rounds: int = 0,
     ) -> None:
         super().__init__()
-        for name, value in {"hypotheses": hypotheses, "rounds": rounds}.items():
-            if value < 0:
-                raise ValueError(f"expected a number of `{name}`, got {value}; try 0 for none")
+        if hypotheses < 0:
+            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
         self.ransac = RansacPnP(
             backend=ransac_backend,
             pairs_factor=pairs_factor,
@@ -63,17 +58,20 @@ class PoseStage(nn.Module):
         self.pnp = WeightedPnP(method=pnp_method, max_iterations=pnp_iterations)
         self.refine = Refine() if refine else None
         self.hypotheses = hypotheses
-        self.widths = widths(rounds, threshold)
         self.estimates: tuple[str, ...] = ("ransac", "pnp", "refined") if refine else ("ransac", "pnp")
 
-    def forward(self, prediction: Prediction, batch: Batch, rematch: Rematch) -> Prediction:
-        """The prediction with its poses, and with the assignment of the last round."""
+    def forward(self, prediction: Prediction, batch: Batch, rounds: Sequence[Rematch] = ()) -> Prediction:
+        """The prediction with its poses, and with the assignment of the last round.
+
+        In each round the points are matched again under the last pose, of which RANSAC's is the first, and the PnP
+        layer is run on the new assignment. The other poses are those of the assignment as it was.
+        """
         assert prediction.assignment is not None
         given = prediction.assignment.detach()
         ransac = Pose(*self.ransac(given, batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
         pose, pnp, last = ransac, self._solve(prediction, batch, ransac), prediction
-        for width in [] if self.training else self.widths:
-            last = rematch(pose, width)
+        for rematch in rounds:
+            last = rematch(pose)
             pose = pnp = self._solve(last, batch, pose)
         poses = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
