@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.geometry import angle_between, bearings, camera_centre, rotation_angle, transform
+from bpnp.geometry import angle_between, bearings, camera_centre, is_finite, rotation_angle, transform
 from bpnp.types import Batch, Pose
 
 
@@ -51,7 +51,7 @@ def centre_error(
     """
     centre = camera_centre(rotation.double(), translation.double())
     error = torch.linalg.vector_norm(centre - camera_centre(rotation_gt.double(), translation_gt.double()), dim=-1)
-    return error.where(_is_finite(rotation, translation), math.inf)
+    return error.where(is_finite(rotation, translation), math.inf)
 
 
 def reprojection_error(
@@ -73,7 +73,7 @@ def reprojection_error(
     points = transform(rotation.double(), translation.double(), points3d.double())
     angle = angle_between(bearings(seen), points).where((points != 0).any(-1), math.pi)
     mean = torch.rad2deg(angle.where(true, 0.0).sum(-1) / true.sum(-1))
-    return mean.where(_is_finite(rotation, translation), 180.0)
+    return mean.where(is_finite(rotation, translation), 180.0)
 
 
 def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
@@ -83,7 +83,7 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
     """
     if batch.rotation is None or batch.translation is None:
         raise ValueError("expected a batch with its true `rotation` and `translation`, got None; try Batch.from_arrays")
-    known = _is_finite(batch.rotation, batch.translation)
+    known = is_finite(batch.rotation, batch.translation)
     if not bool(known.all()):
         raise ValueError(f"expected a finite true pose, got NaN or infinity in {batch.ids[int(known.int().argmin())]}")
     rotation = pose.rotation.where(pose.found[:, None, None], math.nan)
@@ -99,7 +99,3 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
         reprojection_deg=reprojection,
         index=batch.index,
     )
-
-
-def _is_finite(rotation: Float[Tensor, "b 3 3"], translation: Float[Tensor, "b 3"]) -> Bool[Tensor, " b"]:
-    return rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)

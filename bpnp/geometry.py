@@ -1,7 +1,7 @@
 """Bearings, rigid motion, projection and angles. Pure functions, any leading axes; camera = R p + t."""
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 
@@ -41,6 +41,11 @@ def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float
     """Angle in radians, atan2(|a x b|, a.b): exact near 0 and pi, where arccos loses half the digits."""
     a, b = torch.broadcast_tensors(a, b)
     return torch.atan2(torch.linalg.vector_norm(torch.linalg.cross(a, b), dim=-1), (a * b).sum(-1))
+
+
+def is_finite(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Bool[Tensor, "*b"]:
+    """Poses that are there: what was not found is NaN or infinite."""
+    return rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
 
 
 def chords(

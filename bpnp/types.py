@@ -14,6 +14,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bpnp.geometry import is_finite
+
 _T = TypeVar("_T")
 Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
 
@@ -42,7 +44,7 @@ class Pose:
     @property
     def found(self) -> Bool[Tensor, " b"]:
         """Samples that have a finite pose."""
-        return self.rotation.isfinite().all((-2, -1)) & self.translation.isfinite().all(-1)
+        return is_finite(self.rotation, self.translation)
 
     def to(self, *args: Any, **kwargs: Any) -> "Pose":
         return _moved(self, *args, **kwargs)

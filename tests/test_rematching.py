@@ -7,8 +7,9 @@ from planted import Planted, padded, plant
 from torch import Tensor, nn
 
 from bpnp import BPnPNet, Prediction
-from bpnp.geometry import rotation_angle, transform
+from bpnp.geometry import transform
 from bpnp.layers import sinkhorn
+from bpnp.metrics import rotation_error
 from bpnp.models.pose_stage import PoseStage
 from bpnp.models.rematching import FEATURES, LIMIT, cost_under_pose, widths
 from bpnp.types import Pose, SolveStats
@@ -51,7 +52,7 @@ def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
     errors, masses = [], []
     for rounds in (0, 8):
         prediction = solved(scene, scene.near(0.03), cost, rounds)
-        errors.append(torch.rad2deg(rotation_angle(prediction.poses["pnp"].rotation, scene.rotation)))
+        errors.append(rotation_error(prediction.poses["pnp"].rotation, scene.rotation))
         masses.append((prediction.assignment * (scene.permutation() > 0)).sum((1, 2)))
     assert errors[0].min() > 5
     assert errors[1].max() < 0.3

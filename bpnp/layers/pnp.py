@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bpnp.geometry import hat
+from bpnp.geometry import hat, is_finite
 from bpnp.layers.implicit import at_optimum
 from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient, retract
 from bpnp.layers.pacing import steps, unfinished
@@ -58,7 +58,7 @@ def weighted_pnp(
     dtype = assignment.dtype
     q = aggregate(assignment, bearings).double()
     points, frame = _normalise(points3d.double(), q.detach())
-    start_found = rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
+    start_found = is_finite(rotation, translation)
     start_r = torch.where(start_found[:, None, None], rotation.double(), torch.eye(3, device=q.device).double())
     start_r = roma.special_procrustes(start_r.detach())  # steps keep what a rounded start lacks to a rotation
     start_t = torch.where(start_found[:, None], translation.double(), torch.ones_like(frame.centre))

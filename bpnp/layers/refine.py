@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from bpnp.geometry import is_finite
 from bpnp.layers.annealing import (
     COARSE,
     COARSE_ROUNDS,
@@ -70,7 +71,7 @@ def refine(
         f = bearings[i] if mask2d is None else bearings[i][mask2d[i]]
         p = points3d[i] if mask3d is None else points3d[i][mask3d[i]]
         image, cloud = f.detach().double().cpu().numpy(), p.detach().double().cpu().numpy()
-        found = rotation[i].isfinite().all((-2, -1)) & translation[i].isfinite().all(-1)
+        found = is_finite(rotation[i], translation[i])
         if not bool(found.any()) or degenerate(image) or degenerate(cloud):
             continue
         scene = Scene(image, cloud, seed)

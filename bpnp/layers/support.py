@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.geometry import chords
+from bpnp.geometry import chords, is_finite
 
 TRUST = 0.7  # of the assignment; the rest is a uniform one
 ALONE = 0.2  # share of the image points without a partner
@@ -42,5 +42,4 @@ def log_support(
     spread = rays.square().sum((1, 2)) / count - (rays.sum(1) / count.unsqueeze(1)).square().sum(1)
     density = torch.exp(-squared / (2 * WIDTH**2)) * (spread / WIDTH**2)[:, None, None]
     each = torch.log(ALONE + (1 - ALONE) * (prior * density).sum(2)) * mask2d
-    found = rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
-    return torch.where(found, each.sum(1), -math.inf)
+    return torch.where(is_finite(rotation, translation), each.sum(1), -math.inf)

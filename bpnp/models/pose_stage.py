@@ -69,10 +69,11 @@ class PoseStage(nn.Module):
         assert prediction.assignment is not None
         given = prediction.assignment.detach()
         ransac = Pose(*self.ransac(given, batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
-        pose, pnp, last = ransac, self._solve(prediction, batch, ransac), prediction
+        pose, last = ransac, prediction
         for rematch in rounds:
             last = rematch(pose)
-            pose = pnp = self._solve(last, batch, pose)
+            pose = self._solve(last, batch, pose)
+        pnp = pose if rounds else self._solve(prediction, batch, ransac)
         poses = {"ransac": ransac, "pnp": pnp}
         if self.refine is not None and not self.training:
             poses["refined"] = self._refined(prediction, batch, [ransac, pnp])

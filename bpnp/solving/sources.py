@@ -10,6 +10,7 @@ import roma
 import torch
 from torch import Tensor, nn
 
+from bpnp.geometry import is_finite
 from bpnp.layers.search import Candidates, Progress, search_candidates
 from bpnp.layers.starts import GravityPrior, PosePrior
 from bpnp.models import TrainedNet
@@ -152,7 +153,7 @@ def _found(candidates: Candidates, problem: Problem, seconds: float) -> Found:
     """The filled slots, as rotations to the last digit, and the verdict."""
     verdict, reason = judge(candidates, 0, len(problem.bearings), len(problem.points3d))
     rotation, translation = candidates.rotation[0].double(), candidates.translation[0].double()
-    filled = rotation.isfinite().all((-2, -1)) & translation.isfinite().all(-1)
+    filled = is_finite(rotation, translation)
     stats = candidates.stats
     return Found(
         rotation=roma.special_procrustes(rotation[filled]).numpy(),
