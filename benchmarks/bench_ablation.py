@@ -16,15 +16,15 @@ from unittest.mock import patch
 import numpy as np
 from bench_search import run, summary, write_json
 
-from bpnp.layers import annealing, scene
-from bpnp.layers.starts import Array
+from bpnp.search import annealing, scene
+from bpnp.search.starts import Array
 
 Part = list[tuple[Any, str, Any]]  # module, name, value
 
 
 def parts() -> dict[str, Part]:
     """What is patched to take a part out."""
-    search = importlib.import_module("bpnp.layers.search")  # bpnp.layers.search is the function
+    search = importlib.import_module("bpnp.search.many")  # bpnp.search.many is the function
     first = annealing.RECIPES[0]
     few = tuple(recipe._replace(outliers=0.01) for recipe in annealing.RECIPES)
     return {

@@ -16,14 +16,14 @@ import numpy as np
 import pandas as pd
 import torch
 
-from bpnp.accuracy import rotation_error, translation_error
 from bpnp.datamodules import ColmapDataModule, MeshDataModule
 from bpnp.datamodules.batching import PairSource
 from bpnp.datamodules.outliers import Outliers
 from bpnp.geometry import bearings
-from bpnp.layers import search_candidates
+from bpnp.metrics.errors import rotation_error, translation_error
+from bpnp.search.many import search_candidates
+from bpnp.search.verdict import judge
 from bpnp.types import Batch
-from bpnp.verdict import judge
 
 EVERYTHING = 1e6
 

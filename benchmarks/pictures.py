@@ -13,7 +13,7 @@ import torch
 from bench_search import source
 
 from bpnp import solve
-from bpnp.accuracy import rotation_error
+from bpnp.metrics.errors import rotation_error
 from bpnp.report.figures import save_figure
 from bpnp.report.pictures import solution_picture
 

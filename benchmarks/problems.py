@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.models.bpnpnet import BPnPNet, pairwise_distance
-from bpnp.models.features import PointFeatures
+from bpnp.models.nets.features import PointFeatures
 from bpnp.types import Batch
 
 Kind = Literal["smooth", "independent"]

@@ -6,8 +6,8 @@ import torch
 from paper_layers import paper_network
 from torch import Tensor
 
-from bpnp.losses import correspondence_loss, pose_loss
 from bpnp.models.bpnpnet import BPnPNet
+from bpnp.training.losses import correspondence_loss, pose_loss
 from bpnp.types import Batch
 
 LEARNING_RATE = 1e-5

@@ -15,14 +15,14 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from bpnp.callbacks import ResultsWriter, SafeCheckpointIO
 from bpnp.commands import convert_weights, prepare
 from bpnp.datamodules.photos import photo_finder
 from bpnp.localization import localize_command, solve_command
 from bpnp.report import report_command, view_command
 from bpnp.report.dashboards import wandb_command
 from bpnp.table import table_command
-from bpnp.task import BlindPnPTask, TrainingDivergedError
+from bpnp.training.callbacks import ResultsWriter, SafeCheckpointIO
+from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
 

@@ -16,7 +16,7 @@ from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
 from bpnp.datamodules.preprocessed import prepare_preprocessed
 from bpnp.files import written_whole
 from bpnp.models.released import load_released
-from bpnp.task import BlindPnPTask
+from bpnp.training.task import BlindPnPTask
 
 logger = logging.getLogger(__name__)
 

@@ -1,8 +1,8 @@
 """What flows through bpnp: a `Batch` goes into a solver, a `Prediction` comes out.
 
 Axes: b batch, m 2D points, n 3D points (m and n padded to the largest set of the batch).
-Conventions: camera = R p + t (world to camera, COLMAP's ``cam_from_world``); `points2d` are normalised image
-coordinates x/z, y/z (intrinsics applied, distortion removed); 3D points and translations are in scene units.
+Conventions: camera = R p + t (world to camera, COLMAP's `cam_from_world`); `points2d` are normalised image coordinates
+x/z, y/z (intrinsics applied, distortion removed); 3D points and translations are in scene units.
 """
 
 from collections.abc import Callable, Sequence
@@ -223,9 +223,7 @@ def _points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
 
 def _match(i: int, match: Tensor, m: int, n: int) -> Tensor:
     if match.shape != (n,):
-        raise ValueError(
-            f"expected `match3d` of shape ({n},), one entry a 3D point, got {tuple(match.shape)} in pair {i}"
-        )
+        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in pair {i}")
     if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
         raise ValueError(
             f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in pair {i}; try .astype(int)"

@@ -1,4 +1,4 @@
-"""The house rules that a reader of one file cannot see: who imports whom, and what nobody may do."""
+"""Rules of the whole package that no single file shows: import directions, sizes, and what only some files may do."""
 
 import ast
 import functools
@@ -6,25 +6,43 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 PACKAGE = Path(__file__).parents[1] / "bpnp"
+TESTS = Path(__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
+FOLDERS = sorted({file.parent for file in FILES})
 
-# A part imports from parts of its own row and of rows above it.
-ROWS = [
-    ["bpnp.geometry", "bpnp.types", "bpnp.cameras", "bpnp.files"],
-    ["bpnp.layers", "bpnp.losses", "bpnp.supervision", "bpnp.metrics", "bpnp.accuracy", "bpnp.verdict"],
-    ["bpnp.models"],
-    ["bpnp.report"],
-    ["bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.api", "bpnp.solving"],
-    ["bpnp.cli", "bpnp.commands", "bpnp.table", "bpnp.localization", "bpnp.__main__"],
-]
-ROW = {part: i for i, row in enumerate(ROWS) for part in row}
-MAY_IMPORT_LIGHTNING = (
-    "bpnp.task", "bpnp.callbacks", "bpnp.monitors", "bpnp.datamodules", "bpnp.cli", "bpnp.commands", "bpnp.table",
-)  # fmt: skip
+GROUND = {
+    "types",
+    "geometry",
+    "cameras",
+    "files",
+    "metrics",
+    "compilation",
+    "thread_pool",
+    "precision",
+    "distinct_poses",
+}
+# What each part may import beside itself and the ground floor.
+MAY_IMPORT = {
+    **dict.fromkeys(GROUND, set()),
+    "robust": set(),
+    "search": set(),
+    "layers": {"robust"},
+    "models": {"robust", "layers", "search"},
+    "solving": {"robust", "layers", "search", "models"},
+    "datamodules": set(),
+    "report": set(),
+    "training": {"robust", "layers", "models", "report"},
+    "localization": {"search", "solving", "datamodules", "report"},
+    "table": {"models", "solving", "datamodules", "report", "training"},
+    "commands": {"models", "training", "datamodules", "report"},
+    "cli": {"commands", "training", "datamodules", "report", "localization", "table"},
+    "__main__": {"cli"},
+    "": {"models", "search", "solving"},
+}  # fmt: skip
+LIGHTNING = {"training", "datamodules", "cli", "commands", "table"}
 ONE_FILE_EACH = ("cv2", "poselib", "pycolmap", "trimesh")
+VAGUE = {"utils", "util", "helpers", "helper", "misc", "common", "base"}
 
 
 def module(file: Path) -> str:
@@ -33,13 +51,13 @@ def module(file: Path) -> str:
 
 
 def part(name: str) -> str:
-    """bpnp.layers.pnp is of the part bpnp.layers."""
-    return ".".join(name.split(".")[:2])
+    """bpnp.layers.pnp belongs to the part layers, bpnp itself to the part ""."""
+    return ".".join(name.split(".")[1:2])
 
 
 @functools.cache
-def imports(file: Path) -> set[str]:
-    """Modules that a file imports, anywhere in it; `from bpnp.layers import pnp` may name a module or a function."""
+def imports(file: Path) -> frozenset[str]:
+    """Modules that a file imports, anywhere in it."""
     found = set()
     for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
@@ -48,51 +66,39 @@ def imports(file: Path) -> set[str]:
             assert node.level == 0, f"{file} imports relatively"
             assert node.module is not None
             found.add(node.module)
-            if node.module == "bpnp":
-                found |= {f"bpnp.{alias.name}" for alias in node.names if (PACKAGE / f"{alias.name}.py").exists()}
-    return found
+            folder = PACKAGE.parent / Path(*node.module.split("."))
+            found |= {f"{node.module}.{alias.name}" for alias in node.names if is_module(folder / alias.name)}
+    return frozenset(found)
+
+
+def is_module(path: Path) -> bool:
+    return path.with_suffix(".py").is_file() or (path / "__init__.py").is_file()
 
 
 def named(file: Path) -> str:
     return str(file.relative_to(PACKAGE.parent))
 
 
-each_file = pytest.mark.parametrize("file", FILES, ids=named)
+def test_imports_go_one_way() -> None:
+    for file in FILES:
+        own = part(module(file))
+        used = {part(name) for name in imports(file) if name.startswith("bpnp.")}
+        wrong = used - GROUND - MAY_IMPORT[own] - {own}
+        assert not wrong, f"{named(file)} imports {wrong}"
+        assert own not in GROUND or own == "metrics" or used <= GROUND
 
 
-def test_every_part_has_a_place() -> None:
-    parts = {part(module(file)) for file in FILES} - {"bpnp"}
-    assert parts <= {*ROW, "bpnp.datamodules"}
+def test_lightning_and_other_libraries_have_their_places() -> None:
+    users: dict[str, list[str]] = {library: [] for library in ONE_FILE_EACH}
+    for file in FILES:
+        used = {name.split(".")[0] for name in imports(file)}
+        assert not used & {"lightning", "pytorch_lightning"} or part(module(file)) in LIGHTNING, named(file)
+        for library in used & set(ONE_FILE_EACH):
+            users[library].append(named(file))
+    assert {library: len(files) for library, files in users.items()} == dict.fromkeys(ONE_FILE_EACH, 1), users
 
 
-@each_file
-def test_imports_go_one_way(file: Path) -> None:
-    name = module(file)
-    ours = {part(used) for used in imports(file) if used.split(".")[0] == "bpnp"}
-    if name == "bpnp":
-        allowed = {p for p in ROW if ROW[p] <= ROW["bpnp.api"]}
-    elif part(name) == "bpnp.datamodules":
-        allowed = {"bpnp.datamodules", "bpnp.geometry", "bpnp.types", "bpnp.cameras"}
-    else:
-        allowed = {p for p in ROW if ROW[p] <= ROW[part(name)]}
-        if ROW[part(name)] == ROW["bpnp.cli"]:
-            allowed.add("bpnp.datamodules")
-    assert ours <= allowed
-
-
-@each_file
-def test_lightning_stays_at_the_top(file: Path) -> None:
-    used = {name.split(".")[0] for name in imports(file)}
-    assert not used & {"lightning", "pytorch_lightning"} or part(module(file)) in MAY_IMPORT_LIGHTNING
-
-
-@pytest.mark.parametrize("library", ONE_FILE_EACH)
-def test_one_file_knows_each_library(library: str) -> None:
-    users = [named(file) for file in FILES if library in {name.split(".")[0] for name in imports(file)}]
-    assert len(users) == 1
-
-
-def test_modules_of_a_part_do_not_import_in_circles() -> None:
+def test_modules_do_not_import_in_circles() -> None:
     graph = {module(file): {used for used in imports(file) if used.startswith("bpnp")} for file in FILES}
     done: set[str] = set()
 
@@ -107,25 +113,38 @@ def test_modules_of_a_part_do_not_import_in_circles() -> None:
         visit(name, ())
 
 
-@each_file
-def test_files_are_short_and_have_names(file: Path) -> None:
-    assert len(file.read_text().splitlines()) <= 250
-    assert not {"utils", "util", "helpers", "helper", "misc", "common", "base"} & set(file.stem.split("_"))
+def test_no_function_hides_a_module_of_its_name() -> None:
+    for folder in FOLDERS:
+        modules = {file.stem for file in folder.glob("*.py")} | {sub.name for sub in folder.iterdir() if sub.is_dir()}
+        for node in ast.parse((folder / "__init__.py").read_text()).body:
+            if isinstance(node, ast.ImportFrom):
+                names = {alias.asname or alias.name for alias in node.names}
+                assert not names & modules, f"{named(folder)}: {names & modules}"
 
 
-@each_file
-def test_only_the_command_line_prints(file: Path) -> None:
-    calls = [node.func for node in ast.walk(ast.parse(file.read_text())) if isinstance(node, ast.Call)]
-    prints = [f for f in calls if isinstance(f, ast.Name) and f.id == "print"]
-    assert not prints or module(file) == "bpnp.cli"
+def test_files_are_short_and_folders_small() -> None:
+    for file in FILES:
+        assert len(file.read_text().splitlines()) <= 250, named(file)
+        assert not VAGUE & set(file.stem.split("_")), named(file)
+    for folder in FOLDERS:
+        if folder.name != "datamodules" and folder.name != "report":
+            assert len([file for file in folder.glob("*.py") if file.stem != "__init__"]) <= 12, named(folder)
 
 
-@each_file
-def test_no_assertion_that_python_drops_decides_anything(file: Path) -> None:
-    """`assert` may tell a type checker that something is not None; nothing else."""
-    for node in ast.walk(ast.parse(file.read_text())):
-        if isinstance(node, ast.Assert):
-            assert ast.unparse(node.test).endswith("is not None") or "isinstance" in ast.unparse(node.test)
+def test_the_tests_mirror_the_package() -> None:
+    rooms = {folder.relative_to(PACKAGE).parts[0] for folder in FOLDERS if folder != PACKAGE}
+    assert {folder.name for folder in TESTS.iterdir() if any(folder.glob("test_*.py"))} <= {*rooms, "commands"}
+
+
+def test_only_the_command_line_prints_and_no_assertion_decides_anything() -> None:
+    """`assert` may tell a type checker that something is not None; Python can drop it."""
+    for file in FILES:
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "print":
+                assert module(file) == "bpnp.cli", named(file)
+            if isinstance(node, ast.Assert):
+                condition = ast.unparse(node.test)
+                assert condition.endswith("is not None") or "isinstance" in condition, named(file)
 
 
 def test_importing_the_package_leaves_plotting_and_logging_alone() -> None:

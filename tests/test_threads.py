@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from bpnp.layers.threads import spread
+from bpnp.thread_pool import spread
 
 
 @pytest.fixture(params=[1, 2, 5])

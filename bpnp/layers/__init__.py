@@ -1,12 +1,7 @@
-"""Declarative layers: pure tensors in, tensors and per-sample stats out."""
+"""Differentiable layers: pure tensors in, tensors and per-sample stats out; and the RANSAC that starts the last one."""
 
+from bpnp.layers.assignment import Sinkhorn, sinkhorn
 from bpnp.layers.pnp import WeightedPnP, weighted_pnp
 from bpnp.layers.ransac import RansacPnP, ransac_pnp
-from bpnp.layers.refine import Refine, refine
-from bpnp.layers.search import Candidates, Search, search, search_candidates
-from bpnp.layers.sinkhorn import Sinkhorn, sinkhorn
 
-__all__ = [
-    "Candidates", "RansacPnP", "Refine", "Search", "Sinkhorn", "WeightedPnP",
-    "ransac_pnp", "refine", "search", "search_candidates", "sinkhorn", "weighted_pnp",
-]  # fmt: skip
+__all__ = ["RansacPnP", "Sinkhorn", "WeightedPnP", "ransac_pnp", "sinkhorn", "weighted_pnp"]

@@ -1,6 +1,6 @@
 """The layers' linear algebra on a CPU: one loop for each sample, that reads the plan once an iteration.
 
-`bpnp.layers.laplacian` states the transport's in torch, for other devices. A row of the plan is used for both products
+`bpnp.layers.adjoint` states the transport's in torch, for other devices. A row of the plan is used for both products
 while it is in the cache, samples run on different cores without waiting for each other, and each stops by itself.
 """
 
@@ -11,11 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.layers.compiling import compiler
+from bpnp.compilation import compiler
 from bpnp.layers.memory import empty
-from bpnp.layers.threads import spread
+from bpnp.thread_pool import spread
 
-# Sums in any order, as in `bpnp.layers.kernels`, but NaN and infinity keep their meaning: they flag a sample.
+# Sums in any order, as in `bpnp.search.kernels_dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
 

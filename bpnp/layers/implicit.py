@@ -13,8 +13,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from bpnp.layers.adjoint import solve_multipliers
 from bpnp.layers.fused import projected
-from bpnp.layers.laplacian import solve_multipliers
 
 
 def at_optimum(

@@ -16,7 +16,7 @@ from bpnp.geometry import hat, is_finite
 from bpnp.layers.implicit import at_optimum
 from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient, retract
 from bpnp.layers.pacing import steps, unfinished
-from bpnp.layers.precision import full_precision
+from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
 Method = Literal["newton", "lbfgs"]

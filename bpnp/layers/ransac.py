@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from bpnp.layers.consensus import consensus
-from bpnp.layers.estimators import MIN_INLIERS, Estimator, mean_residual, opencv_ransac, poselib_ransac
-from bpnp.layers.precision import full_precision
+from bpnp.precision import full_precision
+from bpnp.robust.backends import MIN_INLIERS, Estimator, mean_residual, opencv_ransac, poselib_ransac
+from bpnp.robust.consensus import consensus
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.layers.laplacian import times, transpose_times
+from bpnp.layers.adjoint import times, transpose_times
 from bpnp.layers.pacing import unfinished, waits
 
 LARGEST_LOG_SCALING = 20.0  # twice this is far from where entries of K underflow in float32

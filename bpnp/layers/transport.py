@@ -3,7 +3,7 @@
 The plan is P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu) from potentials near the optimum. K is made once,
 and again only if the scalings grow so far that entries which underflowed might matter; in between all work is products
 of K with vectors. Rescaling rows and columns in turn converges linearly, and slowly once points share their probability
-with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of `bpnp.layers.laplacian`,
+with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of `bpnp.layers.adjoint`,
 by conjugate gradients to no more digits than the step has) is quadratic there.
 """
 
@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.layers.laplacian import Plan, newton_direction, times
+from bpnp.layers.adjoint import Plan, newton_direction, times
 from bpnp.layers.memory import empty
 from bpnp.layers.pacing import steps, unfinished, waits
 from bpnp.layers.scalings import Scaled, absorb, from_row_minima, sweep

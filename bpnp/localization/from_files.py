@@ -12,14 +12,14 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.api import solve
 from bpnp.files import written_whole
-from bpnp.layers.starts import PosePrior
 from bpnp.localization.point_files import read_camera, read_points
 from bpnp.localization.slow_progress import SlowProgress
 from bpnp.report.figures import SUFFIXES, save_figure
 from bpnp.report.pictures import solution_picture
+from bpnp.search.starts import PosePrior
 from bpnp.solving.solution import Solution
+from bpnp.solving.solve import solve
 
 DESCRIPTION = """Where was the camera? Finds its pose from image points and scene points that nobody has matched."""
 EPILOG = """The verdict is confident, ambiguous (the other candidates fit about as well), or failed: then the pose is a

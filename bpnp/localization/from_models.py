@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bpnp.api import solve
 from bpnp.datamodules.colmap_pairs import ColmapSource
 from bpnp.datamodules.colmap_scenes import find_scenes
 from bpnp.datamodules.photos import photo_finder
@@ -24,6 +23,7 @@ from bpnp.report.photos import PhotoFinder
 from bpnp.report.pictures import picture_box, solution_picture
 from bpnp.report.tables import WIDTH
 from bpnp.solving.solution import Solution
+from bpnp.solving.solve import solve
 
 DESCRIPTION = """Solve images of a COLMAP model as if their poses were unknown, and compare with the model's. The scene
 is turned at random, so that nothing of a pose leaks into its search."""

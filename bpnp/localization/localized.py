@@ -13,9 +13,9 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bpnp.accuracy import centre_error, rotation_error
 from bpnp.datamodules.batching import Pair
 from bpnp.datamodules.reconstruction import ImagePoints
+from bpnp.metrics.errors import centre_error, rotation_error
 from bpnp.report.pictures import VERDICTS
 from bpnp.report.tables import number
 from bpnp.solving.solution import Solution

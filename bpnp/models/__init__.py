@@ -3,5 +3,6 @@
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.loading import TrainedNet, load_network, load_pretrained
 from bpnp.models.matcher import Matcher
+from bpnp.models.search_solver import Search
 
-__all__ = ["BPnPNet", "Matcher", "TrainedNet", "load_network", "load_pretrained"]
+__all__ = ["BPnPNet", "Matcher", "Search", "TrainedNet", "load_network", "load_pretrained"]

@@ -8,14 +8,14 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import Method
-from bpnp.layers.precision import full_precision
 from bpnp.layers.ransac import Backend
-from bpnp.layers.sinkhorn import Sinkhorn
-from bpnp.models.features import InputTransform, PointFeatures, normalise_points3d
-from bpnp.models.pose_stage import PoseStage
+from bpnp.models.evaluation import cost_under_pose, widths
+from bpnp.models.nets.features import InputTransform, PointFeatures, normalise_points3d
+from bpnp.models.pose_head import PoseStage
 from bpnp.models.pretrained import Restorable
-from bpnp.models.rematching import cost_under_pose, widths
+from bpnp.precision import full_precision
 from bpnp.types import Batch, Pose, Prediction
 
 SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
@@ -46,7 +46,7 @@ class BPnPNet(Restorable):
             poses that the assignment proposes.
         hypotheses: poses that the assignment proposes for it, at most; 0 for none.
         rounds: in evaluation, how often the points are matched again under the last pose, RANSAC's the first, and the
-            PnP layer run on the new assignment (`bpnp.models.rematching`); the last width is the threshold.
+            PnP layer run on the new assignment (`bpnp.models.evaluation`); the last width is the threshold.
     """
 
     estimates: tuple[str, ...] = ("ransac", "pnp", "refined")

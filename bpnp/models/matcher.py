@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.layers.sinkhorn import sinkhorn
-from bpnp.models.attention import ExchangeBlock, Neighbourhood
+from bpnp.layers.assignment import sinkhorn
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.normalisation import centred
-from bpnp.models.pose_stage import PoseStage
+from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
+from bpnp.models.nets.normalisation import centred
+from bpnp.models.pose_head import PoseStage
 from bpnp.models.pretrained import Restorable
 from bpnp.types import Batch, Prediction, SolveStats
 
@@ -40,7 +40,7 @@ class Matcher(Restorable):
         neighbours: nearest neighbours that a point is described by; 0 for none.
         mu: entropy weight of the transport at the start of a training; it is learned.
         sinkhorn_tolerance: L1 error of the marginals at which the transport stops.
-        pose: options of the pose stage, as a mapping; `bpnp.models.pose_stage.PoseStage` lists them.
+        pose: options of the pose stage, as a mapping; `bpnp.models.pose_head.PoseStage` lists them.
     """
 
     def __init__(

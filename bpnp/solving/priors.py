@@ -7,9 +7,9 @@ import numpy as np
 import roma
 import torch
 
-from bpnp.layers.starts import GravityPrior, PosePrior
 from bpnp.models import TrainedNet, load_network, load_pretrained
 from bpnp.models.pretrained import LEARNED
+from bpnp.search.starts import GravityPrior, PosePrior
 
 Prior = PosePrior | GravityPrior | TrainedNet
 

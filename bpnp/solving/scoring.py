@@ -4,10 +4,11 @@ import numpy as np
 import torch
 from scipy.spatial import cKDTree
 
-from bpnp.layers.annealing import FINE_OUTLIERS, KEPT, SMALLEST_SCALE, finish
-from bpnp.layers.pool import OTHER_DEG, SAME_DEG, SAME_SHIFT, Pool, distinct, is_safe, near, plausible
-from bpnp.layers.scene import Scene
-from bpnp.layers.search import Candidates
+from bpnp.distinct_poses import SAME_DEG, SAME_SHIFT, distinct, near
+from bpnp.search.annealing import FINE_OUTLIERS, KEPT, SMALLEST_SCALE, finish
+from bpnp.search.candidates import OTHER_DEG, Pool, is_safe, plausible
+from bpnp.search.many import Candidates
+from bpnp.search.scene import Scene
 from bpnp.solving.problem import Array, Problem
 from bpnp.types import SolveStats
 

@@ -9,8 +9,8 @@ from typing import Any, get_args
 import numpy as np
 import numpy.typing as npt
 
+from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
-from bpnp.verdict import Verdict
 
 Array = npt.NDArray[np.float64]
 FORMAT = 1

@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.geometry import is_finite
-from bpnp.layers.search import Candidates, Progress, search_candidates
-from bpnp.layers.starts import GravityPrior, PosePrior
 from bpnp.models import TrainedNet
+from bpnp.search.many import Candidates, Progress, search_candidates
+from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.verdict import Verdict, judge
 from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
 from bpnp.solving.scoring import merged, scored
 from bpnp.types import Batch
-from bpnp.verdict import Verdict, judge
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene

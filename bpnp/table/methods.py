@@ -20,7 +20,7 @@ SHORT_NAMES = {
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
     "matcher": "bpnp.models.Matcher",
-    "search": "bpnp.layers.Search",
+    "search": "bpnp.models.Search",
 }
 
 TRAINED = (SHORT_NAMES["bpnpnet"], SHORT_NAMES["matcher"])

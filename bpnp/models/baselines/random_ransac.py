@@ -8,9 +8,9 @@ from jaxtyping import Int
 from torch import Tensor
 
 from bpnp.geometry import bearings
-from bpnp.layers.p3p import p3p
 from bpnp.models.baselines.agreement import agreement
 from bpnp.models.baselines.single_pairs import MIN_POINTS, Clock, Found, PairSolver, SinglePair, generator_for, no_pose
+from bpnp.robust.p3p import p3p
 
 PREVIEW = 32  # 2D points on which every hypothesis is tried
 SHORTLIST = 8  # hypotheses of a chunk that are then tried on all points

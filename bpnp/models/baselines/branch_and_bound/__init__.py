@@ -1,0 +1,1 @@
+"""Globally optimal solvers by branch and bound: GOPAC and GOSMA."""

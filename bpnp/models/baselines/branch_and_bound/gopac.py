@@ -1,0 +1,153 @@
+"""GOPAC: the pose with most inliers, by nested branch and bound (Campbell et al., ICCV 2017)."""
+
+import heapq
+import itertools
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from bpnp.geometry import bearings
+from bpnp.layers.pnp import weighted_pnp
+from bpnp.models.baselines.branch_and_bound.boxes import Boxes, split, translation_uncertainty
+from bpnp.models.baselines.branch_and_bound.gosma import whole_domain
+from bpnp.models.baselines.branch_and_bound.mixtures import spread
+from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_near
+from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair, no_pose
+from bpnp.models.baselines.starts import weak_perspective_distance
+
+
+class MostInliers(NamedTuple):
+    """A pose, camera = R (p - c), and the number of its inliers; no pose of the domain has more than `bound`."""
+
+    rotation: Float[Tensor, "3 3"] | None
+    place: Float[Tensor, "3"]
+    inliers: int
+    bound: int
+    boxes: int
+
+
+def maximise_inliers(
+    rays: Float[Tensor, "m 3"],
+    points: Float[Tensor, "n 3"],
+    domain: Boxes,
+    *,
+    angle: float,
+    smallest_turn: float = 1e-3,
+    smallest_place: float = 1e-3,
+    max_boxes: int | None = None,
+    clock: Clock | None = None,
+) -> MostInliers:
+    """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
+
+    Outer search over the camera centre c in the one box of the domain, most promising box first; for each box two inner
+    searches over R: at its centre, for a better pose, and with every angle widened by the box's uncertainty psi_t(p_j),
+    for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
+    `smallest_place` are not split: where one might hold more than the best pose, the bound stays above the count.
+    """
+    clock = clock or Clock(None)
+    rotation, place, count, done = None, domain.place[0], 0, 1
+    order = itertools.count()
+    queue = [(-len(rays), next(order), domain)]
+    unresolved = 0
+    while queue and -queue[0][0] > count:
+        if clock.over() or (max_boxes is not None and done >= max_boxes):
+            break
+        _, _, box = heapq.heappop(queue)
+        children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
+        uncertainty = translation_uncertainty(children, points)
+        for k in range(len(children.turn_half)):
+            child = children.pick(torch.tensor([k], device=points.device))
+            directions = torch.nn.functional.normalize(points - child.place[0], dim=-1)
+            reach = torch.full_like(points[:, 0], angle)
+            searching = {"domain": _turns(domain), "smallest": smallest_turn, "clock": clock}
+            here = best_rotation(rays, directions, reach, floor=count, **searching)  # type: ignore[arg-type]
+            if here.rotation is not None:
+                rotation, place, count = _refined(rays, points, here.rotation, child.place[0], angle)
+            wide = (reach + uncertainty[k]).clamp_max(math.pi)
+            there = best_rotation(rays, directions, wide, floor=count, first=True, **searching)  # type: ignore[arg-type]
+            done += 1 + here.boxes + there.boxes
+            if there.bound > count:
+                if float(child.place_half.max()) < smallest_place:
+                    unresolved = max(unresolved, there.bound)
+                else:
+                    heapq.heappush(queue, (-there.bound, next(order), child))
+    left = -queue[0][0] if queue else 0
+    return MostInliers(rotation, place, count, max(count, left, unresolved), done)
+
+
+def _turns(domain: Boxes) -> Boxes:
+    return Boxes(domain.turn, domain.turn_half, domain.place[:1], domain.place_half[:1])
+
+
+def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
+    """The pose, or what the weighted PnP layer makes of its inliers if it has as many."""
+    count = count_near(rays, points, rotation, place, angle)
+    directions = torch.nn.functional.normalize(points - place, dim=-1)
+    near = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
+    weights = (near / near.sum().clamp_min(1)).unsqueeze(0)
+    translation = -rotation @ place
+    turned, shift, stats = weighted_pnp(
+        weights, rays.unsqueeze(0), points.unsqueeze(0), rotation.unsqueeze(0), translation.unsqueeze(0)
+    )
+    if bool(stats.converged[0]):
+        moved = -turned[0].mT @ shift[0]
+        if (refined := count_near(rays, points, turned[0], moved, angle)) >= count:
+            return turned[0], moved, refined
+    return rotation, place, count
+
+
+class GOPAC(PairSolver):
+    """Branch and bound on the number of image points with a scene point near them; exact, and for small problems.
+
+    The camera centre is searched in a cube around the scene's centre, the rotation everywhere. `residual` of the pose
+    is the share of image points without a partner; `converged` is the certificate that no pose has more inliers.
+
+    Args:
+        angle: largest angle between an inlier's ray and its scene point, radians.
+        domain: half side of the cube of camera centres, in weak-perspective distances.
+        smallest_turn: half side of the smallest rotation boxes, radians.
+        smallest_place: half side of the smallest boxes of camera centres, in root mean square radii of the scene.
+        max_boxes: most boxes, inner ones included; null for as many as the time allows.
+        time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
+    """
+
+    estimates = ("gopac",)
+
+    def __init__(
+        self,
+        *,
+        angle: float = 0.005,
+        domain: float = 1.5,
+        smallest_turn: float = 1e-3,
+        smallest_place: float = 1e-3,
+        max_boxes: int | None = None,
+        time_limit: float | None = 30.0,
+    ) -> None:
+        super().__init__(time_limit)
+        if not (angle > 0 and domain > 0):
+            raise ValueError(f"expected `angle` > 0 and `domain` > 0, got {angle} and {domain}")
+        self.angle, self.domain, self.max_boxes = angle, domain, max_boxes
+        self.smallest = {"smallest_turn": smallest_turn, "smallest_place": smallest_place}
+
+    def solve(self, pair: SinglePair, clock: Clock) -> Found:
+        centre = pair.points3d.mean(0)
+        radius = spread((pair.points3d - centre).norm(dim=-1))
+        points = (pair.points3d - centre) / radius
+        half = self.domain * weak_perspective_distance(pair.points2d, points)
+        found = maximise_inliers(
+            bearings(pair.points2d),
+            points,
+            whole_domain(points, half),
+            angle=self.angle,
+            max_boxes=self.max_boxes,
+            clock=clock,
+            **self.smallest,
+        )
+        if found.rotation is None:
+            return no_pose(points, found.boxes)
+        translation = -found.rotation @ (radius * found.place + centre)
+        residual = 1 - found.inliers / len(pair.points2d)
+        return Found(found.rotation, translation, found.boxes, residual, found.inliers >= found.bound)

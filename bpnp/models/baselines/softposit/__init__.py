@@ -1,0 +1,1 @@
+"""SoftPOSIT (David, DeMenthon, Duraiswami, Samet, IJCV 2004)."""

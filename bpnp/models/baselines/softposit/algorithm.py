@@ -1,0 +1,123 @@
+"""SoftPOSIT: soft assignment and scaled-orthographic pose in turns (David, DeMenthon, Duraiswami, Samet, IJCV 2004)."""
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from bpnp.models.baselines.single_pairs import Clock
+from bpnp.models.baselines.softposit.slack_assignment import slack_scalings
+
+CHI2_99 = 9.21  # 99 % quantile, two degrees of freedom
+ENOUGH_STEPS = 20
+WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
+
+
+class Annealed(NamedTuple):
+    """A pose for each start; `residual` is the root mean square distance of the matched points, in pixels."""
+
+    rotation: Float[Tensor, "s 3 3"]
+    translation: Float[Tensor, "s 3"]
+    residual: Float[Tensor, " s"]
+    accepted: Bool[Tensor, " s"]
+    steps: int
+    finished: bool
+
+
+def softposit(
+    points2d: Float[Tensor, "m 2"],
+    points3d: Float[Tensor, "n 3"],
+    rotation: Float[Tensor, "s 3 3"],
+    translation: Float[Tensor, "s 3"],
+    *,
+    noise_px: float = 2.0,
+    focal: float = 800.0,
+    beta_start: float = 4e-4,
+    beta_final: float = 0.5,
+    beta_rate: float = 1.05,
+    max_steps: int | None = None,
+    clock: Clock | None = None,
+) -> Annealed:
+    """Anneal every start (R, t) of one pair.
+
+    With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
+    and scene point k is d^2_jk = focal^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
+    exp(-beta (d^2 - alpha)) with slack, alpha = 9.21 noise^2 + 1, fits Q1 and Q2 to the assignment, makes their rows
+    orthonormal, and multiplies beta by `beta_rate`, from `beta_start` to `beta_final` (1 / pixel^2).
+
+    points2d: normalised image coordinates; `focal` turns them into the pixels of the constants. points3d: scene units.
+    A start is accepted if its residual is under sqrt(alpha)/2 after 20 steps or more. Where the points that are matched
+    span no volume the start keeps its last pose and is not accepted.
+    """
+    image = points2d.double()
+    centre = points3d.double().mean(0)
+    scene = torch.nn.functional.pad(points3d.double() - centre, (0, 1), value=1.0)  # (n, 4)
+    turned = rotation.double()
+    shift = translation.double() + turned @ centre
+    alpha = CHI2_99 * noise_px**2 + 1
+    moments2d = torch.stack([torch.ones_like(image[:, 0]), *image.unbind(-1), image.square().sum(-1)], -1).float()
+    steps = 1 + int(math.log(beta_final / beta_start) / math.log(beta_rate))
+    broken = torch.zeros(len(turned), dtype=torch.bool, device=image.device)
+    residual = image.new_full((len(turned),), math.inf)
+    beta, step = beta_start, 0
+    limit = steps if max_steps is None else min(steps, max_steps)
+    while step < limit and not (clock is not None and clock.over()):
+        rows, depth = _scaled_rows(scene, turned, shift)
+        kernel = _kernel(image, rows, depth, beta, alpha, focal)
+        u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))
+        matched = (v.unsqueeze(-1) * (kernel.mT @ (u.unsqueeze(-1) * moments2d))).double()  # (s, n, 4)
+        residual = torch.where(broken, torch.inf, _residual(matched, rows, depth, focal))
+        moved_r, moved_t, solved = _fit(matched, scene, depth)
+        broken = broken | ~solved
+        turned = torch.where(broken[:, None, None], turned, moved_r)
+        shift = torch.where(broken[:, None], shift, moved_t)
+        beta, step = beta * beta_rate, step + 1
+    accepted = (residual < math.sqrt(alpha) / 2) & (step >= ENOUGH_STEPS) & ~broken
+    return Annealed(turned, shift - turned @ centre, residual, accepted, step, step == limit)
+
+
+def _scaled_rows(scene: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
+    """Q1 . S_k and Q2 . S_k (s, 2, n), and w_k (s, n)."""
+    rows = torch.cat([rotation, translation.unsqueeze(-1)], -1) @ scene.mT / translation[:, 2, None, None]
+    return rows[:, :2], rows[:, 2]
+
+
+def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float, alpha: float, focal: float) -> Tensor:
+    """gamma exp(-beta (d^2 - alpha)) (s, m, n) with gamma = 1/(max(m, n) + 1), in float32."""
+    x, y = (focal * image).float().unsqueeze(-1).unbind(1)
+    along_x, along_y = (focal * rows).float().unsqueeze(2).unbind(1)
+    w = depth.float().unsqueeze(1)
+    squared = torch.addcmul(along_x, x, w, value=-1).square_()
+    squared += torch.addcmul(along_y, x.new_ones(()) * y, w, value=-1).square_()
+    gamma = 1 / (max(image.shape[0], depth.shape[1]) + 1)
+    return squared.mul_(-beta).add_(beta * alpha + math.log(gamma)).exp_()
+
+
+def _residual(matched: Tensor, rows: Tensor, depth: Tensor, focal: float) -> Tensor:
+    """sqrt(sum_jk m_jk d^2_jk / n) from the moments sum_j m_jk (1, x_j, y_j, x_j^2 + y_j^2)."""
+    mass, x, y, squared = matched.unbind(-1)
+    a, b = rows.unbind(1)
+    total = (a.square() + b.square()) * mass - 2 * depth * (a * x + b * y) + depth.square() * squared
+    return focal * total.clamp_min(0).mean(-1).sqrt()
+
+
+def _fit(matched: Tensor, scene: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Pose whose first two rows fit the assignment in the least-squares sense, and whether it is determined."""
+    mass, targets = matched[..., 0], depth.unsqueeze(-1) * matched[..., 1:3]
+    moments = (scene.mT * mass.unsqueeze(1)) @ scene  # L = sum_k m_k S_k S_k^T
+    # The eigenvalues of the equilibrated matrix, so that the unit of the scene does not matter.
+    scale = moments.diagonal(dim1=-2, dim2=-1).clamp_min(1e-300).rsqrt()
+    balanced = scale.unsqueeze(-1) * moments * scale.unsqueeze(-2)
+    factor, info = torch.linalg.cholesky_ex(balanced)
+    solved = (info == 0) & (factor.diagonal(dim1=-2, dim2=-1).amin(-1).square() > WELL_POSED)
+    q = scale.unsqueeze(-1) * torch.cholesky_solve(scale.unsqueeze(-1) * (scene.mT @ targets), factor)  # (s, 4, 2)
+    solved = solved & q.isfinite().all((-2, -1))
+    q = torch.where(solved[:, None, None], q, torch.eye(4, 2, dtype=q.dtype, device=q.device))
+    left, sizes, right = torch.linalg.svd(q[:, :3], full_matrices=False)
+    first, second = (left @ right).unbind(-1)
+    rotation = torch.stack([first, second, torch.linalg.cross(first, second)], -2)
+    distance = 2 / sizes.sum(-1)
+    translation = torch.stack([q[:, 3, 0] * distance, q[:, 3, 1] * distance, distance], -1)
+    return rotation, translation, solved & distance.isfinite()

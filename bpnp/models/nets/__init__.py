@@ -1,0 +1,1 @@
+"""The neural networks that give points their features."""

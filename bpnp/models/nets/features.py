@@ -1,0 +1,96 @@
+"""Point features (paper section 3.3, after Yi et al. 2018) and PointNet's input transform; padding changes nothing."""
+
+import math
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+
+from bpnp.models.nets.normalisation import MaskedBatchNorm, centred, context_norm
+
+
+class ResidualBlock(nn.Module):
+    """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm, optionally followed by a batch norm.
+
+    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product.
+    """
+
+    def __init__(self, channels: int, *, batch_norm: bool) -> None:
+        super().__init__()
+        self.linear_a = nn.Linear(channels, channels)
+        self.linear_b = nn.Linear(channels, channels)
+        self.linear_c = nn.Linear(channels, channels)
+        self.norm_b = MaskedBatchNorm(channels) if batch_norm else None
+        self.norm_c = MaskedBatchNorm(channels) if batch_norm else None
+
+    def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        z = context_norm(nn.functional.linear(x, *self._first_map()), mask)
+        z = z if self.norm_b is None else self.norm_b(z, mask)
+        z = context_norm(self.linear_c(z), mask)
+        z = z if self.norm_c is None else self.norm_c(z, mask)
+        return x + torch.relu(z)
+
+    def _first_map(self) -> tuple[Tensor, Tensor]:
+        """Weight and bias; under autocast, their product keeps its digits."""
+        a, b = self.linear_a, self.linear_b
+        with torch.autocast(a.weight.device.type, enabled=False):
+            return b.weight @ a.weight, torch.addmv(b.bias, b.weight, a.bias)
+
+
+class PointFeatures(nn.Module):
+    """A vector of unit length for each point, from its coordinates and the statistics of its set.
+
+    coordinates: 2 or 3. channels, blocks: width and depth of the residual net.
+    batch_norm: after each context norm, as the paper's text has it; the released code has none.
+    centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
+        assignment (ours; off in the paper).
+    """
+
+    def __init__(
+        self,
+        coordinates: int,
+        *,
+        channels: int = 128,
+        blocks: int = 12,
+        batch_norm: bool = False,
+        centre: bool = False,
+    ) -> None:
+        super().__init__()
+        self.enter = nn.Linear(coordinates, channels)
+        self.blocks = nn.ModuleList(ResidualBlock(channels, batch_norm=batch_norm) for _ in range(blocks))
+        self.centre = centre
+
+    def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        z = self.enter(points)
+        for block in self.blocks:
+            z = block(z, mask)
+        return nn.functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
+
+
+class InputTransform(nn.Module):
+    """PointNet's learned 3 x 3 transform T of a 3D set: points @ T, T = I + output of a small set network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (3, 64, 128, 1024, 512, 256)
+        self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        self.norms = nn.ModuleList(MaskedBatchNorm(width) for width in widths[1:])
+        self.out = nn.Linear(256, 9)
+
+    def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
+        z = points
+        for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
+            z = torch.relu(norm(linear(z), mask))
+        z = z.masked_fill(~mask.unsqueeze(-1), -math.inf).amax(1)
+        for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
+            z = torch.relu(norm(linear(z)))
+        transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))
+        return points @ transform
+
+
+def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
+    """Centred at the mean, root mean square distance one: features that do not depend on the scene's units."""
+    weight = mask.unsqueeze(-1).to(points3d.dtype)
+    around = centred(points3d, mask) * weight
+    radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()
+    return around / torch.where(radius > 0, radius, 1)

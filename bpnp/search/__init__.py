@@ -1,0 +1,1 @@
+"""Poses from two point sets alone: numpy and numba, nothing to train."""

@@ -1,0 +1,184 @@
+"""`bpnp table`: what it runs, keeps, resumes and prints."""
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+from bpnp import BPnPNet
+from bpnp.cli import main
+from bpnp.report import read_results
+from bpnp.report.results import PairRow
+from bpnp.table.finished import Finished
+from bpnp.table.layout import Line, as_latex, as_markdown
+from bpnp.table.methods import parse_methods
+from bpnp.table.pairs import TestPairs, read_data
+from bpnp.table.published import PUBLISHED
+from bpnp.training.task import BlindPnPTask
+
+RECIPE = """
+data:
+  class_path: bpnp.datamodules.MeshDataModule
+  init_args:
+    num_points: 12
+    pool_size: 64
+    test_shapes: 5
+    cache_dir: {folder}
+"""
+RANSAC = """
+model:
+  solver:
+    class_path: bpnp.models.baselines.RandomRansac
+    init_args:
+      max_hypotheses: 64
+      time_limit: null
+"""
+SOFTPOSIT = "model:\n  solver:\n    class_path: bpnp.models.baselines.SoftPOSIT\n    init_args: {max_steps: 3}\n"
+
+
+@pytest.fixture
+def recipes(tmp_path: Path) -> list[str]:
+    (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
+    (tmp_path / "ransac.yaml").write_text(RANSAC)
+    (tmp_path / "softposit.yaml").write_text(SOFTPOSIT)
+    methods = [f"blind={tmp_path}/ransac.yaml", f"{tmp_path}/softposit.yaml"]
+    return ["table", f"--data={tmp_path}/data.yaml", "--methods", *methods, f"--output={tmp_path}/out"]
+
+
+def test_a_table_of_two_methods_and_what_it_leaves(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([*recipes, "--limit=3"])
+    printed = capsys.readouterr().out
+    assert "blind" in printed
+    assert "another data set" in printed
+    assert "21.8" in printed  # SoftPOSIT's median in the paper's table 1
+    results = read_results(tmp_path / "out" / "blind")
+    assert len(results.rows) == 3
+    rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
+    ours = {row["method"]: row for row in rows if row["source"] == "here"}
+    assert set(ours) == {"blind", "softposit"}
+    median = results.estimates["random_ransac"]["rotation_q2_deg"]
+    assert float(ours["blind"]["rotation_q2_deg"]) == pytest.approx(median)
+    paper = {row["method"]: row for row in rows if row["source"] == "paper, ModelNet40"}
+    assert float(paper["Lc Lp"]["recall_joint_15deg_0.5"]) == 0.72
+    assert (tmp_path / "out" / "table.tex").read_text().count(r"\\") == 2 + 2 + 1 + len(PUBLISHED["modelnet40"])
+    main(["report", str(tmp_path / "out" / "blind")])
+
+
+def test_it_goes_on_where_it_was_and_solves_no_pair_twice(recipes: list[str], tmp_path: Path) -> None:
+    main([*recipes, "--limit=2"])
+    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("pairs/*.json")}
+    assert len(kept) == 4
+    lost = sorted(kept)[0]
+    lost.unlink()  # as if it had been killed in this pair
+    (lost.parent / f".{lost.name}.123").write_text('[{"ind')  # and in the middle of writing
+    main([*recipes, "--limit=4"])
+    now = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("pairs/[0-9]*.json")}
+    assert len(now) == 8
+    assert all(now[path] == time for path, time in kept.items() if path != lost)
+
+
+def test_several_processes_find_the_same_poses_as_one(recipes: list[str], tmp_path: Path) -> None:
+    main([*recipes, "--limit=3"])
+    main([*recipes[:-1], f"--output={tmp_path}/two", "--limit=3", "--processes=2"])
+    for name in ("blind", "softposit"):
+        one, two = read_results(tmp_path / "out" / name), read_results(tmp_path / "two" / name)
+        assert [row.rotation_error_deg for row in one.rows] == [row.rotation_error_deg for row in two.rows]
+
+
+def test_an_outlier_sweep_adds_points_and_draws_its_curves(recipes: list[str], tmp_path: Path) -> None:
+    main([*recipes, "--limit=2", "--rho", "0", "0.5"])
+    clean = read_results(tmp_path / "out" / "rho-0" / "blind").rows[0]
+    cluttered = read_results(tmp_path / "out" / "rho-0.5" / "blind").rows[0]
+    assert (clean.m, clean.n, clean.true_pairs) == (12, 12, 12)
+    assert (cluttered.m, cluttered.n, cluttered.true_pairs) == (18, 18, 12)
+    assert (tmp_path / "out" / "outliers.png").stat().st_size > 1000
+    rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
+    assert [row["rho"] for row in rows if row["source"] == "here"] == ["0.0", "0.0", "0.5", "0.5"]
+
+
+def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> None:
+    (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
+    data = read_data(tmp_path / "data.yaml", ["--data.test_shapes=30", "--data.seed", "3"])
+    assert data["init_args"]["test_shapes"] == 30
+    pairs = TestPairs(data)
+    assert sorted(pairs.order) == list(range(30))
+    assert pairs.order != list(range(30))
+    assert TestPairs(data).order == pairs.order
+    assert pairs[4].index.tolist() == [4]
+
+
+@pytest.mark.parametrize(
+    ("extra", "message"),
+    [
+        (["--methods", "nonsense"], "expected a method among softposit, ransac"),
+        (["--methods", "ransac", "ransac"], "expected a label for each method"),
+        (["--methods", "bpnpnet@nothing.ckpt"], "got no file nothing.ckpt"),
+        (["--methods", "bpnp.models.baselines.Nothing"], "bpnp.models.baselines.Nothing"),
+        (["--data.nonsense=3"], "nonsense"),
+        (["--seed=3"], "got --seed=3"),
+        (["--data=nowhere.yaml"], "got no file nowhere.yaml"),
+    ],
+)
+def test_a_users_mistake_is_one_clear_error(
+    recipes: list[str], extra: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*recipes, "--limit=1", *extra])
+    assert stop.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_other_settings_in_the_same_folder_are_refused(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([*recipes, "--limit=1"])
+    with pytest.raises(SystemExit):
+        main([*recipes, "--limit=1", "--data.noise_px=0"])
+    assert "got other data" in capsys.readouterr().err
+    (tmp_path / "ransac.yaml").write_text(RANSAC.replace("64", "65"))
+    with pytest.raises(SystemExit):
+        main([*recipes, "--limit=1"])
+    assert "got other method" in capsys.readouterr().err
+
+
+def test_rows_survive_the_disk_with_their_infinities(tmp_path: Path) -> None:
+    row = PairRow(
+        3, "a\nb", "x", 180.0, float("inf"), float("inf"), float("nan"), 0, 4, 5, 4, 7, float("inf"), False, False, 0.5
+    )
+    finished = Finished(tmp_path)
+    finished.add(3, [row])
+    assert finished.indices() == {3}
+    assert str(finished.rows([3, 4])) == str([row])
+    json.loads((tmp_path / "pairs" / "3.json").read_text(), parse_constant=pytest.fail)
+
+
+def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
+    task = BlindPnPTask(BPnPNet(channels=16, blocks=1))
+    content: dict[str, object] = {"state_dict": task.state_dict()}
+    task.on_save_checkpoint(content)
+    weights = tmp_path / "last.ckpt"
+    torch.save(content, weights)
+    (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
+    main(["table", f"--data={tmp_path}/data.yaml", "--methods", f"Lc=bpnpnet@{weights}", f"hungarian@{weights}",
+          "--limit=2", f"--output={tmp_path}/out", "--paper=none"])  # fmt: skip
+    rows = [row["method"] for row in csv.DictReader((tmp_path / "out" / "table.csv").open())]
+    assert rows == ["Lc ransac", "Lc pnp", "Lc refined", "hungarian ransac", "hungarian pnp"]
+
+
+def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:
+    line = Line("L_c & 50% | R", 3, {})
+    assert r"L\_c \& 50\% | R" in as_latex([line], None)
+    assert r"L_c & 50% \| R" in as_markdown([line], "megadepth")
+    assert "MegaDepth: another data set" in as_markdown([line], "megadepth")
+
+
+def test_every_short_name_can_be_built() -> None:
+    for name in ("softposit", "ransac", "gosma", "gopac", "hungarian", "bpnpnet"):
+        (method,) = parse_methods([name], time_limit=2.0)
+        solver = method.build()
+        assert solver.estimates
+        assert getattr(solver, "time_limit", 2.0) == 2.0

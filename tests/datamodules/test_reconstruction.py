@@ -1,0 +1,218 @@
+import logging
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pycolmap
+import pytest
+from planted_model import HEIGHT, OPENCV, WIDTH, plant_model
+
+from bpnp.cameras import camera_models
+from bpnp.datamodules.reconstruction import read_reconstruction
+
+FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
+SIMPLE_RADIAL = ("SIMPLE_RADIAL", [700.0, 400.0, 300.0, -0.35])
+PARAMETERS = {
+    "f": 450.0, "fx": 440.0, "fy": 460.0, "cx": 390.0, "cy": 310.0, "omega": 0.8, "alpha": 0.6, "beta": 1.1,
+    "w": 4000.0, "h": 2000.0,
+}  # fmt: skip
+
+
+def equal(a, b) -> bool:
+    """Whether two reconstructions hold the same, name apart."""
+    return np.array_equal(a.points3d, b.points3d) and all(
+        np.array_equal(getattr(x, field), getattr(y, field))
+        for x, y in zip(a.images, b.images, strict=True)
+        for field in ("name", "points2d", "seen", "clutter2d", "observed", "rotation", "translation", "focal")
+    )
+
+
+@pytest.mark.parametrize("model", [name for name, _ in camera_models().values()])
+def test_planted_points_come_back_through_every_camera_model(model: str, tmp_path: Path) -> None:
+    """Keypoints are projections of known points, so undistorting them has to give x/z, y/z back."""
+    info = pycolmap.Camera.create_from_model_name(1, model, 1.0, WIDTH, HEIGHT).params_info
+    params = [PARAMETERS.get(name.strip(), 0.01) for name in info.split(",")]
+    truth = plant_model(tmp_path, camera=(model, params))
+    found = read_reconstruction(tmp_path)
+    np.testing.assert_allclose(found.points3d, truth.points3d, atol=1e-15)
+    for i, image in enumerate(found.images):
+        assert image.name == f"photo {i}.jpg"
+        np.testing.assert_array_equal(image.seen, truth.seen[i])
+        np.testing.assert_allclose(image.points2d, truth.points2d[i], atol=1e-6)
+        np.testing.assert_allclose(image.rotation, truth.rotations[i], atol=1e-12)
+        np.testing.assert_allclose(image.translation, truth.translations[i], atol=1e-12)
+        expected = {"f": 450, "fx": 450, "w": 4000 / (2 * np.pi)}[info.split(",")[0].strip()]
+        assert image.focal == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("camera", [OPENCV, FISHEYE, SIMPLE_RADIAL])
+def test_undistortion_is_the_inverse_of_opencv(camera: tuple[str, list[float]], tmp_path: Path) -> None:
+    truth = plant_model(tmp_path, camera=camera, clutter=200)
+    model, params = camera
+    fx, fy, cx, cy, *distortion = params if model != "SIMPLE_RADIAL" else [params[0], *params, 0.0, 0.0, 0.0]
+    matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    project = cv2.fisheye.projectPoints if "FISHEYE" in model else cv2.projectPoints
+    found = read_reconstruction(tmp_path)
+    assert not found.lost
+    for image, expected in zip(found.images, truth.clutter_px, strict=True):
+        rays = np.column_stack([image.clutter2d, np.ones(len(expected))]).astype(np.float64)
+        pixels, _ = project(rays[:, None], np.zeros(3), np.zeros(3), matrix, np.array(distortion))
+        np.testing.assert_allclose(pixels.reshape(-1, 2), expected, atol=1e-3)
+
+
+def test_keypoints_outside_the_field_of_view_are_dropped_and_counted(tmp_path: Path, caplog) -> None:
+    """At 300 pixels a radian a fisheye pixel 600 from the centre looks backwards: x/z means nothing."""
+    plant_model(tmp_path, camera=FISHEYE, images=1)
+    keypoints = image_keypoints(tmp_path / "images.bin")
+    keypoints["position"][3] = (400.0 + 600.0, 300.0)  # of a 3D point
+    keypoints["position"][-2] = (400.0, 300.0 - 600.0)  # clutter
+    rewrite_keypoints(tmp_path / "images.bin", keypoints)
+    with caplog.at_level(logging.WARNING):
+        found = read_reconstruction(tmp_path)
+    assert found.lost == {"keypoints that could not be undistorted": 2}
+    assert "2 keypoints that could not be undistorted" in caplog.text
+    assert (len(found.images[0].points2d), len(found.images[0].clutter2d)) == (39, 11)
+
+
+def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path) -> None:
+    truth = plant_model(tmp_path, images=1)
+    keypoints = image_keypoints(tmp_path / "images.bin")
+    keypoints[-1] = keypoints[5]
+    keypoints["position"][5] += 3.0
+    rewrite_keypoints(tmp_path / "images.bin", keypoints)
+    found = read_reconstruction(tmp_path)
+    assert found.lost == {"repeated keypoints": 1}
+    np.testing.assert_array_equal(found.images[0].seen, truth.seen[0])
+    np.testing.assert_allclose(found.images[0].points2d, truth.points2d[0], atol=1e-6)
+    assert len(found.images[0].clutter2d) == 11
+
+
+def test_bad_points_are_dropped_and_counted(tmp_path: Path) -> None:
+    """A NaN point leaves the scene, a point behind a camera leaves its pairs, an unknown one is no clutter."""
+    truth = plant_model(tmp_path, images=1, text=True)
+    lines = (tmp_path / "points3D.txt").read_text().splitlines()
+    a, b, c = truth.seen[0][:3]
+    behind = truth.rotations[0].T @ (np.array([0, 0, -1.0]) - truth.translations[0])
+    rows = {int(line.split()[0]): k for k, line in enumerate(lines) if not line.startswith("#")}
+    lines[rows[a + 1]] = replace_numbers(lines[rows[a + 1]], ["nan"] * 3)
+    lines[rows[b + 1]] = replace_numbers(lines[rows[b + 1]], [repr(float(x)) for x in behind])
+    lines[rows[c + 1]] = "999999" + lines[rows[c + 1]][len(str(c + 1)) :]
+    (tmp_path / "points3D.txt").write_text("\n".join(lines) + "\n")
+    found = read_reconstruction(tmp_path)
+    assert found.lost == {
+        "points that are not finite": 1,
+        "keypoints of a point that is missing": 2,
+        "pairs with the point behind or in the camera": 1,
+    }
+    image = found.images[0]
+    assert (len(found.points3d), len(image.seen), len(image.observed), len(image.clutter2d)) == (59, 37, 38, 12)
+    np.testing.assert_allclose(image.points2d, truth.points2d[0][3:], atol=1e-6)
+
+
+def test_an_image_with_a_broken_pose_is_skipped_and_counted(tmp_path: Path) -> None:
+    plant_model(tmp_path, text=True)
+    lines = (tmp_path / "images.txt").read_text().splitlines()
+    for k, quaternion in ((4, "0 0 0 0"), (6, "nan 0 0 1")):
+        lines[k] = replace_numbers(lines[k], quaternion.split())
+    (tmp_path / "images.txt").write_text("\n".join(lines) + "\n")
+    found = read_reconstruction(tmp_path)
+    assert (len(found.images), found.lost) == (1, {"images with a broken pose": 2})
+
+
+def test_poses_of_a_rig_are_those_of_the_images(tmp_path: Path) -> None:
+    """COLMAP stores one pose a frame for all cameras of a rig; the reading must give cam_from_world of each camera."""
+    rng = np.random.default_rng(0)
+
+    def random_pose() -> pycolmap.Rigid3d:
+        return pycolmap.Rigid3d(pycolmap.Rotation3d(rng.normal(size=3)), rng.normal(size=3))
+
+    model, rig, frame = pycolmap.Reconstruction(), pycolmap.Rig(rig_id=1), pycolmap.Frame(frame_id=1, rig_id=1)
+    for i in (1, 2):
+        model.add_camera(pycolmap.Camera(camera_id=i, model="PINHOLE", width=9, height=9, params=[9.0, 9, 4, 4]))
+    rig.add_ref_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 1))
+    rig.add_sensor(pycolmap.sensor_t(pycolmap.SensorType.CAMERA, 2), random_pose())
+    model.add_rig(rig)
+    images = [pycolmap.Image(f"{i}.jpg", np.full((1, 2), 5.0), i, i) for i in (1, 2)]
+    for image in images:
+        image.frame_id = 1
+        frame.add_data_id(image.data_id)
+    frame.rig_from_world = random_pose()
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    model.register_frame(1)
+    model.add_point3D(np.ones(3), pycolmap.Track([pycolmap.TrackElement(1, 0), pycolmap.TrackElement(2, 0)]))
+    model.write_binary(tmp_path)
+    for image in read_reconstruction(tmp_path).images:
+        pose = model.find_image_with_name(image.name).cam_from_world()
+        np.testing.assert_allclose(image.rotation, pose.rotation.matrix(), atol=1e-12)
+        np.testing.assert_allclose(image.translation, pose.translation, atol=1e-12)
+
+
+def test_zlib_works_after_the_reading(tmp_path: Path) -> None:
+    """pycolmap before zlib makes both calls abort the process."""
+    code = (
+        "import bpnp.cameras, io, zlib, numpy\n"
+        "bpnp.cameras.camera_models()\n"
+        "zlib.compress(bytes(100_000)); numpy.savez_compressed(io.BytesIO(), a=numpy.arange(10_000))"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
+
+
+@pytest.mark.parametrize("scene", ["castle-P30", "sceaux_castle_txt", "statue_of_liberty", "walkthrough"])
+def test_real_residuals_are_those_of_the_reconstruction(scene: str, shared_data: Path, tmp_path: Path) -> None:
+    """Every pair's residual, sent back through the lens into pixels, is the one that pycolmap computes there."""
+    folder = shared_data / "colmap" / scene / "sparse" / "0"
+    model = pycolmap.Reconstruction(folder)
+    ids = np.sort(np.fromiter(model.points3D, dtype=np.int64))
+    found = read_reconstruction(folder)
+    assert len(found.images) == model.num_reg_images()
+    for image in found.images[::7]:
+        expected = model.find_image_with_name(image.name)
+        errors: dict[int, list[float]] = {}
+        for keypoint in expected.get_observation_points2D():
+            pixel = expected.project_point(model.point3D(keypoint.point3D_id).xyz)
+            error = np.inf if pixel is None else float(np.linalg.norm(pixel - keypoint.xy))
+            errors.setdefault(keypoint.point3D_id, []).append(error)
+        assert 0 <= len(errors) - len(image.seen) <= 3
+        points = found.points3d[image.seen] @ image.rotation.T + image.translation
+        rays = np.column_stack([image.points2d, np.ones(len(image.points2d))]).astype(np.float64)
+        residuals = np.linalg.norm(expected.camera.img_from_cam(points) - expected.camera.img_from_cam(rays), axis=-1)
+        for point_id, residual in zip(ids[image.seen], residuals, strict=True):
+            # pycolmap does not normalise the 6-digit quaternions of a text model: up to 0.003 pixels
+            assert min(abs(error - residual) for error in errors[point_id]) < 5e-3
+        assert np.median(residuals) < 2.0
+
+
+@pytest.mark.parametrize("scene", ["fountain-P11", None])
+def test_binary_and_text_give_the_same(scene: str | None, request, tmp_path: Path) -> None:
+    if scene is None:
+        plant_model(tmp_path / "binary")
+    else:
+        shutil.copytree(request.getfixturevalue("shared_data") / "colmap" / scene / "sparse" / "0", tmp_path / "binary")
+    (tmp_path / "text").mkdir()
+    pycolmap.Reconstruction(tmp_path / "binary").write_text(tmp_path / "text")
+    assert equal(read_reconstruction(tmp_path / "binary"), read_reconstruction(tmp_path / "text"))
+
+
+KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])
+
+
+def image_keypoints(path: Path) -> np.ndarray:
+    """The keypoints of a file of one image: the last thing in it."""
+    content = path.read_bytes()
+    start = content.index(b".jpg\0") + 5 + 8
+    return np.frombuffer(content[start:], KEYPOINT).copy()
+
+
+def rewrite_keypoints(path: Path, keypoints: np.ndarray) -> None:
+    path.write_bytes(path.read_bytes()[: -keypoints.nbytes] + keypoints.tobytes())
+
+
+def replace_numbers(line: str, numbers: list[str]) -> str:
+    """The line with the numbers after its id replaced."""
+    fields = line.split(" ")
+    return " ".join([fields[0], *numbers, *fields[1 + len(numbers) :]])

@@ -1,0 +1,136 @@
+from collections.abc import Iterator
+
+import pytest
+import torch
+from torch import Tensor
+
+from bpnp.layers import memory
+from bpnp.layers.adjoint import times, transpose_times
+from bpnp.layers.fused import conjugate_gradients, moments, outer_products, projected, square_product
+
+LIMIT = 200
+
+
+@pytest.fixture(params=[1, 3])
+def threads(request: pytest.FixtureRequest) -> Iterator[int]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(request.param)
+    yield request.param
+    torch.set_num_threads(before)
+
+
+def plan(b: int, m: int, n: int, *, seed: int = 0) -> Tensor:
+    p = torch.rand(b, m, n, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) ** 6
+    return p / p.sum((-2, -1), keepdim=True)
+
+
+def noise(*shape: int) -> Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+
+
+def laplacian(p: Tensor) -> Tensor:
+    """S of every sample, formed."""
+    return torch.diag_embed(p.sum(-2)) - p.mT @ (p / p.sum(-1, keepdim=True))
+
+
+def solve(p: Tensor, rhs: Tensor, *, tolerance: float | Tensor = 1e-12) -> tuple[Tensor, Tensor, Tensor]:
+    """S x = rhs with P = diag(alpha) K diag(beta) for some scalings."""
+    alpha, beta = (0.5 + noise(*shape).abs() for shape in (p.shape[:2], (p.shape[0], p.shape[2])))
+    alpha, beta = alpha.to(p), beta.to(p)
+    kernel = p / alpha.unsqueeze(-1) / beta.unsqueeze(-2)
+    degree = laplacian(p.double()).diagonal(dim1=-2, dim2=-1).to(p)
+    return conjugate_gradients(kernel, (alpha, beta), (p.sum(-1), p.sum(-2)), degree, rhs, tolerance, LIMIT)
+
+
+@pytest.mark.parametrize("shape", [(5, 30, 20), (2, 7, 9), (1, 3, 2)])
+def test_the_sums_are_torchs(shape: tuple[int, int, int], threads: int) -> None:
+    p, v = plan(*shape), noise(*shape)
+    rows, means, cols, centred = moments(p, v)
+    torch.testing.assert_close(rows, p.sum(-1))
+    torch.testing.assert_close(means, (p * v).sum(-1) / p.sum(-1))
+    torch.testing.assert_close(cols, p.sum(-2))
+    torch.testing.assert_close(centred, (p * (v - means.unsqueeze(-1))).sum(-2))
+    torch.testing.assert_close(square_product(p, rows), (rows.unsqueeze(-1) * p.square()).sum(-2))
+
+
+@pytest.mark.parametrize("shape", [(5, 30, 20), (3, 7, 9), (1, 3, 2)])
+def test_solves_the_laplacian(shape: tuple[int, int, int], threads: int) -> None:
+    p = plan(*shape)
+    system = laplacian(p)
+    rhs = (system @ noise(shape[0], shape[2], 1)).squeeze(-1)
+    x, mean, solved = solve(p, rhs)
+    assert solved.all()
+    torch.testing.assert_close((system @ x.unsqueeze(-1)).squeeze(-1), rhs, atol=1e-12, rtol=1e-9)
+    torch.testing.assert_close(mean, (p @ x.unsqueeze(-1)).squeeze(-1) / p.sum(-1), atol=1e-9, rtol=1e-9)
+
+
+def test_every_sample_stops_at_its_own_tolerance_whatever_its_neighbours(threads: int) -> None:
+    p = plan(4, 40, 30).float()
+    rhs = (laplacian(p) @ noise(4, 30, 1).float()).squeeze(-1)
+    rhs[1], rhs[2, 0] = 0, torch.nan
+    tolerance = torch.tensor([1e-1, 1e-3, 1e-3, 1e-5])
+    x, _, _ = solve(p, rhs, tolerance=tolerance)
+    assert not x[1].any()  # done before it starts
+    unit = 1 / p.sum(-2)
+    residual = rhs - (laplacian(p) @ x.unsqueeze(-1)).squeeze(-1)
+    relative = ((unit * residual**2).sum(-1) / (unit * rhs**2).sum(-1)).sqrt()
+    assert 1e-3 < relative[0] <= 1.01e-1
+    assert relative[3] < 2e-5
+    swapped, _, _ = solve(p.flip(0), rhs.flip(0), tolerance=tolerance.flip(0))
+    assert (swapped.flip(0) - x)[[0, 1, 3]].abs().max() < 1e-2 * x[[0, 3]].abs().max()
+
+
+def test_memory_in_any_order_is_read_right() -> None:
+    p, v = plan(3, 8, 5), noise(3, 8, 5)
+    expected = moments(p, v)
+    for found, value in zip(moments(p.mT.contiguous().mT, v.mT.contiguous().mT), expected, strict=True):
+        torch.testing.assert_close(found, value)
+
+
+def test_nothing_is_done_for_an_empty_batch(threads: int) -> None:
+    rows, _, cols, _ = moments(torch.empty(0, 4, 5), torch.empty(0, 4, 5))
+    assert (rows.shape, cols.shape) == ((0, 4), (0, 5))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_products_and_projections_are_torchs(dtype: torch.dtype, threads: int) -> None:
+    left, right = noise(3, 7, 3).to(dtype), noise(3, 9, 3).to(dtype)
+    torch.testing.assert_close(outer_products(left, right), left @ right.mT)
+    p, v, a, b = (x.to(dtype) for x in (plan(3, 7, 9), noise(3, 7, 9), noise(3, 7), noise(3, 9)))
+    expected = -10 * p * (v - a.unsqueeze(-1) - b.unsqueeze(-2))
+    torch.testing.assert_close(projected(p, v, a, b, -10.0), expected)
+
+
+def test_what_is_not_a_number_stays_visible() -> None:
+    p, v = plan(2, 7, 9), noise(2, 7, 9)
+    v[1, 2, 3] = torch.nan
+    _, means, _, centred = moments(p, v)
+    assert means[0].isfinite().all()
+    assert means[1].isnan().sum() == 1
+    assert centred[1].isnan().all()
+    assert outer_products(torch.full((1, 2, 3), torch.inf), torch.zeros(1, 2, 3)).isnan().all()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_large_results_can_be_used_like_others(dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "LARGE", 1000)
+    large, small = (memory.empty(torch.Size((3, k, 11)), dtype=dtype, device=torch.device("cpu")) for k in (100, 2))
+    assert (large.shape, large.dtype, small.shape) == ((3, 100, 11), dtype, (3, 2, 11))
+    kept = large.normal_()[1]
+    expected = kept.clone()
+    del large  # a view keeps the memory
+    others = [memory.empty(torch.Size((3, 100, 11)), dtype=dtype, device=torch.device("cpu")).zero_() for _ in range(9)]
+    assert torch.equal(kept, expected)
+    assert all((other == 0).all() for other in others)
+
+
+@pytest.mark.parametrize("shape", [(20_000, 3), (3, 20_000)])
+def test_long_sums_keep_their_digits(shape: tuple[int, int]) -> None:
+    """Sums of thousands of terms to the rounding of their result, as float64 gives them."""
+    torch.manual_seed(3)
+    matrix = torch.rand(2, *shape)
+    x, y = torch.rand(2, shape[1]), torch.rand(2, shape[0])
+    exact = (matrix.double() @ x.double().unsqueeze(-1)).squeeze(-1)
+    assert ((times(matrix, x) - exact).abs() / exact).max() < 4e-7
+    exact = (y.double().unsqueeze(-2) @ matrix.double()).squeeze(-2)
+    assert ((transpose_times(matrix, y) - exact).abs() / exact).max() < 4e-7

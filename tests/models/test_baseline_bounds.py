@@ -1,0 +1,222 @@
+"""Branch and bound: no pose of a box beats the box's bound, and the searches end at planted optima."""
+
+import math
+
+import pytest
+import roma
+import torch
+from planted import plant
+from torch import Tensor
+
+from bpnp.geometry import angle_between, camera_centre
+from bpnp.models.baselines.branch_and_bound.boxes import (
+    Boxes,
+    distance_range,
+    rotation_uncertainty,
+    split,
+    translation_uncertainty,
+)
+from bpnp.models.baselines.branch_and_bound.gopac import maximise_inliers
+from bpnp.models.baselines.branch_and_bound.gosma import align_mixtures, polish
+from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, log_z, lower_bound, overlap, squared_norm
+from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
+from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_near
+from bpnp.models.baselines.single_pairs import Clock
+
+
+def normal(*shape: int) -> Tensor:
+    return torch.randn(*shape, dtype=torch.float64)
+
+
+def uniform(*shape: int) -> Tensor:
+    return torch.rand(*shape, dtype=torch.float64)
+
+
+def random_boxes(count: int, spread: float = 3.0) -> Boxes:
+    """From large to small, elongated, around and away from the origin."""
+    halves = 10 ** (-2 * uniform(count, 1)) * (0.3 + uniform(count, 3))
+    return Boxes(1.5 * normal(count, 3), 10 ** (-2 * uniform(count)), spread * normal(count, 3), halves)
+
+
+def some_pose(boxes: Boxes, *, corner: bool) -> tuple[Tensor, Tensor]:
+    turn, shift = (2 * uniform(len(boxes.turn), 3) - 1 for _ in range(2))
+    turn, shift = (turn.sign(), shift.sign()) if corner else (turn, shift)
+    rotation = roma.rotvec_to_rotmat(boxes.turn + turn * boxes.turn_half.unsqueeze(-1))
+    return rotation, boxes.place + shift * boxes.place_half
+
+
+def random_mixtures() -> tuple[SceneMixture, RayMixture]:
+    weights3d, weights2d = (torch.nn.functional.normalize(0.2 + uniform(k), p=1, dim=0) for k in (5, 6))
+    directions = torch.nn.functional.normalize(normal(6, 3), dim=-1)
+    scene = SceneMixture(weights3d, normal(5, 3), 0.02 + 0.3 * uniform(5))
+    return scene, RayMixture(weights2d, directions, 1 + 300 * uniform(6))
+
+
+def whole(turn: Tensor, turn_half: float, place: Tensor, place_half: float) -> Boxes:
+    return Boxes(
+        turn.reshape(1, 3), turn.new_full((1,), turn_half), place.reshape(1, 3), turn.new_full((1, 3), place_half)
+    )
+
+
+def test_uncertainty_angles_and_distances_hold_in_ten_thousand_boxes() -> None:
+    boxes, points = random_boxes(10_000), normal(4, 3)
+    turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, points)
+    near, far = distance_range(boxes, points)
+    for trial in range(20):
+        rotation, place = some_pose(boxes, corner=trial % 2 == 1)
+        towards = points - place.unsqueeze(1)
+        assert (angle_between(towards, points - boxes.place.unsqueeze(1)) <= moving).all()
+        turned, centred = points @ rotation.mT, points @ boxes.rotation.mT
+        assert (angle_between(turned, centred) <= turning.unsqueeze(-1) + 1e-9).all()
+        distances = towards.norm(dim=-1)
+        assert (distances >= near - 1e-9).all()
+        assert (distances <= far + 1e-9).all()
+
+
+def test_no_pose_of_ten_thousand_boxes_is_below_the_mixtures_bound() -> None:
+    tightest = math.inf
+    for _ in range(10):
+        scene, rays = random_mixtures()
+        boxes = random_boxes(1000)
+        bound = lower_bound(scene, rays, boxes)
+        for trial in range(20):
+            value = distance(scene, rays, *some_pose(boxes, corner=trial % 2 == 1))
+            assert (bound <= value).all()
+            tightest = min(tightest, float((value - bound).min()))
+    assert tightest < 0.1  # a bound far below everything would pass as well
+
+
+def test_the_mixtures_distance_is_an_integral_over_the_sphere() -> None:
+    directions = torch.nn.functional.normalize(normal(400_000, 3), dim=-1)
+    axes, k = torch.nn.functional.normalize(normal(2, 3), dim=-1), torch.tensor([3.0, 8.0]).double()
+    densities = torch.exp(k * (directions @ axes.mT) - log_z(k))
+    expected = 4 * math.pi * densities.prod(-1).mean()
+    found = overlap(k[0], k[1], axes[0] @ axes[1])
+    torch.testing.assert_close(found, expected, rtol=0.02, atol=0)
+    assert float(4 * math.pi * densities.mean()) == pytest.approx(1, rel=0.02)
+
+
+def test_children_cover_their_parents() -> None:
+    parents = random_boxes(200)
+    for turning in (True, False):
+        children = split(parents, torch.full((200,), turning))
+        for trial in range(4):
+            rotation_vector = parents.turn + parents.turn_half.unsqueeze(-1) * (2 * uniform(200, 3) - 1)
+            place = parents.place + parents.place_half * (2 * uniform(200, 3) - 1)
+            inside_ball = rotation_vector.norm(dim=-1) <= math.pi
+            off_turn = (rotation_vector.unsqueeze(1) - children.turn).abs() <= children.turn_half.unsqueeze(-1) + 1e-12
+            off_place = (place.unsqueeze(1) - children.place).abs() <= children.place_half + 1e-12
+            held = (off_turn & off_place).all(-1).any(-1)
+            assert held[inside_ball].all(), trial
+
+
+def planted_mixtures() -> tuple[SceneMixture, RayMixture, Tensor, Tensor]:
+    """Four clusters, seen exactly, and a cluster of the image that no part of the scene explains."""
+    means = torch.tensor([[1.0, 0, 0.3], [-0.8, 0.5, -0.4], [0.1, -1.0, 0.5], [0.2, 0.9, 0.8]]).double()
+    scene = SceneMixture(
+        torch.tensor([0.4, 0.3, 0.2, 0.1]).double(), means, 0.05 * torch.tensor([1, 1.3, 0.8, 1.2]).double()
+    )
+    rotation = roma.rotvec_to_rotmat(torch.tensor([0.2, -0.3, 0.25]).double())
+    place = torch.tensor([0.4, -0.3, -4.0]).double()
+    towards = means - place
+    outlier = torch.tensor([[0.0, 0.0, -1.0]]).double()
+    rays = RayMixture(
+        torch.cat([0.97 * scene.weights, torch.tensor([0.03]).double()]),
+        torch.cat([torch.nn.functional.normalize(towards, dim=-1) @ rotation.mT, outlier]),
+        torch.cat([towards.square().sum(-1) / scene.variances + 1, torch.tensor([20.0]).double()]),
+    )
+    return scene, rays, rotation, place
+
+
+def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() -> None:
+    scene, rays, rotation, place = planted_mixtures()
+    domain = whole(torch.zeros(3).double(), 0.45, torch.tensor([0.3, -0.2, -4.1]).double(), 0.2)
+    found = align_mixtures(scene, rays, domain, gap=0.2, max_boxes=100_000)
+    assert found.certified
+    # The outliers' weight is missing elsewhere, which moves the optimum a little.
+    assert float(roma.rotmat_geodesic_distance(found.rotation, rotation)) < math.radians(1)
+    assert float((found.place - place).norm()) < 0.1
+    steps = torch.linspace(-1, 1, 6).double()
+    grid = torch.cartesian_prod(steps, steps, steps)
+    norm = float(squared_norm(rays))
+    lowest = math.inf
+    for shift in grid:
+        turned = roma.rotvec_to_rotmat(0.45 * grid)
+        values = distance(scene, rays, turned, (domain.place + 0.2 * shift).expand(len(grid), 3))
+        lowest = min(lowest, float(values.min()) / norm + 1)
+    assert found.bound <= lowest
+    assert found.value <= lowest  # no grid point beats it
+
+
+def test_gosma_cut_short_has_no_certificate_and_a_bound_below() -> None:
+    scene, rays, *_ = planted_mixtures()
+    domain = whole(torch.zeros(3).double(), math.pi, torch.zeros(3).double(), 6.0)
+    found = align_mixtures(scene, rays, domain, gap=0.1, max_boxes=5000)
+    assert not found.certified
+    assert found.bound < found.value - 0.1
+
+
+def test_polishing_never_makes_a_pose_worse() -> None:
+    scene, rays, rotation, place = planted_mixtures()
+    turned = roma.rotvec_to_rotmat(torch.tensor([0.05, -0.04, 0.03]).double()) @ rotation
+    before = distance(scene, rays, turned.unsqueeze(0), place.unsqueeze(0) + 0.1)
+    value, polished, _ = polish(scene, rays, turned, place + 0.1)
+    assert value < float(before)
+    assert float(roma.rotmat_geodesic_distance(polished, rotation)) < math.radians(1)
+
+
+def test_mixtures_find_planted_clusters_in_any_order() -> None:
+    centres = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 1]]).double()
+    points = (centres.unsqueeze(1) + 0.1 * normal(3, 200, 3)).flatten(0, 1)
+    mixture = scene_mixture(points, 1.0)
+    assert len(mixture.weights) == 3
+    assert torch.cdist(centres, mixture.means).amin(-1).max() < 0.05
+    shuffled = scene_mixture(points[torch.randperm(600)], 1.0)
+    torch.testing.assert_close(shuffled.means.sum(0), mixture.means.sum(0))
+    rays = torch.nn.functional.normalize(centres.new_tensor([0, 0, 1.0]) + 0.05 * normal(500, 3), dim=-1)
+    fitted = ray_mixture(rays, 0.3)
+    assert len(fitted.weights) == 1
+    assert float(fitted.concentrations) == pytest.approx(1 / 0.05**2, rel=0.15)
+
+
+def test_no_rotation_of_a_box_has_more_inliers_than_its_bound() -> None:
+    points = normal(30, 12, 3)
+    for directions in torch.nn.functional.normalize(points, dim=-1):
+        rays, reach = torch.nn.functional.normalize(normal(10, 3), dim=-1), 0.05 + 0.2 * uniform(12)
+        domain = whole(normal(3), 0.4, torch.zeros(3).double(), 0.0)
+        found = best_rotation(rays, directions, reach, domain, floor=0, clock=Clock(None), smallest=0.02)
+        turns = domain.turn + 0.4 * (2 * uniform(400, 3) - 1)
+        cosine = (rays @ roma.rotvec_to_rotmat(turns)) @ directions.mT
+        counts = (cosine >= reach.cos()).any(-1).sum(-1)
+        assert int(counts.max()) <= found.bound
+        assert found.reached <= found.bound
+        inside = turns.norm(dim=-1) <= math.pi
+        assert int(counts[inside].max()) <= max(found.reached, found.bound)
+
+
+def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:
+    problem = plant(1, 7, seed=3, outliers2d=2, outliers3d=2)
+    rays, points = problem.bearings[0], problem.points3d[0]
+    centre = camera_centre(*problem.pose)[0]
+    turn = roma.rotmat_to_rotvec(problem.rotation)[0]
+    domain = whole(turn + 0.05, 0.15, centre + 0.05, 0.15)
+    found = maximise_inliers(rays, points, domain, angle=0.01, max_boxes=3_000_000)
+    assert found.rotation is not None
+    assert found.inliers == found.bound
+    assert found.inliers >= 7
+    assert count_near(rays, points, found.rotation, found.place, 0.01) == found.inliers
+    steps = torch.linspace(-1, 1, 7).double()
+    grid = torch.cartesian_prod(steps, steps, steps)
+    most = 0
+    for shift in grid:
+        directions = torch.nn.functional.normalize(points - domain.place[0] - 0.15 * shift, dim=-1)
+        cosine = (rays @ roma.rotvec_to_rotmat(domain.turn + 0.15 * grid)) @ directions.mT
+        most = max(most, int((cosine >= math.cos(0.01)).any(-1).sum(-1).max()))
+    assert most <= found.inliers
+
+
+def test_gopac_cut_short_has_no_certificate() -> None:
+    problem = plant(1, 12, seed=1)
+    domain = whole(torch.zeros(3).double(), math.pi, torch.zeros(3).double(), 6.0)
+    found = maximise_inliers(problem.bearings[0], problem.points3d[0], domain, angle=0.01, max_boxes=500)
+    assert found.bound > found.inliers

@@ -1,0 +1,202 @@
+"""The baselines as solvers of batches."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import roma
+import torch
+from planted import plant
+from scipy.optimize import linear_sum_assignment
+
+from bpnp import Batch, BPnPNet
+from bpnp.metrics import rotation_error, translation_error
+from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
+from bpnp.models.baselines.agreement import agreement
+from bpnp.models.baselines.hungarian import hungarian
+from bpnp.models.baselines.random_ransac import probability_of_true_triple
+from bpnp.models.baselines.single_pairs import PairSolver
+from bpnp.models.baselines.softposit.algorithm import softposit
+from bpnp.models.baselines.softposit.slack_assignment import slack_scalings
+
+QUICK: dict[str, PairSolver] = {
+    "softposit": SoftPOSIT(max_steps=25, time_limit=None),
+    "random_ransac": RandomRansac(max_hypotheses=512, time_limit=None),
+    "gosma": GOSMA(max_boxes=400, batch=64, time_limit=None),
+    "gopac": GOPAC(max_boxes=400, time_limit=None, angle=0.02),
+}
+each_solver = pytest.mark.parametrize("name", QUICK)
+
+
+@each_solver
+def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_history(name: str) -> None:
+    small, large = plant(1, 12, seed=1), plant(1, 20, seed=2)
+    together = Batch.from_arrays(
+        [large.points2d[0], small.points2d[0]], [large.points3d[0], small.points3d[0]], index=[5, 9]
+    )  # fmt: skip
+    alone = Batch.from_arrays(small.points2d, small.points3d, index=[9])
+    of_two, of_one = QUICK[name](together).poses[name], QUICK[name](alone).poses[name]
+    assert QUICK[name].estimates == (name,)
+    torch.testing.assert_close(of_two.rotation[1], of_one.rotation[0], rtol=0, atol=0, equal_nan=True)
+    torch.testing.assert_close(of_two.translation[1], of_one.translation[0], rtol=0, atol=0, equal_nan=True)
+    assert of_two.stats.iterations[1] == of_one.stats.iterations[0]
+
+
+@each_solver
+def test_three_points_have_no_pose_and_say_so(name: str) -> None:
+    problem = plant(1, 12)
+    pose = QUICK[name](Batch.from_arrays(problem.points2d[:, :3], problem.points3d)).poses[name]
+    assert not pose.found[0]
+    assert not pose.stats.converged[0]
+    assert pose.stats.residual[0] == math.inf
+
+
+@each_solver
+def test_a_limit_of_time_ends_in_an_unconverged_answer(name: str) -> None:
+    solver = {"softposit": SoftPOSIT, "random_ransac": RandomRansac, "gosma": GOSMA, "gopac": GOPAC}[name]
+    with torch.inference_mode():
+        pose = solver(time_limit=1e-6)(plant(1, 30).batch()).poses[name]
+    assert not pose.stats.converged[0]
+    with pytest.raises(ValueError, match="expected `time_limit` > 0"):
+        solver(time_limit=0.0)
+
+
+@each_solver
+def test_the_scenes_unit_and_origin_change_nothing_but_the_translation(name: str) -> None:
+    problem = plant(1, 14, seed=4, dtype=torch.float64)
+    scaled = 7 * problem.points3d + torch.tensor([30.0, -20.0, 50.0])
+    if name == "softposit":
+        return  # its start is given in scene units
+    first = QUICK[name](Batch.from_arrays(problem.points2d, problem.points3d)).poses[name]
+    second = QUICK[name](Batch.from_arrays(problem.points2d, scaled)).poses[name]
+    torch.testing.assert_close(first.rotation, second.rotation, rtol=0, atol=1e-4, equal_nan=True)
+
+
+def test_softposit_converges_from_ten_degrees_on_clean_data() -> None:
+    turned, moved = [], []
+    for seed in range(2):
+        problem = plant(1, 25, seed=seed)
+        angle = torch.nn.functional.normalize(torch.randn(20, 3).double(), dim=-1)
+        amount = (2 * torch.rand(20, 1).double() - 1) * math.radians(10)
+        shift = torch.nn.functional.normalize(torch.randn(20, 3).double(), dim=-1) * 0.5 * torch.rand(20, 1).double()
+        starts = roma.rotvec_to_rotmat(amount * angle) @ problem.rotation, problem.translation + shift
+        found = softposit(problem.points2d[0], problem.points3d[0], *starts)
+        turned.append(roma.rotmat_geodesic_distance(found.rotation, problem.rotation.expand(20, 3, 3)))
+        moved.append((found.translation - problem.translation).norm(dim=-1))
+        assert found.accepted.double().mean() >= 0.95
+    solved = (torch.cat(turned) < math.radians(0.1)) & (torch.cat(moved) < 0.01)
+    assert solved.double().mean() >= 0.95
+
+
+def test_softposit_starts_near_the_truth_as_far_as_it_says() -> None:
+    problem = plant(30, 5)
+    batch = problem.batch()
+    pose = SoftPOSIT(start="near_truth", max_steps=0)(batch).poses["softposit"]
+    degrees = rotation_error(pose.rotation, batch.rotation)
+    away = translation_error(pose.translation, batch.translation)
+    assert 8 < degrees.max() <= 10.001
+    assert 0.4 < away.max() <= 0.501
+    with pytest.raises(ValueError, match="expected a batch with its true poses"):
+        SoftPOSIT(start="near_truth")(Batch.from_arrays(problem.points2d, problem.points3d))
+
+
+def test_softposit_starts_at_the_mean_of_the_papers_cameras() -> None:
+    problem = plant(1, 5)
+    pose = SoftPOSIT(start="mean", max_steps=0)(problem.batch()).poses["softposit"]
+    from scipy.spatial.transform import Rotation
+
+    expected = Rotation.from_euler("xyz", [22.5] * 3, degrees=True).as_matrix()  # as the views are drawn
+    np.testing.assert_allclose(pose.rotation[0].numpy(), expected, atol=1e-6)
+    np.testing.assert_allclose(pose.translation[0].numpy(), [0, 0, 4.5], atol=1e-6)
+
+
+def test_slack_scalings_balance_every_real_row_and_column() -> None:
+    kernel = torch.rand(2, 7, 9) + 0.01
+    u, v = slack_scalings(kernel, slack=1e-3, tolerance=1e-7, max_iterations=2000)
+    balanced = u.unsqueeze(-1) * kernel * v.unsqueeze(-2)
+    # Seven rows cannot fill nine columns: what the rows lack is in their slacks, and likewise the columns'.
+    assert (balanced.sum(-1) <= 1 + 1e-4).all()
+    assert (balanced.sum(-2) <= 1 + 1e-4).all()
+    identity = torch.eye(5).unsqueeze(0) * 100 + 1e-6
+    u, v = slack_scalings(identity, slack=1.0)
+    matched = (u.unsqueeze(-1) * identity * v.unsqueeze(-2)).diagonal(dim1=1, dim2=2)
+    assert (matched > 0.98).all()
+
+
+def test_blind_ransac_reaches_its_predicted_success_rate() -> None:
+    points, hypotheses, problems = 6, 120, 150
+    batch = plant(problems, points, seed=5).batch()
+    solver = RandomRansac(threshold=1e-4, confidence=1.0, max_hypotheses=hypotheses, time_limit=None)
+    pose = solver(batch).poses["random_ransac"]
+    solved = (rotation_error(pose.rotation, batch.rotation) < 0.1).double().mean()
+    triple = probability_of_true_triple(points, points, points)
+    assert triple == pytest.approx(1 / (6 * 5 * 4))
+    predicted = 1 - (1 - triple) ** hypotheses
+    assert float(solved) == pytest.approx(predicted, abs=3 * math.sqrt(predicted * (1 - predicted) / problems))
+
+
+def test_blind_ransac_stops_when_it_is_sure_and_converges() -> None:
+    batch = plant(4, 5, seed=6).batch()
+    pose = RandomRansac(threshold=1e-4, confidence=0.99, time_limit=None, max_hypotheses=20_000)(batch).poses[
+        "random_ransac"
+    ]
+    assert pose.stats.converged.all()
+    assert (pose.stats.iterations < 20_000).all()
+    assert (rotation_error(pose.rotation, batch.rotation) < 0.1).all()
+
+
+def test_agreement_counts_as_a_loop_would() -> None:
+    problem = plant(2, 15, seed=7, outliers2d=4, outliers3d=6)
+    near = agreement(problem.points2d[0], problem.points3d[0], problem.rotation, problem.translation, threshold=0.02)
+    for i in range(2):
+        camera = problem.points3d[0] @ problem.rotation[i].T + problem.translation[i]
+        close = torch.cdist(problem.points2d[0], camera[:, :2] / camera[:, 2:]) < 0.02
+        assert int(near.near2d[i]) == int(close.any(1).sum())
+        assert int(near.near3d[i]) == int(close.any(0).sum())
+    assert int(near.pairs[0]) >= 15
+
+
+def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:
+    first, second = plant(1, 9, seed=1), plant(1, 6, seed=2, outliers3d=5)
+    batch = Batch.from_arrays([first.points2d[0], second.points2d[0]], [first.points3d[0], second.points3d[0]])
+    cost = torch.rand(2, 9, 11)
+    assignment = hungarian(cost, batch)
+    for i, (m, n) in enumerate(((9, 9), (6, 11))):
+        rows, columns = linear_sum_assignment(cost[i, :m, :n].numpy())
+        chosen = cost[i, :m, :n].numpy()[rows, columns].sum()
+        found = assignment[i] > 0
+        assert int(found.sum()) == min(m, n)
+        assert not found[m:].any()
+        assert not found[:, n:].any()
+        assert float(cost[i][found].sum()) == pytest.approx(chosen, rel=1e-6)
+    torch.testing.assert_close(assignment.sum((1, 2)), torch.ones(2))
+
+
+def test_hungarian_pairs_lead_to_the_planted_pose() -> None:
+    class TrueCosts(BPnPNet):
+        def cost(self, batch: Batch) -> torch.Tensor:
+            assert batch.match3d is not None
+            return 1 - (torch.arange(batch.points2d.shape[1])[:, None] == batch.match3d.unsqueeze(1)).to(batch.points2d)
+
+    batch = plant(2, 40, seed=8).batch()
+    prediction = Hungarian(net=TrueCosts(channels=16, blocks=1))(batch)
+    for name in Hungarian.estimates:
+        assert prediction.poses[name].stats.converged.all()
+        assert (rotation_error(prediction.poses[name].rotation, batch.rotation) < 1e-3).all()
+    with pytest.raises(FileNotFoundError):
+        Hungarian(checkpoint="nothing.ckpt")
+
+
+@pytest.mark.parametrize(
+    "path", sorted((Path(__file__).parents[2] / "configs" / "baselines").glob("*.yaml")), ids=lambda p: p.stem
+)
+def test_every_recipe_names_a_solver_and_its_settings(path: Path) -> None:
+    from bpnp.table.methods import parse_methods
+
+    (method,) = parse_methods([str(path)])
+    if "checkpoint" in method.init_args:
+        with pytest.raises((ValueError, OSError), match="checkpoint"):
+            method.build()
+    else:
+        assert isinstance(method.build(), PairSolver)

@@ -1,0 +1,106 @@
+from functools import partial
+from typing import Any
+
+import pytest
+import torch
+from planted import Planted, padded, plant
+from torch import Tensor, nn
+
+from bpnp import BPnPNet, Prediction
+from bpnp.geometry import transform
+from bpnp.layers import sinkhorn
+from bpnp.metrics import rotation_error
+from bpnp.models.evaluation import FEATURES, LIMIT, cost_under_pose, widths
+from bpnp.models.pose_head import PoseStage
+from bpnp.types import Pose, SolveStats
+
+MU = 0.1
+
+
+def stats(size: int) -> SolveStats:
+    return SolveStats(torch.ones(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
+
+
+class Given(nn.Module):
+    """In the place of RANSAC: a pose that is given."""
+
+    def __init__(self, rotation: Tensor, translation: Tensor) -> None:
+        super().__init__()
+        self.pose = rotation, translation, stats(len(rotation))
+
+    def forward(self, *_: Any) -> tuple[Tensor, Tensor, SolveStats]:
+        return self.pose
+
+
+def solved(scene: Planted, start: tuple[Tensor, Tensor], cost: Tensor, rounds: int) -> Prediction:
+    """The pose stage's answer to an assignment of this cost, when RANSAC finds `start`."""
+    batch = scene.batch()
+    stage = PoseStage(refine=False).eval()
+    stage.ransac = Given(*start)  # type: ignore[assignment]
+
+    def rematch(pose: Pose, *, width: float) -> Prediction:
+        return Prediction(*sinkhorn(cost_under_pose(cost, batch, pose, width=width, mu=MU), mu=MU, tolerance=1e-12))
+
+    again = [partial(rematch, width=width) for width in widths(rounds, 0.003)]
+    return stage(Prediction(*sinkhorn(cost, mu=MU)), batch, again)
+
+
+def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
+    """The features tell nothing: every pair costs the same."""
+    scene = plant(4, 150, noise=0.002, seed=3)
+    cost = torch.ones(4, 150, 150, dtype=torch.float64)
+    errors, masses = [], []
+    for rounds in (0, 8):
+        prediction = solved(scene, scene.near(0.03), cost, rounds)
+        errors.append(rotation_error(prediction.poses["pnp"].rotation, scene.rotation))
+        masses.append((prediction.assignment * (scene.permutation() > 0)).sum((1, 2)))
+    assert errors[0].min() > 5
+    assert errors[1].max() < 0.3
+    assert masses[0].max() < 0.01
+    assert masses[1].min() > 0.7
+
+
+def test_the_cost_is_a_gaussian_of_the_angle_with_a_floor() -> None:
+    scene = plant(2, 5, noise=0.05, seed=1)
+    batch, cost = scene.batch(), torch.rand(2, 5, 5, dtype=torch.float64)
+    rotation, translation = scene.near(0.1)
+    rotation[1] = torch.nan
+    found = cost_under_pose(cost, batch, Pose(rotation, translation, stats(2)), width=0.05, mu=MU)
+    torch.testing.assert_close(found[1], cost[1])
+    directions = nn.functional.normalize(transform(rotation, translation, scene.points3d), dim=-1)
+    for i in range(5):
+        for j in range(5):
+            chord = float((scene.bearings[0, i] - directions[0, j]).norm())
+            expected = FEATURES * cost[0, i, j] + MU * min(chord**2 / (2 * 0.05**2), LIMIT)
+            assert float(found[0, i, j]) == pytest.approx(float(expected), rel=1e-9)
+
+
+def test_widths_fall_to_the_last() -> None:
+    assert widths(3, 0.01) == pytest.approx([0.05, 0.05 / 5**0.5, 0.01])
+    assert widths(0, 0.01) == []
+    with pytest.raises(ValueError, match="expected a number of `rounds`, got -1"):
+        BPnPNet(rounds=-1)
+
+
+def test_the_pose_of_a_round_is_differentiable_in_the_cost() -> None:
+    scene = plant(1, 7, noise=0.01, seed=2)
+    cost = torch.rand(1, 7, 7, dtype=torch.float64, requires_grad=True)
+
+    def pose(cost: Tensor) -> tuple[Tensor, Tensor]:
+        found = solved(scene, scene.near(0.02), cost, 1).poses["pnp"]
+        return found.rotation, found.translation
+
+    assert torch.autograd.gradcheck(pose, (cost,), atol=1e-6, rtol=1e-3)
+
+
+def test_a_pair_depends_neither_on_its_batch_nor_on_padding_and_training_has_no_rounds() -> None:
+    torch.manual_seed(0)
+    net = BPnPNet(channels=16, blocks=2, rounds=3, threshold=0.05, refine=False).double().eval()
+    scenes = [plant(1, n, outliers2d=n // 3, seed=n) for n in (12, 20, 15)]
+    joint = net(padded(scenes)).assignment
+    for i, scene in enumerate(scenes):
+        alone = net(padded([scene])).assignment[0]
+        torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-4, atol=1e-9)
+        assert (net(padded([scene]), poses=False).assignment[0] - alone).abs().max() > 1e-4
+    net.train()
+    torch.testing.assert_close(net(padded(scenes)).assignment, net(padded(scenes), poses=False).assignment)

@@ -1,0 +1,221 @@
+from collections.abc import Callable
+
+import pytest
+import torch
+from lightning import LightningModule, Trainer
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from bpnp.models.bpnpnet import BPnPNet
+from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
+from bpnp.models.nets.normalisation import MaskedBatchNorm, context_norm
+from bpnp.training.callbacks import CompileNets
+
+SIZES = (9, 1, 14)
+
+
+def sets(channels: int, *, garbage: float = 50.0) -> tuple[list[Tensor], Tensor, Tensor]:
+    """Sets of different sizes, the same padded with garbage, and the mask."""
+    single = [torch.randn(size, channels) for size in SIZES]
+    padded = garbage * torch.randn(len(SIZES), max(SIZES), channels)
+    mask = torch.arange(max(SIZES)) < torch.tensor(SIZES).unsqueeze(-1)
+    for i, points in enumerate(single):
+        padded[i, : len(points)] = points
+    return single, padded, mask
+
+
+def plain_context_norm(x: Tensor) -> Tensor:
+    deviation = x - x.mean(0)
+    variance = (deviation**2).sum(0) / max(len(x) - 1, 1)
+    return deviation / (variance + 1e-3).sqrt()
+
+
+def randomise(module: nn.Module) -> nn.Module:
+    """Batch norms as after some training: no statistic or factor at its neutral start."""
+    for norm in module.modules():
+        if isinstance(norm, nn.BatchNorm1d):
+            nn.init.uniform_(norm.weight, 0.5, 2)
+            nn.init.normal_(norm.bias)
+            nn.init.normal_(norm.running_mean)
+            nn.init.uniform_(norm.running_var, 0.5, 2)
+    return module
+
+
+def test_context_norm_uses_the_unbiased_variance_and_its_epsilon() -> None:
+    single, padded, mask = sets(5)
+    normed = context_norm(padded, mask)
+    for i, points in enumerate(single):
+        torch.testing.assert_close(normed[i, : len(points)], plain_context_norm(points))
+    assert not normed[~mask].any()
+    x = torch.tensor([[[1.0], [3.0]]])
+    torch.testing.assert_close(context_norm(x, torch.ones(1, 2).bool()).flatten().abs(), torch.full((2,), 2.001**-0.5))
+
+
+def test_a_block_is_the_released_block() -> None:
+    block = ResidualBlock(6, batch_norm=False)
+    single, padded, mask = sets(6)
+    out = block(padded, mask)
+    for i, x in enumerate(single):
+        z = F.conv1d(x.T[None], block.linear_a.weight[..., None], block.linear_a.bias)
+        z = F.conv1d(z, block.linear_b.weight[..., None], block.linear_b.bias)[0].T
+        z = F.linear(plain_context_norm(z), block.linear_c.weight, block.linear_c.bias)
+        torch.testing.assert_close(out[i, : len(x)], x + F.relu(plain_context_norm(z)))
+
+
+@pytest.mark.parametrize("centre", [True, False])
+def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
+    net = PointFeatures(2, channels=8, blocks=3, centre=centre)
+    single, padded, mask = sets(2)
+    features = net(padded, mask)
+    for i, x in enumerate(single):
+        z = net.enter(x)
+        for block in net.blocks:
+            z = block(z[None], torch.ones(1, len(x)).bool())[0]
+        z = z - z.mean(0) if centre else z
+        torch.testing.assert_close(features[i, : len(x)], z / z.norm(dim=-1, keepdim=True).clamp_min(1e-12))
+
+
+def build(kind: str) -> tuple[nn.Module, int]:
+    if kind == "transform":
+        return InputTransform(), 3
+    return PointFeatures(3, channels=16, blocks=4, batch_norm=kind == "batch norm", centre=kind == "centre"), 3
+
+
+@pytest.mark.parametrize("kind", ["plain", "batch norm", "centre", "transform"])
+def test_padding_and_neighbours_change_nothing(kind: str) -> None:
+    net, channels = build(kind)
+    randomise(net).eval()
+    single, padded, mask = sets(channels)
+    with torch.no_grad():
+        together = net(padded, mask)
+        for i, x in enumerate(single):
+            alone = net(x[None], torch.ones(1, len(x)).bool())[0]
+            assert (together[i, : len(x)] - alone).abs().max() < 5e-6 * max(1.0, float(alone.abs().max()))
+
+
+@pytest.mark.parametrize("kind", ["plain", "batch norm", "transform"])
+def test_padding_changes_no_gradient_in_training(kind: str) -> None:
+    net, channels = build(kind)
+    net.double()
+    _, padded, mask = sets(channels)
+    padded = padded.double()
+    weights = torch.randn(*mask.shape, 16 if kind != "transform" else 3, dtype=torch.float64)
+
+    def gradients(points: Tensor) -> list[Tensor]:
+        net.zero_grad()
+        (net(points, mask) * weights)[mask].sum().backward()
+        return [p.grad.clone() for p in net.parameters() if p.grad is not None]
+
+    for a, b in zip(gradients(padded), gradients(padded * mask.unsqueeze(-1)), strict=True):
+        assert a.isfinite().all()
+        assert (a - b).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("kind", ["plain", "centre", "transform"])
+def test_points_in_another_order_give_features_in_that_order(kind: str) -> None:
+    net, channels = build(kind)
+    randomise(net).eval()
+    x, mask = torch.randn(2, 20, channels), torch.ones(2, 20).bool()
+    order = torch.randperm(20)
+    with torch.no_grad():
+        torch.testing.assert_close(net(x[:, order], mask), net(x, mask)[:, order], atol=1e-5, rtol=0)
+
+
+def test_batch_norm_is_torchs_on_the_real_points() -> None:
+    ours, theirs = MaskedBatchNorm(5), nn.BatchNorm1d(5)
+    theirs.load_state_dict(ours.state_dict())
+    for _ in range(4):
+        single, padded, mask = sets(5)
+        out, expected = ours(padded, mask), theirs(torch.cat(single))
+        torch.testing.assert_close(out[mask], expected)
+    for name, value in theirs.state_dict().items():
+        torch.testing.assert_close(ours.state_dict()[name], value)
+    ours.eval()
+    theirs.eval()
+    torch.testing.assert_close(ours(padded, mask)[mask], theirs(torch.cat(single)))
+
+
+def test_batch_norm_of_vectors_is_torchs_and_one_sample_uses_the_running_statistics() -> None:
+    ours, theirs = MaskedBatchNorm(5), nn.BatchNorm1d(5)
+    x = torch.randn(6, 5)
+    torch.testing.assert_close(ours(x), theirs(x))
+    state = {k: v.clone() for k, v in ours.state_dict().items()}
+    one = torch.randn(1, 5, requires_grad=True)
+    out = ours(one)
+    torch.testing.assert_close(out, theirs.eval()(one))
+    assert torch.equal(ours.running_mean, state["running_mean"])
+    assert torch.equal(ours.running_var, state["running_var"])
+    out.sum().backward()
+    assert one.grad is not None
+    assert one.grad.isfinite().all()
+
+
+def test_batch_norm_has_torchs_gradients() -> None:
+    ours, theirs = MaskedBatchNorm(4), nn.BatchNorm1d(4)
+    single, padded, mask = sets(4)
+    weights = torch.randn(sum(SIZES), 4)
+    a, b = padded.requires_grad_(), torch.cat(single).requires_grad_()
+    (ours(a, mask)[mask] * weights).sum().backward()
+    (theirs(b) * weights).sum().backward()
+    assert a.grad is not None
+    assert not a.grad[~mask].any()
+    torch.testing.assert_close(a.grad[mask], b.grad)
+
+
+def test_the_input_transform_is_pointnets() -> None:
+    net = randomise(InputTransform()).eval()
+    single, padded, mask = sets(3)
+    moved = net(padded, mask)
+
+    def norm(i: int) -> Callable[[Tensor], Tensor]:
+        n = net.norms[i]
+        return lambda z: F.batch_norm(z, n.running_mean, n.running_var, n.weight, n.bias)
+
+    for i, x in enumerate(single):
+        z = x
+        for k in range(3):
+            z = F.relu(norm(k)(net.linears[k](z)))
+        z = z.max(0, keepdim=True).values
+        for k in (3, 4):
+            z = F.relu(norm(k)(net.linears[k](z)))
+        torch.testing.assert_close(moved[i, : len(x)], x @ (torch.eye(3) + net.out(z).view(3, 3)))
+
+
+def test_normalised_scenes_forget_their_unit_and_origin() -> None:
+    single, padded, mask = sets(3)
+    normalised = normalise_points3d(padded, mask)
+    for i, x in enumerate(single):
+        y = normalised[i, : len(x)]
+        assert y.mean(0).abs().max() < 1e-6
+        assert abs(float((y**2).sum(-1).mean().sqrt()) - (len(x) > 1)) < 1e-6
+    assert not normalised[~mask].any()
+    moved = normalise_points3d(250 * padded + torch.tensor([30.0, -20, 10]), mask)
+    torch.testing.assert_close(moved, normalised, atol=2e-5, rtol=0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
+def test_the_context_norm_has_the_gradient_of_its_formula(dtype: torch.dtype) -> None:
+    _, x, mask = sets(5, garbage=3.0)
+    x, weight = x.double(), torch.randn(x.shape, dtype=torch.float64)
+    if dtype == torch.float64:
+        assert torch.autograd.gradcheck(lambda x: context_norm(x, mask), x.requires_grad_())
+        return
+    gradients = []
+    for value in (x.requires_grad_(), x.detach().to(dtype).requires_grad_()):
+        out = context_norm(value, mask)
+        assert out.dtype == value.dtype
+        gradients.append(torch.autograd.grad((out.double() * weight).sum(), value)[0].double())
+    assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()  # 8 bits
+
+
+def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
+    compiled = []
+    monkeypatch.setattr(nn.Module, "compile", lambda net, backend: compiled.append((net, backend)))
+    task = LightningModule()
+    task.solver = net = BPnPNet(channels=8, blocks=2)
+    trainer = Trainer(accelerator="cpu", barebones=True)
+    CompileNets(backend="eager").on_fit_start(trainer, task)
+    assert [part is net.features2d or part is net.features3d or part is net.align for part, _ in compiled] == [True] * 3
+    assert {backend for _, backend in compiled} == {"eager"}
+    with pytest.raises(ValueError, match="expected nets of BPnPNet, got"):
+        CompileNets(["features4d"]).on_fit_start(trainer, task)

@@ -1,0 +1,137 @@
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from planted import padded, plant
+from torch import Tensor
+
+from bpnp import Batch, BPnPNet
+from bpnp.models import Matcher, load_network
+from bpnp.models.matcher import robust_frame
+from bpnp.models.nets.attention import Attention, Neighbourhood
+from bpnp.training.losses import matching_likelihood_loss
+
+
+def small(seed: int = 0) -> Matcher:
+    torch.manual_seed(seed)
+    return Matcher(channels=16, blocks=2, heads=2, neighbours=3).double().eval()
+
+
+def cluttered(*sizes: int) -> Batch:
+    """Pairs with a third of clutter on each side, padded to the largest."""
+    return padded([plant(1, n, outliers2d=n // 3, outliers3d=n // 3 + 1, seed=n) for n in sizes])
+
+
+def plan(net: Matcher, batch: Batch) -> Tensor:
+    transported, stats = net.transport(batch)
+    assert stats.converged.all()
+    return transported.detach()
+
+
+def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
+    batch = cluttered(9, 21)
+    prediction = small()(batch, poses=False)
+    total = (batch.count2d + batch.count3d).unsqueeze(-1).double()
+    torch.testing.assert_close(prediction.assignment.sum(2) + prediction.unmatched2d, batch.mask2d / total)
+    torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
+
+
+def test_a_pair_depends_neither_on_its_batch_nor_on_padding() -> None:
+    net, batch = small(), cluttered(9, 21, 14)
+    joint = net(batch, poses=False).assignment
+    for i, size in enumerate((9, 21, 14)):
+        alone = net(cluttered(size), poses=False).assignment[0]
+        torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-8, atol=1e-14)
+        assert not joint[i, alone.shape[0] :].any()
+        assert not joint[i, :, alone.shape[1] :].any()
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    net, batch = small(), cluttered(12)
+    order2d, order3d = torch.randperm(batch.points2d.shape[1]), torch.randperm(batch.points3d.shape[1])
+    shuffled = replace(batch, points2d=batch.points2d[:, order2d], points3d=batch.points3d[:, order3d])
+    ours, theirs = plan(net, batch)[:, :-1, :-1], plan(net, shuffled)[:, :-1, :-1]
+    torch.testing.assert_close(theirs, ours[:, order2d][:, :, order3d], rtol=1e-8, atol=1e-14)
+
+
+def test_unit_and_origin_of_the_scene_do_not_matter() -> None:
+    net, batch = small(), cluttered(12)
+    moved = replace(batch, points3d=40 * batch.points3d + torch.tensor([100.0, -7.0, 3.0]))
+    torch.testing.assert_close(plan(net, moved), plan(net, batch), rtol=1e-6, atol=1e-12)
+
+
+def test_each_side_hears_of_the_other() -> None:
+    """What BPnPNet's features cannot do: the features of the image change with the scene."""
+    net, batch = small(), cluttered(12)
+    other = replace(batch, points3d=batch.points3d.flip(-1) ** 3)
+    assert (net.features(other)[0] - net.features(batch)[0]).abs().max() > 1e-3
+
+
+def test_half_of_the_points_may_lie_anywhere_without_moving_the_frame() -> None:
+    batch = cluttered(30)
+    far = batch.points3d.clone()
+    far[:, ::3] = 1e6
+    before, after = (robust_frame(points, batch.mask3d) for points in (batch.points3d, far))
+    spread = batch.points3d.std()
+    assert (after.centre - before.centre).abs().max() < 2 * spread
+    assert float(after.radius / before.radius) < 4
+
+
+def test_neighbourhoods_look_alike_at_every_scale_and_ignore_padding() -> None:
+    torch.manual_seed(0)
+    layer, points = Neighbourhood(3, 8, neighbours=4).double(), torch.randn(1, 20, 3, dtype=torch.float64)
+    mask = torch.ones(1, 20, dtype=torch.bool)
+    plain = layer(points, mask)
+    torch.testing.assert_close(layer(1e3 * points, mask), plain)
+    padded = torch.cat([points, torch.zeros(1, 5, 3)], 1)
+    torch.testing.assert_close(layer(padded, torch.arange(25)[None] < 20)[:, :20], plain)
+
+
+def test_neighbourhood_of_few_points() -> None:
+    layer = Neighbourhood(2, 8, neighbours=4)
+    for count in (1, 2, 3):
+        points = torch.rand(1, count, 2)
+        assert layer(points, torch.ones(1, count, dtype=torch.bool)).isfinite().all()
+
+
+def test_learns_the_partners_and_the_clutter_of_one_pair() -> None:
+    torch.manual_seed(0)
+    batch = plant(1, 12, outliers2d=4, outliers3d=4, seed=3, dtype=torch.float32).batch()
+    net = Matcher(channels=32, blocks=2, heads=2)
+    optimiser = torch.optim.Adam(net.parameters(), lr=3e-3)
+    for _ in range(120):
+        loss = matching_likelihood_loss(net(batch, poses=False), batch).mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    prediction = net.eval()(batch)
+    paired = batch.match3d[0] >= 0
+    assert (prediction.assignment[0].argmax(0)[paired] == batch.match3d[0][paired]).all()
+    total = batch.points2d.shape[1] + batch.points3d.shape[1]
+    unmatched = prediction.unmatched3d[0] * total
+    assert unmatched[~paired].min() > 0.8
+    assert unmatched[paired].max() < 0.2
+    cosine = (torch.einsum("bij,bij->b", prediction.poses["refined"].rotation, batch.rotation) - 1) / 2
+    assert float(cosine) > 0.9999
+
+
+def test_says_what_is_wrong_with_its_options() -> None:
+    with pytest.raises(ValueError, match=r"expected `channels` a multiple of `heads`, got 30 and 4"):
+        Attention(30, 4)
+    with pytest.raises(ValueError, match=r"expected `mu` > 0, got 0"):
+        Matcher(mu=0.0)
+
+
+def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -> None:
+    net, batch = small().float(), cluttered(9).to(torch.float32)
+    for name, solver in (("matcher", net), ("other", BPnPNet(channels=8, blocks=1))):
+        saved = {"class": type(solver).__name__, "settings": solver.settings}
+        state = {f"solver.{key}": value for key, value in solver.state_dict().items()}
+        torch.save({"solver": saved, "state_dict": state}, tmp_path / f"{name}.ckpt")
+    expected = net(batch, poses=False).assignment
+    for again in (Matcher.from_checkpoint(tmp_path / "matcher.ckpt"), load_network(tmp_path / "matcher.ckpt")):
+        torch.testing.assert_close(again(batch, poses=False).assignment, expected)
+    assert isinstance(load_network(tmp_path / "other.ckpt"), BPnPNet)
+    with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
+        Matcher.from_checkpoint(tmp_path / "other.ckpt")

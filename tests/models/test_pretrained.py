@@ -1,0 +1,148 @@
+"""The packaged weights: found by name, offline, and good on shapes that they were not trained on."""
+
+import tomllib
+from dataclasses import replace
+from fnmatch import fnmatch
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bpnp import Batch, BPnPNet, Matcher, solve
+from bpnp.datamodules import MeshDataModule
+from bpnp.datamodules.outliers import Outliers
+from bpnp.metrics import rotation_error
+from bpnp.models.pretrained import LEARNED, pack, pretrained_names, pretrained_path
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """Views of test shapes from every side, scaled by 7 and moved: the units of a scene are its own."""
+    data = MeshDataModule(
+        rotation="so3",
+        num_points=64,
+        pool_size=64,
+        test_shapes=24,
+        batch_size=24,
+        cache_dir=str(tmp_path_factory.mktemp("c")),
+    )
+    data.setup("test")
+    return next(iter(data.test_dataloader()))
+
+
+def test_every_packaged_file_is_in_the_wheel() -> None:
+    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["bpnp"]
+    files = sorted((ROOT / "bpnp" / "weights").iterdir())
+    assert f"{LEARNED}.ckpt" in [file.name for file in files]
+    for file in files:
+        assert any(fnmatch(f"weights/{file.name}", pattern) for pattern in patterns), file
+        assert file.stat().st_size < 8e6
+    assert LEARNED in pretrained_names()
+    assert pretrained_path(LEARNED).is_file()
+
+
+def test_an_unknown_name_is_refused_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match="expected the name of packaged weights, got '../x'; try .*procedural-so3"):
+        BPnPNet.from_pretrained("../x")
+
+
+def medians(name: str, batch: Batch) -> dict[str, float]:
+    """Rotation error of each estimate; chance is beyond 90 degrees."""
+    assert batch.rotation is not None
+    net = BPnPNet.from_pretrained(name)
+    assert not net.training
+    with torch.no_grad():
+        poses = net(batch).poses
+    return {key: float(rotation_error(pose.rotation, batch.rotation).median()) for key, pose in poses.items()}
+
+
+def test_the_weights_find_unseen_shapes_from_every_side(unseen: Batch) -> None:
+    found = medians(LEARNED, unseen)
+    assert found["ransac"] < 3
+    assert found["pnp"] < 1
+    assert found["refined"] < 1
+
+
+def test_the_weights_for_the_papers_rotations_find_unseen_shapes(tmp_path: Path) -> None:
+    data = MeshDataModule(num_points=256, pool_size=512, test_shapes=16, batch_size=16, cache_dir=str(tmp_path))
+    data.setup("test")
+    found = medians("procedural-euler", next(iter(data.test_dataloader())))
+    assert found["ransac"] < 2
+    assert found["pnp"] < 0.5
+    assert found["refined"] < 0.5
+
+
+def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -> None:
+    assert unseen.rotation is not None
+    x, p = unseen.points2d[0], 7 * unseen.points3d[0] + torch.tensor([5.0, -3.0, 1.0])
+    solution = solve(x, p, prior="learned")
+    of_net = solve(x, p, prior=BPnPNet.from_pretrained(LEARNED))
+    np.testing.assert_array_equal(solution.rotation, of_net.rotation)
+    assert solution.verdict == "confident"
+    relative = torch.as_tensor(solution.rotation)[None]
+    assert float(rotation_error(relative, unseen.rotation[:1].double())) < 1
+
+
+@pytest.fixture(scope="module")
+def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """Views of test shapes as in the paper, with half as many outliers as pairs on each side; any scale and origin."""
+    data = MeshDataModule(
+        num_points=64,
+        pool_size=64,
+        test_shapes=16,
+        test_outliers=Outliers(ratio=0.5),
+        batch_size=16,
+        cache_dir=str(tmp_path_factory.mktemp("c")),
+    )
+    data.setup("test")
+    batch: Batch = next(iter(data.test_dataloader()))
+    return batch
+
+
+def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
+    """The most probable partner of a paired point is the true one or a near one; of 96, chance is in the middle."""
+    assert cluttered.rotation is not None
+    net = Matcher.from_pretrained("matcher-clutter")
+    moved = replace(cluttered, points3d=7 * cluttered.points3d + torch.tensor([5.0, -3.0, 1.0]))
+    with torch.no_grad():
+        prediction = net(moved)
+    partner = cluttered.match3d.clamp_min(0)
+    true = prediction.assignment.gather(1, partner.unsqueeze(1))
+    rank = (prediction.assignment > true).sum(1)[cluttered.match3d >= 0]
+    assert float(rank.float().median()) <= 1
+    alone, paired = ((cluttered.match3d < 0) & cluttered.mask3d), cluttered.match3d >= 0
+    assert prediction.unmatched3d[alone].median() > 1.3 * prediction.unmatched3d[paired].median()
+    assert float(rotation_error(prediction.poses["ransac"].rotation, cluttered.rotation).median()) < 5
+    assert float(rotation_error(prediction.poses["refined"].rotation, cluttered.rotation).median()) < 1.5
+
+
+def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
+    assert cluttered.rotation is not None
+    points = cluttered.points2d[0], cluttered.points3d[0]
+    for way in ({"prior": Matcher.from_pretrained("matcher-clutter")}, {"solver": pretrained_path("matcher-clutter")}):
+        relative = torch.as_tensor(solve(*points, **way).rotation)[None]
+        assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
+
+
+def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) -> None:
+    net = BPnPNet(channels=16, blocks=2, normalise_scene=True).eval()
+    content = {
+        "solver": {"class": "BPnPNet", "settings": net.settings},
+        "state_dict": {f"solver.{key}": value for key, value in net.state_dict().items()} | {"skipped": torch.zeros(2)},
+        "optimizer_states": [torch.zeros(1000)],
+    }
+    torch.save(content, tmp_path / "whole.ckpt")
+    pack(tmp_path / "whole.ckpt", tmp_path / "out" / "packed.ckpt")
+    assert set(torch.load(tmp_path / "out" / "packed.ckpt", weights_only=True)) == {"solver", "state_dict"}
+    assert (tmp_path / "out" / "packed.ckpt").stat().st_size < 0.6 * (tmp_path / "whole.ckpt").stat().st_size
+    packed = BPnPNet.from_checkpoint(tmp_path / "out" / "packed.ckpt")
+    with torch.no_grad():
+        np.testing.assert_allclose(packed.cost(unseen), net.cost(unseen), atol=5e-3)
+    content["state_dict"]["solver.features2d.enter.bias"] = torch.full((16,), 1e6)
+    torch.save(content, tmp_path / "large.ckpt")
+    with pytest.raises(ValueError, match="within float16's range, got others in solver.features2d.enter.bias"):
+        pack(tmp_path / "large.ckpt", tmp_path / "large_packed.ckpt")
+    assert not (tmp_path / "large_packed.ckpt").exists()

@@ -1,0 +1,233 @@
+"""The authors' weights: a plain network written from the formulas, with their names, gives the same numbers."""
+
+import datetime
+import os
+from collections import OrderedDict
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+from torch import Tensor, nn
+
+from bpnp import Batch, BPnPNet
+from bpnp.commands import convert_weights
+from bpnp.datamodules import MeshDataModule
+from bpnp.models.released import load_released, tensor_maps
+from bpnp.training.task import BlindPnPTask
+
+
+def unit(layer: nn.Module) -> nn.Sequential:
+    return nn.Sequential(layer)
+
+
+class Block(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.preconv, self.conv1, self.conv2 = (unit(nn.Conv1d(128, 128, 1)) for _ in range(3))
+
+    def forward(self, x: Tensor) -> Tensor:
+        def context_norm(z: Tensor) -> Tensor:
+            return (z - z.mean(-1, keepdim=True)) / torch.sqrt(z.var(-1, keepdim=True) + 1e-3)
+
+        z = context_norm(self.conv1(self.preconv(x)))
+        return x + torch.relu(context_norm(self.conv2(z)))
+
+
+class Extractor(nn.Module):
+    def __init__(self, coordinates: int) -> None:
+        super().__init__()
+        self.conv_in = unit(nn.Conv1d(coordinates, 128, 1))
+        for k in range(12):
+            self.add_module(f"conv_{k}", Block())
+
+    def forward(self, x: Tensor) -> Tensor:
+        z = self.conv_in(x)
+        for k in range(12):
+            z = getattr(self, f"conv_{k}")(z)
+        return nn.functional.normalize(z, dim=1)
+
+
+class Transform(nn.Module):
+    def __init__(self) -> None:
+        super().__init__()
+        self.conv1, self.conv2, self.conv3 = nn.Conv1d(3, 64, 1), nn.Conv1d(64, 128, 1), nn.Conv1d(128, 1024, 1)
+        self.fc1, self.fc2, self.fc3 = nn.Linear(1024, 512), nn.Linear(512, 256), nn.Linear(256, 9)
+        for i, width in enumerate((64, 128, 1024, 512, 256)):
+            self.add_module(f"bn{i + 1}", nn.BatchNorm1d(width))
+
+    def forward(self, x: Tensor) -> Tensor:
+        z = torch.relu(self.bn1(self.conv1(x)))
+        z = torch.relu(self.bn2(self.conv2(z)))
+        z = torch.relu(self.bn3(self.conv3(z))).amax(-1)
+        z = torch.relu(self.bn4(self.fc1(z)))
+        z = torch.relu(self.bn5(self.fc2(z)))
+        return self.fc3(z).view(-1, 3, 3) + torch.eye(3, dtype=x.dtype)
+
+
+class Released(nn.Module):
+    """One pair at a time: points (1, k, d) in, pairwise feature distances (1, m, n) out."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.stn, self.FeatureExtractor2d, self.FeatureExtractor3d = Transform(), Extractor(2), Extractor(3)
+
+    def forward(self, points2d: Tensor, points3d: Tensor) -> Tensor:
+        turned = torch.bmm(points3d, self.stn(points3d.mT))
+        z2d, z3d = self.FeatureExtractor2d(points2d.mT), self.FeatureExtractor3d(turned.mT)
+        return (z2d.mT[:, :, None] - z3d.mT[:, None]).norm(dim=-1)
+
+
+@pytest.fixture(scope="module")
+def reference() -> Released:
+    torch.manual_seed(5)
+    net = Released()
+    for module in net.modules():
+        if isinstance(module, nn.BatchNorm1d):
+            module.running_mean.normal_(0, 0.3)
+            module.running_var.uniform_(0.3, 2)
+            nn.init.uniform_(module.weight, 0.5, 1.5)
+            nn.init.normal_(module.bias, 0, 0.2)
+            module.num_batches_tracked += 1234
+    return net.eval()
+
+
+def checkpoint(net: nn.Module, **changes: object) -> dict[str, object]:
+    optimizer = torch.optim.Adam(net.parameters(), lr=1e-3)
+    sum(p.sum() for p in net.parameters()).backward()
+    optimizer.step()
+    return {"epoch": 90, "state_dict": net.state_dict(), "best_error": np.float64(0.25)} | {
+        "optimizer": optimizer.state_dict()
+    } | changes  # fmt: skip
+
+
+def plan(cost: Tensor, mu: float = 0.1, rounds: int = 3000) -> Tensor:
+    """Sinkhorn's scaling, not in the log domain, uniform marginals."""
+    kernel = torch.exp(-cost / mu)
+    m, n = cost.shape[-2:]
+    u = cost.new_ones(m)
+    for _ in range(rounds):
+        v = (1 / n) / (kernel.mT @ u)
+        u = (1 / m) / (kernel @ v)
+    return u[:, None] * kernel * v
+
+
+def pairs() -> list[tuple[Tensor, Tensor]]:
+    return [(torch.rand(m, 2) - 0.5, torch.randn(n, 3)) for m, n in ((40, 40), (25, 61), (64, 12))]
+
+
+def test_counts_are_those_of_the_paper_code(reference: Released) -> None:
+    state = reference.state_dict()
+    assert {key: tuple(value.shape) for key, value in state.items()} == {k: m.shape for k, m in tensor_maps().items()}
+    assert len(state) == 185
+    assert sum(p.numel() for p in reference.parameters()) == 1_992_841
+    assert sum(p.numel() for p in BPnPNet().parameters()) == 1_992_841
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: bool) -> None:
+    file = tmp_path / "ModelNet40.pth.tar"
+    torch.save(checkpoint(reference), file, _use_new_zipfile_serialization=zipped)
+    net = load_released(file).double()
+    reference = Released()
+    reference.load_state_dict(torch.load(file, weights_only=False)["state_dict"])
+    reference.double().eval()
+    sets = [(p2.double(), p3.double()) for p2, p3 in pairs()]
+    batch = Batch.from_arrays([p2 for p2, _ in sets], [p3 for _, p3 in sets])
+    cost, assignment = net.cost(batch), net(batch, poses=False).assignment
+    for i, (p2, p3) in enumerate(sets):
+        expected = reference(p2[None], p3[None])[0]
+        assert expected.std() > 0.02  # enough for the assignment to depend on it
+        torch.testing.assert_close(cost[i, : len(p2), : len(p3)], expected, rtol=0, atol=1e-9)
+        torch.testing.assert_close(assignment[i, : len(p2), : len(p3)], plan(expected), rtol=1e-4, atol=1e-8)
+
+
+def test_convert_weights_writes_our_checkpoint(reference: Released, tmp_path: Path) -> None:
+    file, out = tmp_path / "released.pth.tar", tmp_path / "sub" / "out.ckpt"
+    torch.save(checkpoint(reference), file)
+    convert_weights([str(file), str(out)])
+    assert list(out.parent.iterdir()) == [out]
+    (p2, p3), net = pairs()[0], BPnPNet.from_checkpoint(out)
+    assert not net.training
+    torch.testing.assert_close(net.cost(Batch.from_arrays(p2, p3)), reference(p2[None], p3[None]), rtol=0, atol=2e-3)
+    data = MeshDataModule(num_points=16, pool_size=16, test_shapes=2, cache_dir=str(tmp_path))
+    task = BlindPnPTask()
+    trainer = Trainer(accelerator="cpu", logger=False, enable_progress_bar=False, default_root_dir=tmp_path)
+    trainer.test(task, data, ckpt_path=str(out), weights_only=True)
+    torch.testing.assert_close(task.solver.state_dict(), net.state_dict(), rtol=0, atol=0)
+
+
+def test_names_with_the_prefix_of_data_parallel(reference: Released, tmp_path: Path) -> None:
+    torch.save(checkpoint(nn.DataParallel(reference)), tmp_path / "x")
+    assert isinstance(load_released(tmp_path / "x"), BPnPNet)
+
+
+BIAS = "FeatureExtractor2d.conv_11.conv2.0.bias"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({BIAS: None}, f"no '{BIAS}'"),
+        ({"stn.fc4.bias": torch.zeros(3)}, "an unexpected 'stn.fc4.bias'"),
+        ({BIAS: torch.zeros(127)}, rf"'{BIAS}' of shape \(127,\), not \(128,\)"),
+        ({"stn.conv1.weight": torch.zeros(64, 3)}, r"'stn.conv1.weight' of shape \(64, 3\), not \(64, 3, 1\)"),
+        ({BIAS: 3.0}, f"'{BIAS}' as a float"),
+        ({BIAS: torch.full((128,), torch.nan)}, f"'{BIAS}' with NaN"),
+    ],
+)
+def test_a_wrong_tensor_is_named(
+    reference: Released, tmp_path: Path, change: dict[str, object], message: str
+) -> None:  # fmt: skip
+    state = {k: v for k, v in (reference.state_dict() | change).items() if v is not None}
+    torch.save({"state_dict": state}, tmp_path / "x.pth.tar")
+    with pytest.raises(ValueError, match=message):
+        load_released(tmp_path / "x.pth.tar")
+
+
+class Exploit:
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, ("touch hacked",)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_code_in_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, zipped: bool) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = tmp_path / "x.pth.tar"
+    torch.save({"state_dict": {}, "optimizer": Exploit()}, file, _use_new_zipfile_serialization=zipped)
+    with pytest.raises(ValueError, match=r"system in it .*x\.pth\.tar"):
+        load_released(file)
+    assert not Path("hacked").exists()
+
+
+def test_numpy_scalars_stay_refused_elsewhere(reference: Released, tmp_path: Path) -> None:
+    torch.save(checkpoint(reference), tmp_path / "x.pth.tar")
+    load_released(tmp_path / "x.pth.tar")
+    with pytest.raises(Exception, match="Unsupported"):
+        torch.load(tmp_path / "x.pth.tar", weights_only=True)
+
+
+def test_foreign_and_broken_files(reference: Released, tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    torch.save(checkpoint(reference), whole)
+    contents = {
+        "empty": b"",
+        "text": b"Not Found",
+        "html": b"<!DOCTYPE html><html></html>",
+        "truncated": whole.read_bytes()[:-5000],
+        "half": whole.read_bytes()[: whole.stat().st_size // 2],
+    }
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=f"got .*{name};"):
+            load_released(tmp_path / name)
+    for name, value in {"list": [1], "bare": OrderedDict(a=torch.zeros(1)), "date": {"state_dict": 1}}.items():
+        torch.save(value, tmp_path / name)
+        with pytest.raises(ValueError, match=f"state_dict.*{name}"):
+            load_released(tmp_path / name)
+    torch.save({"state_dict": {}, "when": datetime.date(2020, 7, 1)}, tmp_path / "object")
+    with pytest.raises(ValueError, match=r"datetime\.date in it"):
+        load_released(tmp_path / "object")
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        load_released(tmp_path / "nowhere")

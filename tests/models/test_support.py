@@ -1,0 +1,99 @@
+import math
+
+import pytest
+import torch
+from planted import plant
+
+from bpnp import Batch, Matcher, Pose, SolveStats
+from bpnp.models.pose_head import PoseStage
+from bpnp.models.support import ALONE, TRUST, WIDTH, log_support
+from bpnp.types import Prediction
+
+
+def masks(batch: Batch) -> dict[str, torch.Tensor]:
+    return {"mask2d": batch.mask2d, "mask3d": batch.mask3d}
+
+
+def test_is_the_sum_over_bearings_written_out() -> None:
+    planted = plant(1, 6, outliers2d=2, outliers3d=1)
+    plan = planted.diffuse(0.05)
+    found = log_support(plan, planted.bearings, planted.points3d, *planted.pose, **masks(planted.batch()))
+    rays = planted.bearings[0]
+    area = float(((rays - rays.mean(0)) ** 2).sum(1).mean()) * 2 * math.pi
+    total = 0.0
+    for i, ray in enumerate(rays):
+        inner = 0.0
+        for j, p in enumerate(planted.points3d[0]):
+            seen = planted.rotation[0] @ p + planted.translation[0]
+            chord = float((seen / seen.norm() - ray).norm())
+            given = TRUST * float(plan[0, i, j] / plan[0, i].sum()) + (1 - TRUST) / len(planted.points3d[0])
+            inner += given * area * math.exp(-(chord**2) / 2 / WIDTH**2) / (2 * math.pi * WIDTH**2)
+        total += math.log(ALONE + (1 - ALONE) * inner)
+    assert float(found[0]) == pytest.approx(total, rel=1e-7)
+
+
+def test_speaks_for_the_true_pose_and_against_a_wrong_one_whatever_the_padding() -> None:
+    planted = plant(3, 40, outliers2d=20, outliers3d=20)
+    plan, batch = planted.diffuse(0.03), planted.batch()
+    right = log_support(plan, planted.bearings, planted.points3d, *planted.pose, **masks(batch))
+    wrong = log_support(plan, planted.bearings, planted.points3d, *planted.near(2.0), **masks(batch))
+    assert (right > 0).all()
+    assert (wrong < 0).all()
+    pad = torch.nn.functional.pad
+    wide = log_support(
+        pad(plan, (0, 5, 0, 3)),
+        pad(planted.bearings, (0, 0, 0, 3)),
+        pad(planted.points3d, (0, 0, 0, 5)),
+        *planted.pose,
+        mask2d=pad(batch.mask2d, (0, 3)),
+        mask3d=pad(batch.mask3d, (0, 5)),
+    )
+    torch.testing.assert_close(wide, right)
+
+
+def test_there_is_none_without_a_pose() -> None:
+    planted = plant(2, 8)
+    rotation = planted.rotation.clone()
+    rotation[1] = torch.nan
+    found = log_support(
+        planted.permutation(), planted.bearings, planted.points3d, rotation, planted.translation,
+        **masks(planted.batch()),
+    )  # fmt: skip
+    assert found[0] > 0
+    assert found[1] == -math.inf
+
+
+def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Annealing is made to end at a wrong pose wherever it starts from proposals; the sure sample keeps its pose."""
+    planted = plant(2, 40, noise=1e-4)
+    stage, batch = PoseStage().eval(), planted.batch()
+    wrong, calls = planted.near(2.5), []
+
+    def annealed(rays: torch.Tensor, points3d: torch.Tensor, rotation: torch.Tensor, *rest: torch.Tensor) -> object:
+        calls.append(rotation.shape[1])
+        crowd = rotation.shape[1] > 2
+        ends = (torch.stack([planted.rotation[0], wrong[0][1]]), torch.stack([planted.translation[0], wrong[1][1]]))
+        turned, shifted = ends if crowd else planted.pose
+        missing = ~rotation.isfinite().all((-2, -1)).any(1)
+        turned = turned.masked_fill(missing[:, None, None], torch.nan)
+        shifted = shifted.masked_fill(missing[:, None], torch.nan)
+        return turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing)
+
+    monkeypatch.setattr(stage.refine, "forward", annealed)
+    refined: Pose = stage(Prediction(planted.permutation()), batch).poses["refined"]
+    assert calls[0] > 2
+    assert calls[1] == 2
+    torch.testing.assert_close(refined.rotation, planted.rotation)
+    torch.testing.assert_close(refined.translation, planted.translation)
+    assert refined.stats.iterations.tolist() == [1, 2]
+    assert refined.stats.converged.all()
+
+
+def test_the_choice_does_not_depend_on_the_batch() -> None:
+    torch.manual_seed(0)
+    net = Matcher(channels=16, blocks=1, heads=2).double().eval()
+    together = net(plant(3, 12, outliers3d=6).batch()).poses["refined"]
+    planted = plant(3, 12, outliers3d=6)
+    for i in range(3):
+        single = Batch.from_arrays(planted.points2d[i], planted.points3d[i])
+        torch.testing.assert_close(net(single).poses["refined"].rotation[0], together.rotation[i], equal_nan=True)

@@ -1,0 +1,227 @@
+from dataclasses import dataclass
+
+import numpy as np
+import poselib
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+
+from bpnp.geometry import rotation_angle
+from bpnp.robust.consensus import Consensus, consensus
+
+THRESHOLD = 0.01
+
+
+@dataclass(frozen=True)
+class Planted:
+    points2d: NDArray[np.float64]
+    points3d: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    true: NDArray[np.bool_]
+
+    def tensors(self, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor, Tensor]:
+        arrays = (self.points2d, self.points3d, self.weights)
+        x, p, w = (torch.as_tensor(a, dtype=dtype).unsqueeze(0) for a in arrays)
+        return x, p, w
+
+    def residuals(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance of each pair in the image plane, infinite behind the camera."""
+        camera = self.points3d @ rotation.T + translation
+        distance = np.linalg.norm(camera[:, :2] / camera[:, 2:] - self.points2d, axis=-1)
+        return np.where(camera[:, 2] > 0, distance, np.inf)
+
+
+def planted(seed: int, *, pairs: int = 600, inliers: float = 0.3, noise: float = 0.0025, lead: float = 2.0) -> Planted:
+    """Candidate pairs of 400 points: a share of true ones, the rest random, so that points repeat; weights favour the
+    true pairs by `lead`."""
+    rng = np.random.default_rng(seed)
+    points3d = rng.uniform(-1, 1, (400, 3))
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    translation = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(4, 6)])
+    camera = points3d @ rotation.T + translation
+    points2d = camera[:, :2] / camera[:, 2:] + rng.normal(0, noise, (400, 2))
+    true = np.arange(pairs) < round(inliers * pairs)
+    first = np.where(true, np.arange(pairs) % 400, rng.integers(0, 400, pairs))
+    second = np.where(true, first, (first + rng.integers(1, 400, pairs)) % 400)
+    order = rng.permutation(pairs)
+    weights = np.exp(rng.standard_normal(pairs) + lead * true)
+    return Planted(points2d[first[order]], points3d[second[order]], weights[order], rotation, translation, true[order])
+
+
+def degrees(result: Consensus, problem: Planted) -> float:
+    return float(torch.rad2deg(rotation_angle(result.rotation[0].double(), torch.as_tensor(problem.rotation))))
+
+
+def from_poselib(problem: Planted) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    camera = {"model": "SIMPLE_PINHOLE", "width": 1000, "height": 1000, "params": [1000.0, 0.0, 0.0]}
+    options = {"max_reproj_error": THRESHOLD * 1000}
+    pose, _ = poselib.estimate_absolute_pose(problem.points2d * 1000, problem.points3d, camera, options, {})
+    return pose.R, pose.t
+
+
+@pytest.mark.parametrize(("inliers", "lead"), [(0.1, 2.0), (0.3, 2.0), (0.6, 2.0), (0.3, 0.0), (0.6, 0.0)])
+def test_pose_and_score_are_poselibs(inliers: float, lead: float) -> None:
+    for seed in range(3):
+        problem = planted(seed, inliers=inliers, lead=lead)
+        result = consensus(*problem.tensors())
+        rotation, translation = from_poselib(problem)
+        score = np.minimum(problem.residuals(rotation, translation) ** 2, THRESHOLD**2).sum()
+        assert float(result.score[0]) < score * 1.005
+        assert rotation_angle(result.rotation[0], torch.as_tensor(rotation)) < np.deg2rad(0.2)
+        assert degrees(result, problem) < 1
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_exact_pairs_give_the_exact_pose(dtype: torch.dtype) -> None:
+    problem = planted(1, inliers=0.2, noise=0.0)
+    result = consensus(*problem.tensors(dtype), threshold=1e-4)
+    np.testing.assert_array_equal(result.inliers[0].numpy(), problem.true)
+    assert result.rotation.dtype == result.translation.dtype == result.score.dtype == dtype
+    atol = 1e-5 if dtype == torch.float32 else 1e-9
+    np.testing.assert_allclose(result.rotation[0].double(), problem.rotation, atol=atol)
+    np.testing.assert_allclose(result.translation[0].double(), problem.translation, atol=10 * atol)
+
+
+def test_score_and_inliers_follow_from_the_pose() -> None:
+    problem = planted(2)
+    result = consensus(*problem.tensors())
+    residuals = problem.residuals(result.rotation[0].numpy(), result.translation[0].numpy())
+    np.testing.assert_array_equal(result.inliers[0].numpy(), residuals < THRESHOLD)
+    np.testing.assert_allclose(float(result.score[0]), np.minimum(residuals**2, THRESHOLD**2).sum(), rtol=1e-9)
+    assert (result.inliers[0].numpy() & problem.true).sum() > 0.98 * problem.true.sum()
+
+
+def test_pose_is_the_cauchy_fit_to_its_inliers() -> None:
+    problem = planted(3)
+    result = consensus(*problem.tensors())
+    inliers, start = result.inliers[0].numpy(), result.rotation[0].numpy()
+    residuals = problem.residuals(start, result.translation[0].numpy())[inliers]
+    scale = 4 * np.median(residuals**2)
+
+    def error(parameters: NDArray[np.float64]) -> NDArray[np.float64]:
+        rotation = Rotation.from_rotvec(parameters[:3]).as_matrix() @ start
+        camera = problem.points3d[inliers] @ rotation.T + parameters[3:]
+        distance2 = ((camera[:, :2] / camera[:, 2:] - problem.points2d[inliers]) ** 2).sum(-1)
+        return np.sqrt(scale * np.log1p(distance2 / scale))
+
+    optimum = least_squares(error, np.r_[0, 0, 0, result.translation[0].numpy()], xtol=1e-15, ftol=1e-15, gtol=1e-15).x
+    # The scale comes from the pose before the fit, hence not to the last digit; the noise moves the pose by 1e-3.
+    np.testing.assert_allclose(optimum[:3], 0, atol=2e-5)
+    np.testing.assert_allclose(optimum[3:], result.translation[0].numpy(), atol=2e-4)
+
+
+def test_a_few_heavy_true_pairs_are_found_with_few_hypotheses() -> None:
+    for seed in range(5):
+        problem = planted(seed, pairs=1000, inliers=0.05, lead=4.0)
+        assert degrees(consensus(*problem.tensors(), hypotheses=128), problem) < 1
+
+
+def test_neighbours_padding_and_the_order_of_pairs_do_not_matter() -> None:
+    problems = [planted(seed, pairs=pairs) for seed, pairs in enumerate((600, 150, 900))]
+    alone = [consensus(*p.tensors()) for p in problems]
+    points2d, points3d, weights = torch.full((3, 1000, 2), 0.1), torch.ones(3, 1000, 3), torch.full((3, 1000), 9.0)
+    batch = [x.double() for x in (points2d, points3d, weights)]
+    mask = torch.zeros(3, 1000, dtype=torch.bool)
+    rng = np.random.default_rng(0)
+    places = [torch.as_tensor(rng.permutation(1000)[: len(p.weights)]) for p in problems]
+    for i, (problem, place) in enumerate(zip(problems, places, strict=True)):
+        mask[i, place] = True
+        for padded, values in zip(batch, problem.tensors(), strict=True):
+            padded[i, place] = values[0]
+    batch[0][~mask] = torch.nan
+    together = consensus(*batch, mask=mask)
+    assert not together.inliers[~mask].any()
+    for i, place in enumerate(places):
+        torch.testing.assert_close(together.rotation[i], alone[i].rotation[0], atol=1e-9, rtol=0)
+        torch.testing.assert_close(together.translation[i], alone[i].translation[0], atol=1e-8, rtol=0)
+        assert torch.equal(together.inliers[i, place], alone[i].inliers[0])
+
+
+def test_points_behind_the_camera_are_no_inliers() -> None:
+    problem = planted(4, inliers=0.6)
+    camera = problem.points3d @ problem.rotation.T + problem.translation
+    behind = problem.true & (np.arange(600) % 2 == 0)
+    camera[behind] *= -1
+    points3d = (camera - problem.translation) @ problem.rotation
+    x, _, w = problem.tensors()
+    result = consensus(x, torch.as_tensor(points3d).unsqueeze(0), w)
+    assert degrees(result, problem) < 1
+    assert not result.inliers[0].numpy()[behind].any()
+
+
+def test_georeferenced_scene() -> None:
+    problem = planted(5)
+    x, p, w = problem.tensors()
+    offset = torch.tensor([4e5, 5.4e6, 300.0], dtype=torch.float64)
+    moved, plain = consensus(x, 20 * p + offset, w), consensus(x, p, w)
+    torch.testing.assert_close(moved.rotation, plain.rotation, atol=1e-7, rtol=0)
+    torch.testing.assert_close(moved.translation + moved.rotation @ offset, 20 * plain.translation, atol=1e-5, rtol=0)
+
+
+UNSOLVABLE = {
+    "no usable pair": lambda x, p, mask: (x, p, torch.zeros_like(mask)),
+    "three pairs": lambda x, p, mask: (x, p, torch.arange(len(mask)) < 3),
+    "one pair many times": lambda x, p, mask: (x[:1].expand_as(x), p[:1].expand_as(p), mask),
+    "points on a line": lambda x, p, mask: (x, p[:, :1] * torch.ones(3, dtype=p.dtype), mask),
+    "nothing finite": lambda x, p, mask: (x * torch.nan, p, mask),
+    "random pairs, few": lambda x, p, mask: (x.flip(0), p, torch.arange(len(mask)) < 4),
+}
+
+
+@pytest.mark.parametrize("kind", UNSOLVABLE)
+def test_a_sample_without_a_pose_is_flagged_and_leaves_its_neighbours_alone(kind: str) -> None:
+    problem = planted(6, inliers=0.5)
+    x, p, w = (torch.cat([v, v]) for v in problem.tensors())
+    mask = torch.ones(2, 600, dtype=torch.bool)
+    x[1], p[1], mask[1] = UNSOLVABLE[kind](x[1].clone(), p[1].clone(), mask[1])
+    result = consensus(x, p, w, mask=mask)
+    assert result.found.tolist() == [True, False]
+    assert result.rotation[1].isnan().all()
+    assert result.translation[1].isnan().all()
+    assert not result.inliers[1].any()
+    assert result.score[1] == torch.inf
+    expected = consensus(*problem.tensors())
+    torch.testing.assert_close(result.rotation[0], expected.rotation[0], atol=1e-9, rtol=0)
+
+
+def test_same_seed_same_result_and_other_seeds_the_same_pose() -> None:
+    problem = planted(7)
+    first, again = consensus(*problem.tensors(), seed=3), consensus(*problem.tensors(), seed=3)
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a, b)
+    other = consensus(*problem.tensors(), seed=4)
+    assert rotation_angle(first.rotation[0], other.rotation[0]) < np.deg2rad(0.1)
+
+
+def test_neither_the_global_generator_nor_the_parts_nor_autocast_change_the_result() -> None:
+    problem = planted(8)
+    x, p, w = problem.tensors(torch.float32)
+    state = torch.random.get_rng_state()
+    expected = consensus(x, p, w)
+    assert torch.equal(torch.random.get_rng_state(), state)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        torch.testing.assert_close(consensus(x, p, w).rotation, expected.rotation, atol=1e-6, rtol=0)
+    torch.testing.assert_close(consensus(x, p, w, chunk=5000).rotation, expected.rotation, atol=1e-6, rtol=0)
+
+
+def test_no_gradient_and_no_step_that_reads_the_data() -> None:
+    x, p, w = planted(9).tensors()
+    assert not consensus(x.requires_grad_(), p, w.requires_grad_()).rotation.requires_grad
+    with FakeTensorMode():  # tensors without values: a read raises
+        assert consensus(torch.zeros(2, 50, 2), torch.zeros(2, 50, 3), torch.ones(2, 50)).rotation.shape == (2, 3, 3)
+
+
+def test_wrong_arguments_are_named() -> None:
+    x, p, w = planted(10).tensors()
+    with pytest.raises(ValueError, match=r"at least one, got \[\(1, 0\), \(1, 0\), \(1, 0\)"):
+        consensus(x[:, :0], p[:, :0], w[:, :0])
+    with pytest.raises(ValueError, match="expected a positive `threshold`, got -0.01"):
+        consensus(x, p, w, threshold=-0.01)
+    with pytest.raises(ValueError, match="expected a positive `hypotheses`, got 0"):
+        consensus(x, p, w, hypotheses=0)

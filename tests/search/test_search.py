@@ -1,0 +1,180 @@
+"""The training-free search and the refinement find planted poses, and say when they do not."""
+
+import numpy as np
+import pytest
+import roma
+import torch
+from planted import plant
+
+from bpnp.geometry import bearings
+from bpnp.metrics import rotation_error, translation_error
+from bpnp.models import Search
+from bpnp.search.many import search, search_candidates
+from bpnp.search.refine import refine
+from bpnp.search.starts import GravityPrior, PosePrior, super_fibonacci
+from bpnp.types import Batch
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return plant(3, 200, seed=4, noise=1e-4)
+
+
+def found(rotation, translation, problem, degrees):
+    error = rotation_error(rotation, problem.rotation)
+    shift = translation_error(translation, problem.translation)
+    assert (error < degrees).all(), f"rotation errors {error.tolist()}"
+    assert (shift < 0.05).all(), f"translation errors {shift.tolist()}"
+
+
+def test_search_finds_planted_poses(problem):
+    rotation, translation, stats = search(problem.bearings, problem.points3d)
+    found(rotation, translation, problem, 0.5)
+    assert stats.converged.all()
+    identity = torch.eye(3, dtype=rotation.dtype).expand_as(rotation)
+    torch.testing.assert_close(rotation @ rotation.mT, identity, atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("outliers", [60])
+def test_search_finds_poses_among_clutter(outliers):
+    problem = plant(2, 200, seed=5, noise=1e-4, outliers2d=outliers, outliers3d=outliers)
+    rotation, translation, _ = search(problem.bearings, problem.points3d)
+    found(rotation, translation, problem, 0.5)
+
+
+def test_units_and_origin_of_the_scene_do_not_matter(problem):
+    rotation, translation, _ = search(problem.bearings[:1].double(), 1000 * problem.points3d[:1].double() + 1e5)
+    moved = translation + (rotation @ torch.full((3, 1), 1e5).to(rotation)).squeeze(-1)
+    assert rotation_error(rotation, problem.rotation[:1]) < 0.5
+    assert (moved / 1000 - problem.translation[:1]).norm() < 0.05
+
+
+def test_neighbours_padding_and_batch_size_do_not_matter(problem):
+    padded = Batch.from_arrays(
+        [problem.points2d[0].numpy(), problem.points2d[1, :150].numpy()],
+        [problem.points3d[0].numpy(), problem.points3d[1, :150].numpy()],
+    )
+    together = search(bearings(padded.points2d), padded.points3d, mask2d=padded.mask2d, mask3d=padded.mask3d)
+    alone = search(problem.bearings[1:2, :150], problem.points3d[1:2, :150])
+    torch.testing.assert_close(together[0][1], alone[0][0], rtol=0, atol=0)
+    torch.testing.assert_close(together[1][1], alone[1][0], rtol=0, atol=0)
+
+
+def test_the_seed_decides(problem):
+    first, second = (search_candidates(problem.bearings[:1], problem.points3d[:1], seed=3) for _ in range(2))
+    for a, b in zip(first[:5], second[:5], strict=True):
+        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+
+
+def test_candidates_are_distinct_and_fall_in_score(problem):
+    candidates = search_candidates(problem.bearings[:1], problem.points3d[:1])
+    score = candidates.score[0][candidates.score[0].isfinite()]
+    assert (score.diff() <= 0).all()
+    rotation, translation = candidates.rotation[0][: len(score)], candidates.translation[0][: len(score)]
+    for i in range(len(score)):
+        for j in range(i):
+            apart = rotation_error(rotation[i : i + 1], rotation[j : j + 1]) > 2.9
+            assert apart or (translation[i] - translation[j]).norm() > 0.01
+
+
+@pytest.mark.parametrize("case", ["three", "line2d", "line3d", "same2d", "same3d"])
+def test_what_fixes_no_pose_has_none(problem, case):
+    f, p = problem.bearings[:1].clone(), problem.points3d[:1].clone()
+    along = torch.linspace(0, 1, f.shape[1]).unsqueeze(-1).to(p)
+    if case == "three":
+        f, p = f[:, :3], p[:, :3]
+    elif case == "line2d":
+        f = bearings(along.repeat(1, 2).unsqueeze(0) * 0.1)
+    elif case == "line3d":
+        p = (along * torch.ones(3).to(p)).unsqueeze(0)
+    elif case == "same2d":
+        f = f[:, :1].expand_as(f).contiguous()
+    else:
+        p = p[:, :1].expand_as(p).contiguous()
+    # Points of a line within rounding are on it; in two dimensions a bearing on a line has a plane of its own.
+    rotation, translation, stats = search(f, p)
+    if case != "line2d":
+        assert rotation.isnan().all()
+        assert translation.isnan().all()
+        assert stats.residual.isinf().all()
+        assert not stats.converged.any()
+
+
+def test_points_without_a_relation_are_not_called_solved():
+    generator = torch.Generator().manual_seed(0)
+    f = bearings(torch.rand(1, 120, 2, generator=generator) - 0.5)
+    p = torch.rand(1, 120, 3, generator=generator)
+    *_, stats = search(f, p, max_batches=4)
+    assert not stats.converged.any()
+
+
+def test_a_rough_pose_saves_batches(problem):
+    rotation, translation = problem.near(0.05, seed=1)
+    prior = PosePrior(rotation[0], translation[0], rotation_sigma_deg=4, translation_sigma=0.1)
+    r, t, stats = search(problem.bearings[:1], problem.points3d[:1], prior=prior, max_batches=1)
+    assert rotation_error(r, problem.rotation[:1]) < 0.5
+    assert stats.iterations.item() == 1
+
+
+def test_gravity_leaves_one_angle(problem):
+    up = torch.tensor([0.0, 0.0, 1.0], dtype=problem.rotation.dtype)
+    prior = GravityPrior(problem.rotation[0] @ up, up, 1.0)
+    r, *_ = search(problem.bearings[:1], problem.points3d[:1], prior=prior)
+    assert rotation_error(r, problem.rotation[:1]) < 0.5
+
+
+def test_starts_cover_all_rotations():
+    """No rotation is farther from 1152 even ones than 25 degrees; a random set of that size leaves gaps of 30."""
+    starts = torch.as_tensor(super_fibonacci(1152))
+    torch.testing.assert_close(starts @ starts.mT, torch.eye(3, dtype=starts.dtype).expand_as(starts))
+    generator = torch.Generator().manual_seed(0)
+    targets = roma.unitquat_to_rotmat(
+        torch.nn.functional.normalize(torch.randn(500, 4, dtype=starts.dtype, generator=generator), dim=-1)
+    )
+    cosine = ((targets.flatten(1) @ starts.flatten(1).T).amax(1) - 1) / 2
+    assert torch.rad2deg(torch.acos(cosine)).max() < 25
+
+
+def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
+    rotation, translation = problem.near(0.08, seed=2)
+    rotation, translation = rotation.unsqueeze(1).clone(), translation.unsqueeze(1).clone()
+    rotation[2] = torch.nan
+    r, t, stats = refine(problem.bearings, problem.points3d, rotation, translation)
+    assert (rotation_error(r, problem.rotation)[:2] < 0.3).all()
+    assert (translation_error(t, problem.translation)[:2] < 0.02).all()
+    assert r[2].isnan().all()
+    assert not stats.converged[2]
+    assert stats.converged[:2].all()
+
+
+def test_search_as_a_solver(problem):
+    prediction = Search(max_batches=8)(problem.batch())
+    assert prediction.assignment is None
+    found(prediction.poses["search"].rotation, prediction.poses["search"].translation, problem, 0.5)
+
+
+@pytest.mark.parametrize("wrong", [{"max_batches": 0}, {"time_limit": 0.0}, {"clutter": 1.0}])
+def test_wrong_budgets_are_refused(problem, wrong):
+    with pytest.raises(ValueError, match="expected"):
+        search(problem.bearings, problem.points3d, **wrong)
+
+
+def test_a_time_limit_ends_the_search():
+    generator = torch.Generator().manual_seed(0)
+    f, p = bearings(torch.rand(1, 60, 2, generator=generator)), torch.rand(1, 60, 3, generator=generator)
+    *_, stats = search(f, p, time_limit=1e-6)
+    assert stats.iterations.item() == 0
+    assert np.isinf(stats.residual.item())
+
+
+def test_points_at_the_end_of_the_world_do_not_matter(problem):
+    """A reconstruction's few points far away decide neither where the search starts nor its scale."""
+    torch.manual_seed(5)
+    points3d, rays = problem.points3d[:1].clone(), problem.bearings[:1].clone()
+    far = torch.randperm(points3d.shape[1])[:4]
+    points3d[0, far] *= 1e5
+    camera = points3d[0, far] @ problem.rotation[0].T + problem.translation[0]
+    rays[0, far] = torch.nn.functional.normalize(camera, dim=-1)
+    rotation, _, stats = search(rays, points3d, max_batches=8)
+    assert bool(stats.converged[0])
+    assert rotation_error(rotation, problem.rotation[:1]).item() < 1

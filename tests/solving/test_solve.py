@@ -1,0 +1,361 @@
+"""`solve` and `solve_many` on planted problems."""
+
+from dataclasses import replace
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+from planted import Planted, plant
+from scipy.spatial.transform import Rotation
+
+from bpnp import BPnPNet, GravityPrior, PosePrior, Solution, solve, solve_many
+from bpnp.models import Search
+from bpnp.types import Pose, Prediction, SolveStats
+
+FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
+K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
+
+
+def true_matches(planted: Planted) -> set[tuple[int, int]]:
+    return {(i, j) for j, i in enumerate(planted.match3d[0].tolist()) if i >= 0}
+
+
+def found(solution: Solution) -> set[tuple[int, int]]:
+    return {(i, j) for i, j in solution.matches.tolist()}
+
+
+def degrees(solution: Solution, planted: Planted) -> float:
+    relative = solution.rotation.T @ planted.rotation[0].numpy()
+    return float(np.degrees(Rotation.from_matrix(relative).magnitude()))
+
+
+def test_an_exact_problem_is_solved_to_the_last_digits() -> None:
+    planted = plant(1, 80)
+    solution = solve(planted.points2d[0].numpy(), planted.points3d[0].numpy())
+    np.testing.assert_allclose(solution.rotation, planted.rotation[0], atol=1e-9)
+    np.testing.assert_allclose(solution.translation, planted.translation[0], atol=1e-9)
+    np.testing.assert_allclose(solution.centre, -planted.rotation[0].mT @ planted.translation[0], atol=1e-9)
+    assert found(solution) == true_matches(planted)
+    assert (solution.verdict, solution.inlier_count, solution.inlier_ratio) == ("confident", 80, 1.0)
+    assert solution.unit == "normalised"
+    assert max(solution.reprojection_error, solution.reprojection_error_deg) < 1e-8
+    first = solution.candidates[0]
+    assert first.rotation.tolist() == solution.rotation.tolist()
+    assert first.inlier_count == 80
+    assert all(other.score <= first.score for other in solution.candidates)
+
+
+def test_noise_and_clutter_are_borne_and_reported() -> None:
+    """200 true pairs with normal noise of 0.001, and a quarter of clutter on each side."""
+    planted = plant(1, 200, noise=0.001, outliers2d=50, outliers3d=50, seed=3)
+    solution = solve(planted.points2d[0], planted.points3d[0])
+    assert solution.verdict == "confident"
+    assert degrees(solution, planted) < 0.1
+    right = found(solution) & true_matches(planted)
+    assert len(right) > 0.9 * 200
+    assert solution.inlier_count == len(solution.matches) >= len(right)
+    assert solution.inlier_ratio == solution.inlier_count / 250
+    assert 0.0005 < solution.inlier_threshold / 3 < 0.0015
+    camera = planted.points3d[0].numpy()[solution.matches[:, 1]] @ solution.rotation.T + solution.translation
+    errors = np.linalg.norm(
+        camera[:, :2] / camera[:, 2:] - planted.points2d[0].numpy()[solution.matches[:, 0]], axis=-1
+    )
+    assert solution.reprojection_error == pytest.approx(errors.mean())
+    assert errors.max() <= solution.inlier_threshold
+
+
+@pytest.mark.parametrize("as_object", [False, True])
+def test_pixels_of_a_lens_are_undistorted_and_lost_ones_counted(as_object: bool) -> None:
+    """Two pixels that no ray in front of the fisheye reaches; the places in `matches` are those of the given array."""
+    planted = plant(1, 60, seed=1)
+    lens = pycolmap.Camera(model=FISHEYE[0], params=FISHEYE[1])
+    rays = np.column_stack([planted.points2d[0].numpy(), np.ones(60)])
+    pixels = np.insert(lens.img_from_cam(rays), [0, 10], [[1000.0, 300.0]], axis=0)
+    solution = solve(pixels, planted.points3d[0], lens if as_object else FISHEYE)
+    expected = {(i + 1 + (i >= 10), j) for i, j in true_matches(planted)}
+    assert found(solution) == expected
+    assert (solution.stats.dropped2d, solution.unit) == (2, "px")
+    assert np.isnan(solution.points2d).any(-1).nonzero()[0].tolist() == [0, 11]
+    np.testing.assert_allclose(solution.rotation, planted.rotation[0], atol=1e-8)
+    assert solution.reprojection_error < 1e-5
+
+
+def test_a_matrix_and_a_threshold_count_pixels() -> None:
+    planted = plant(1, 60, noise=0.001)
+    pixels = planted.points2d[0].numpy() @ K[:2, :2].T + K[:2, 2]
+    loose, tight = (solve(pixels, planted.points3d[0], K, inlier_threshold=t) for t in (5, 0.4))
+    assert (loose.inlier_threshold, tight.inlier_threshold) == (5.0, 0.4)
+    assert loose.inlier_count == 60 > tight.inlier_count > 5
+    assert tight.reprojection_error < 0.4
+    assert 0.3 < loose.reprojection_error < 0.9
+
+
+def test_bearings_may_look_anywhere() -> None:
+    """A camera in the middle of its points, which it sees all around."""
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(80, 3))
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.3, -0.2, 0.5])
+    points3d = (rays * rng.uniform(3, 4, (80, 1)) - translation) @ rotation
+    solution = solve(rays, points3d, prior=PosePrior(rotation, translation + 0.1, 5.0, 0.2))  # type: ignore[arg-type]
+    np.testing.assert_allclose(solution.rotation, rotation, atol=1e-8)
+    assert found(solution) == {(i, i) for i in range(80)}
+    assert solution.unit == "rad"
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e7])
+def test_any_unit_and_origin_of_the_scene(shift: float) -> None:
+    planted = plant(1, 60, noise=0.0005)
+    plain = solve(planted.points2d[0], planted.points3d[0])
+    moved = solve(planted.points2d[0], 1000 * planted.points3d[0] + shift)
+    np.testing.assert_allclose(moved.rotation, plain.rotation, atol=1e-5)
+    np.testing.assert_allclose(moved.centre, 1000 * plain.centre + shift, atol=0.05)
+    assert found(moved) == found(plain)
+
+
+def test_arrays_tensors_lists_and_precisions_are_the_same_points() -> None:
+    planted = plant(1, 40)
+    x, p = planted.points2d[0].float(), planted.points3d[0].float()
+    expected = solve(x, p)
+    for points2d, points3d in ((x.numpy(), p.numpy()), (x.tolist(), p.tolist()), (x.double(), p.double().numpy())):
+        again = solve(points2d, points3d)
+        np.testing.assert_array_equal(again.rotation, expected.rotation)
+        np.testing.assert_array_equal(again.matches, expected.matches)
+
+
+def test_many_pairs_are_solved_as_each_alone() -> None:
+    planted = [plant(1, size, seed=size, noise=0.001) for size in (30, 70, 50)]
+    sets2d = [x.points2d[0].numpy() @ K[:2, :2].T + K[:2, 2] for x in planted]
+    sets3d = [x.points3d[0].numpy() for x in planted]
+    together = solve_many(sets2d, sets3d, K)
+    assert [len(s.points2d) for s in together] == [30, 70, 50]
+    for solution, x, p in zip(together, sets2d, sets3d, strict=True):
+        alone = solve(x, p, K)
+        np.testing.assert_array_equal(solution.rotation, alone.rotation)
+        np.testing.assert_array_equal(solution.matches, alone.matches)
+    again = solve_many(sets2d, sets3d, [K, ("PINHOLE", [520.0, 500.0, 405.0, 290.0]), K])
+    np.testing.assert_array_equal(again[0].rotation, together[0].rotation)
+    assert degrees(again[1], planted[1]) < 1
+
+
+def test_many_pairs_may_share_a_scene() -> None:
+    planted = plant(1, 50)
+    turn = torch.as_tensor(Rotation.from_rotvec([0.2, 0.1, -0.3]).as_matrix())
+    rays = planted.bearings[0] @ turn.mT
+    solutions = solve_many([planted.points2d[0], rays[:, :2] / rays[:, 2:]], planted.points3d[0])
+    np.testing.assert_allclose(solutions[1].rotation, turn.numpy() @ solutions[0].rotation, atol=1e-8)
+
+
+def test_a_symmetric_shape_has_several_answers() -> None:
+    """Points on a square prism look the same after a quarter turn about its axis."""
+    rng = np.random.default_rng(0)
+    side = np.column_stack([rng.uniform(-1, 1, 20), np.ones(20), rng.uniform(-2, 2, 20)])
+    turns = [Rotation.from_rotvec([0, 0, k * np.pi / 2]).as_matrix() for k in range(4)]
+    points3d = np.concatenate([side @ turn.T for turn in turns])
+    rotation, translation = Rotation.random(rng=1).as_matrix(), np.array([0.1, 0.2, 8.0])
+    camera = points3d @ rotation.T + translation
+    solution = solve(camera[:, :2] / camera[:, 2:], points3d)
+    assert solution.verdict in ("ambiguous", "confident")
+    full = [candidate for candidate in solution.candidates if candidate.inlier_count == 80]
+    axes = np.stack([candidate.rotation for candidate in full])
+    for turn in turns:
+        gaps = [Rotation.from_matrix((rotation @ turn).T @ axis).magnitude() for axis in axes]
+        assert min(gaps) < 0.01
+
+
+def test_unrelated_points_are_not_called_solved() -> None:
+    rng = np.random.default_rng(0)
+    solution = solve(rng.uniform(-0.4, 0.4, (50, 2)), rng.normal(size=(60, 3)), time_limit=0.5)
+    assert solution.verdict != "confident"
+
+
+@pytest.mark.parametrize(
+    ("change2d", "change3d", "reason"),
+    [
+        (None, lambda p: np.outer(p[:, 0], [1.0, 2.0, 3.0]) + 5, "on one line"),
+        (None, lambda p: (np.outer(p[:, 0], [1.0, 2.0, 3.0]) + 5).astype(np.float32), "on one line"),
+        (None, np.ones_like, "only 1 different 3D point:"),
+        (None, lambda p: p[np.arange(40) % 3], "only 3 different 3D points:"),
+        (np.ones_like, None, "only 1 different 2D point:"),
+        (lambda x: x[np.arange(40) % 2], None, "only 2 different 2D points:"),
+    ],
+)
+def test_points_that_fix_no_pose_fail_with_the_reason(change2d, change3d, reason: str) -> None:
+    planted = plant(1, 40)
+    points2d, points3d = planted.points2d[0].numpy(), planted.points3d[0].numpy()
+    solution = solve(
+        points2d if change2d is None else change2d(points2d), points3d if change3d is None else change3d(points3d)
+    )
+    assert solution.verdict == "failed"
+    assert reason in solution.reason
+    assert not solution.found
+    assert np.isnan(solution.rotation).all()
+    assert (solution.matches.shape, solution.inlier_count, solution.candidates) == ((0, 2), 0, ())
+
+
+X, P = plant(1, 20).points2d[0].numpy(), plant(1, 20).points3d[0].numpy()
+WITH_NAN = np.where(np.arange(20)[:, None] == 7, np.nan, P)
+
+
+@pytest.mark.parametrize(
+    ("points2d", "points3d", "options", "message"),
+    [
+        (X[:3], P, {}, "4 or more points in `points2d`, got 3"),
+        (X, P[:3], {}, "4 or more points in `points3d`, got 3"),
+        (X[:0], P, {}, "4 or more points in `points2d`, got 0"),
+        (X, WITH_NAN, {}, "finite `points3d`, got .* at point 7"),
+        (X + np.inf, P, {}, "finite `points2d`"),
+        (P, X, {}, "swapped"),
+        (P, P, {}, "unit bearings .* swapped"),
+        (P, X, {"camera": K}, "swapped"),
+        (X, X, {}, r"`points3d` of shape \(k, 3\).* swapped"),
+        (X.T, P, {}, r"`points2d` of shape \(k, 2\) or \(k, 3\), got \(2, 20\)"),
+        (X[:, 0], P, {}, r"got \(20,\)"),
+        (X, "points.npy", {}, "`points3d` as an array of numbers"),
+        (X.astype(complex), P, {}, "`points2d` as an array of numbers"),
+        (None, P, {}, "`points2d` as an array of numbers"),
+        (500 * X + 300, P, {}, "look like pixels; try camera=K"),
+        (X, P, {"camera": K}, "look normalised"),
+        (500 * X, P, {"camera": np.zeros((3, 3))}, "last row"),
+        (500 * X, P, {"camera": np.diag([500.0, 0, 1])}, "invertible `camera`"),
+        (X, P, {"inlier_threshold": 0.0}, "positive `inlier_threshold`"),
+        (X, P, {"time_limit": -1.0}, "positive `time_limit`"),
+        (X, P, {"clutter": 1.5}, "`clutter`"),
+        (X, P, {"solver": "serch"}, '`solver` "search"'),
+        (X, P, {"device": "gpu0"}, "`device` of this machine"),
+        (X, P, {"prior": PosePrior(2 * np.eye(3), None, 5.0)}, "a rotation in `prior.rotation`"),
+        (X, P, {"prior": PosePrior(np.eye(3), np.zeros(2), 5.0)}, r"`prior.translation` of shape \(3,\)"),
+        (X, P, {"prior": PosePrior(np.eye(3), None, 0.0)}, "positive `prior.rotation_sigma_deg`"),
+        (X, P, {"prior": GravityPrior(np.zeros(3), np.ones(3), 1.0)}, "expected directions"),
+    ],
+)
+def test_a_mistake_is_one_clear_error(points2d, points3d, options, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        solve(points2d, points3d, **options)
+
+
+def test_a_missing_checkpoint_is_named() -> None:
+    for options in ({"solver": "nothing.ckpt"}, {"prior": "nothing.ckpt"}):
+        with pytest.raises(FileNotFoundError, match="nothing.ckpt"):
+            solve(X, P, **options)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([X, X[:3]], [P, P]), "4 or more points in `points2d` in pair 1, got 3"),
+        (([X], [P, P]), "1 arrays as in `points2d` in `points3d`, got 2"),
+        ((X, P), r"`points2d` as a sequence of arrays, one a pair, got shape \(20, 2\)"),
+        (([], []), "one array a pair in `points2d`, got 0"),
+        ((5, P), "`points2d` as a sequence"),
+        (([X, X], P, [K]), "2 of `camera`, one a pair, got 1"),
+    ],
+)
+def test_of_many_pairs_the_wrong_one_is_named(arguments, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        solve_many(*arguments)
+
+
+def test_a_prior_that_is_none_of_its_kinds_is_refused() -> None:
+    for prior, message in ((3, "expected `prior` as PosePrior, GravityPrior, BPnPNet"), ([None], "2 of `prior`")):
+        with pytest.raises(ValueError, match=message):
+            solve_many([X, X], P, prior=prior)
+
+
+def test_a_rough_pose_or_the_vertical_helps() -> None:
+    planted = plant(1, 60, noise=0.001)
+    x, p = planted.points2d[0], planted.points3d[0] + 1e6
+    rotation, translation = (value[0] for value in planted.near(0.1))
+    translation = translation - rotation @ torch.full((3,), 1e6, dtype=torch.float64)
+    up = planted.rotation[0] @ torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    for prior in (
+        PosePrior(rotation, translation, 6.0, 0.2),
+        PosePrior(rotation.numpy(), None, 6.0),  # type: ignore[arg-type]
+        GravityPrior(up.numpy(), np.array([0, 0, 1]), 1.0),  # type: ignore[arg-type]
+    ):
+        solution = solve(x, p, prior=prior)
+        assert solution.verdict == "confident"
+        assert degrees(solution, planted) < 0.2
+
+
+class Fixed(torch.nn.Module):
+    """A solver that always has the same answer."""
+
+    def __init__(self, rotation: torch.Tensor, translation: torch.Tensor) -> None:
+        super().__init__()
+        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
+        self.pose = Pose(rotation[None].float(), translation[None].float(), stats)
+
+    def forward(self, batch) -> Prediction:
+        return Prediction(poses={"fixed": self.pose})
+
+
+def test_a_module_solves_and_is_judged_by_the_points() -> None:
+    planted = plant(1, 100, noise=0.001)
+    x, p = planted.points2d[0], planted.points3d[0]
+    near = Fixed(*(value[0] for value in planted.near(0.003)))
+    solution = solve(x, p, solver=near)
+    assert solution.verdict == "confident"
+    assert degrees(solution, planted) < 0.1
+    wrong = Fixed(torch.eye(3).double(), torch.tensor([0.0, 0.0, 5.0]).double())
+    assert solve(x, p, solver=wrong).verdict != "confident"
+    missing = solve(x, p, solver=Fixed(torch.full((3, 3), torch.nan), torch.full((3,), torch.nan)))
+    assert (missing.verdict, missing.found) == ("failed", False)
+    searched = solve(x, p, solver=Search())
+    assert degrees(searched, planted) < 0.1
+
+
+def test_a_net_is_a_solver_and_a_source_of_candidates() -> None:
+    """Untrained, it knows nothing: as a solver it is not believed, as a prior it does no harm.
+
+    With the many starts of its hypotheses even that may find the pose; believed, it is then right.
+    """
+    planted = plant(1, 60, noise=0.001)
+    x, p = planted.points2d[0], planted.points3d[0]
+    torch.manual_seed(0)
+    net = BPnPNet(channels=16, blocks=2, hypotheses=0)
+    assert solve(x, p, solver=net).verdict != "confident"
+    assert net.training  # as it came
+    net.pose_stage.hypotheses = 192
+    lucky = solve(x, p, solver=net)
+    assert lucky.verdict != "confident" or degrees(lucky, planted) < 0.2
+    solution = solve(x, p, prior=net)
+    assert solution.verdict == "confident"
+    assert degrees(solution, planted) < 0.2
+
+
+def test_a_solution_is_the_same_after_its_json(tmp_path) -> None:
+    planted = plant(1, 30, noise=0.001)
+    degenerate = np.ones((30, 3))
+    for solution in (solve(planted.points2d[0], planted.points3d[0]), solve(planted.points2d[0], degenerate)):
+        text = solution.to_json()
+        assert "NaN" not in text
+        (tmp_path / "s.json").write_text(text)
+        for again in (Solution.from_json(text), Solution.from_json(tmp_path / "s.json")):
+            assert again.to_json() == text
+            np.testing.assert_array_equal(again.rotation, solution.rotation)
+            np.testing.assert_array_equal(again.matches, solution.matches)
+            assert (again.verdict, again.stats.iterations) == (solution.verdict, solution.stats.iterations)
+            assert len(again.candidates) == len(solution.candidates)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
+def test_what_is_no_solution_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="expected the JSON of a solution"):
+        Solution.from_json(text)
+
+
+def test_progress_names_the_pair() -> None:
+    planted = plant(1, 30)
+    calls: list[tuple[int, int]] = []
+    sets2d, sets3d = [planted.points2d[0]] * 2, planted.points3d[0]
+    solve_many(sets2d, sets3d, progress=lambda pair, batch, _: calls.append((pair, batch)))
+    assert {pair for pair, _ in calls} == {0, 1}
+    assert [batch for pair, batch in calls if pair == 0] == [batch for pair, batch in calls if pair == 1]
+
+
+def test_the_seed_decides() -> None:
+    planted = plant(1, 60, noise=0.002)
+    first, second = (solve(planted.points2d[0], planted.points3d[0], seed=7) for _ in range(2))
+    assert replace(first, seconds=0.0).to_json() == replace(second, seconds=0.0).to_json()

@@ -1,0 +1,225 @@
+import math
+
+import pytest
+import torch
+from planted import Planted, plant
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from bpnp import Batch
+from bpnp.geometry import bearings, rotation_angle, transform
+from bpnp.training.losses import (
+    RELEASED_BOUNDS,
+    correspondence_loss,
+    correspondence_loss_from_pose,
+    matching_likelihood_loss,
+    pairs_within,
+    pose_loss,
+    reprojection_loss,
+)
+from bpnp.types import Prediction
+
+
+def random_assignment(planted: Planted, *, seed: int = 0) -> Tensor:
+    shape = (*planted.points2d.shape[:2], planted.points3d.shape[1])
+    weights = torch.rand(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return weights / weights.sum((-2, -1), keepdim=True)
+
+
+def angle(planted: Planted, b: int, i: int, j: int) -> float:
+    """Angle of bearing i and 3D point j by the law of cosines, apart from what is tested."""
+    f = bearings(planted.points2d[b, i])
+    y = planted.rotation[b] @ planted.points3d[b, j] + planted.translation[b]
+    return math.acos(max(-1.0, min(1.0, float(f @ y / y.norm()))))
+
+
+def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
+    planted = plant(4, 9, outliers2d=3, outliers3d=5)
+    assignment = random_assignment(planted)
+    correct = torch.zeros_like(assignment)
+    for b, j in torch.nonzero(planted.match3d >= 0).tolist():
+        correct[b, planted.match3d[b, j], j] = 1
+    expected = (assignment * (1 - 2 * correct)).sum((-2, -1))
+    torch.testing.assert_close(correspondence_loss(assignment, planted.match3d), expected)
+
+
+def test_correspondence_loss_is_bounded() -> None:
+    planted = plant(3, 8, outliers2d=2)
+    perfect = correspondence_loss(planted.permutation(), planted.match3d)
+    torch.testing.assert_close(perfect, -torch.ones(3, dtype=torch.float64))
+    wrong = correspondence_loss(planted.permutation().roll(1, 1), planted.match3d)
+    torch.testing.assert_close(wrong, torch.ones(3, dtype=torch.float64))
+    none = torch.full_like(planted.match3d, -1)
+    torch.testing.assert_close(correspondence_loss(random_assignment(planted), none), torch.ones(3).double())
+
+
+@pytest.mark.parametrize("threshold", [0.003, 0.03, 0.3])
+def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: float) -> None:
+    planted = plant(2, 12, noise=0.01, outliers2d=3)
+    assignment = random_assignment(planted)
+    within = pairs_within(planted.points2d, planted.points3d, *planted.pose, threshold)
+    found = correspondence_loss_from_pose(
+        assignment, planted.points2d, planted.points3d, *planted.pose, angle=threshold
+    )  # fmt: skip
+    for b in range(2):
+        expected = 0.0
+        for i, j in torch.cartesian_prod(torch.arange(15), torch.arange(12)).tolist():
+            close = angle(planted, b, i, j) <= threshold
+            assert bool(within[b, i, j]) == close
+            expected += float(assignment[b, i, j]) * (1 - 2 * close)
+        assert abs(float(found[b]) - expected) < 1e-12
+    assert 0 < within.sum() < within.numel()
+
+
+def test_correspondences_from_a_pose_contain_the_true_ones_in_float32() -> None:
+    planted = plant(3, 500, dtype=torch.float32)
+    within = pairs_within(planted.points2d, planted.points3d, *planted.pose, 1e-5)
+    assert (within & (planted.permutation() > 0)).sum((-2, -1)).tolist() == [500] * 3
+
+
+def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
+    planted = plant(50, 4)
+    rotation, translation = planted.near(0.7)
+    found = pose_loss(rotation, translation, *planted.pose)
+    turn = Rotation.from_matrix(planted.rotation.numpy()).inv() * Rotation.from_matrix(rotation.numpy())
+    distance = (translation - planted.translation).pow(2).sum(-1).sqrt()
+    assert (found - torch.from_numpy(turn.magnitude()) - distance).abs().max() < 1e-12
+
+
+def turned(angle: float) -> Tensor:
+    return torch.from_numpy(Rotation.from_rotvec([0, 0, angle]).as_matrix())
+
+
+def test_beyond_its_bounds_the_released_loss_is_constant() -> None:
+    rotation = torch.stack([turned(1.5), turned(1.7), turned(1.5), turned(1.7)]).requires_grad_()
+    translation = torch.tensor([[0.9, 0, 0], [0.9, 0, 0], [0, 1.1, 0], [0, 1.1, 0]], dtype=torch.float64)
+    translation.requires_grad_()
+    truth = turned(0.0).expand(4, 3, 3), torch.zeros(4, 3, dtype=torch.float64)
+    bounded = pose_loss(rotation, translation, *truth, bounds=RELEASED_BOUNDS)
+    quarter = math.pi / 2
+    expected = torch.tensor([1.5 + 0.9, quarter + 0.9, 1.5 + 1, quarter + 1], dtype=torch.float64)
+    torch.testing.assert_close(bounded, expected)
+    bounded.sum().backward()
+    assert rotation.grad is not None
+    assert translation.grad is not None
+    assert (rotation.grad != 0).any((-2, -1)).tolist() == [True, False, True, False]
+    assert (translation.grad != 0).any(-1).tolist() == [True, True, False, False]
+    unbounded = pose_loss(rotation, translation, *truth)
+    torch.testing.assert_close(unbounded, torch.tensor([2.4, 2.6, 2.6, 2.8], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_at_the_truth(dtype: torch.dtype) -> None:
+    planted = plant(3, 6, dtype=dtype)
+    rotation, translation = (x.clone().requires_grad_() for x in planted.pose)
+    assignment = planted.permutation().requires_grad_()
+    loss = pose_loss(rotation, translation, *planted.pose)
+    loss = loss + reprojection_loss(assignment, planted.points2d, planted.points3d, rotation, translation)
+    assert loss.max() < 1e-2
+    loss.sum().backward()
+    assert all(x.grad is not None and x.grad.isfinite().all() for x in (rotation, translation, assignment))
+
+
+def test_pose_loss_points_downhill() -> None:
+    planted = plant(5, 4)
+    rotation, translation = (x.requires_grad_() for x in planted.near(0.3))
+    pose_loss(rotation, translation, *planted.pose).sum().backward()
+    assert rotation.grad is not None
+    with torch.no_grad():
+        u, _, vt = torch.linalg.svd(rotation - 0.05 * rotation.grad)
+        assert (rotation_angle(u @ vt, planted.rotation) < rotation_angle(rotation, planted.rotation)).all()
+
+
+def test_reprojection_loss_is_a_weighted_sum_of_angles() -> None:
+    planted = plant(2, 6, outliers2d=2, outliers3d=1, noise=0.05)
+    assignment = random_assignment(planted)
+    found = reprojection_loss(assignment, planted.points2d, planted.points3d, *planted.pose)
+    for b in range(2):
+        pairs = torch.cartesian_prod(torch.arange(8), torch.arange(7)).tolist()
+        expected = sum(float(assignment[b, i, j]) * angle(planted, b, i, j) for i, j in pairs)
+        assert abs(float(found[b]) - expected) < 1e-12
+
+
+def test_a_point_at_the_camera_centre_spoils_no_gradient() -> None:
+    planted = plant(1, 5)
+    translation = -(planted.rotation @ planted.points3d[:, 0, :, None]).squeeze(-1)
+    assert transform(planted.rotation, translation, planted.points3d)[0, 0].abs().max() < 1e-15
+    assignment, translation = random_assignment(planted), translation.requires_grad_()
+    assignment[..., 0] = 0
+    reprojection_loss(assignment, planted.points2d, planted.points3d, planted.rotation, translation).sum().backward()
+    assert translation.grad is not None
+    assert translation.grad.isfinite().all()
+
+
+def _with_bins(planted: Planted, *, seed: int = 0) -> tuple[Prediction, Batch]:
+    """A random plan with bins, as nested lists would have it: rows and columns of one total mass."""
+    b, m, n = len(planted.points2d), planted.points2d.shape[1], planted.points3d.shape[1]
+    plan = torch.rand(b, m + 1, n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    plan = plan / plan.sum((-2, -1), keepdim=True)
+    prediction = Prediction(plan[:, :-1, :-1], unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
+    return prediction, planted.batch()
+
+
+def test_matching_likelihood_loss_is_the_sum_over_points_written_out() -> None:
+    planted = plant(3, 6, outliers2d=2, outliers3d=4)
+    prediction, batch = _with_bins(planted)
+    losses = matching_likelihood_loss(prediction, batch)
+    for b in range(3):
+        p, left2d, left3d = prediction.assignment[b], prediction.unmatched2d[b], prediction.unmatched3d[b]
+        partner = planted.match3d[b].tolist()
+        paired, alone = [], []
+        for j, i in enumerate(partner):
+            to_j = float(p[:, j].sum() + left3d[j])
+            if i < 0:
+                alone.append(-math.log(float(left3d[j]) / to_j))
+                continue
+            to_i = float(p[i].sum() + left2d[i])
+            paired.append(-math.log(float(p[i, j]) / to_j))
+            paired.append(-math.log(float(p[i, j]) / to_i))
+        for i in set(range(p.shape[0])) - set(partner):
+            alone.append(-math.log(float(left2d[i] / (p[i].sum() + left2d[i]))))
+        assert float(losses[b]) == pytest.approx(sum(paired) / len(paired) + sum(alone) / len(alone))
+
+
+def test_matching_likelihood_loss_of_the_truth_is_zero_with_and_without_bins() -> None:
+    planted = plant(2, 8)
+    truth = planted.permutation()
+    none = torch.zeros(2, 8, dtype=torch.float64)
+    for bins in ({}, {"unmatched2d": none, "unmatched3d": none}):
+        loss = matching_likelihood_loss(Prediction(truth, **bins), planted.batch())
+        torch.testing.assert_close(loss, torch.zeros(2, dtype=torch.float64))
+
+
+def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> None:
+    alone, padded = plant(1, 5, outliers3d=2), plant(1, 5, outliers3d=2)
+    prediction, batch = _with_bins(alone)
+    wide = [torch.nn.functional.pad(x, (0, 3)) for x in (padded.match3d.float(), batch.mask3d.float())]
+    larger = Batch(
+        points2d=torch.nn.functional.pad(batch.points2d, (0, 0, 0, 2)),
+        points3d=torch.nn.functional.pad(batch.points3d, (0, 0, 0, 3)),
+        mask2d=torch.nn.functional.pad(batch.mask2d, (0, 2)),
+        mask3d=wide[1].bool(),
+        focal=batch.focal,
+        index=batch.index,
+        ids=batch.ids,
+        match3d=torch.where(wide[1].bool(), wide[0].long(), -1),
+    )
+    grown = Prediction(
+        torch.nn.functional.pad(prediction.assignment, (0, 3, 0, 2)),
+        unmatched2d=torch.nn.functional.pad(prediction.unmatched2d, (0, 2)),
+        unmatched3d=torch.nn.functional.pad(prediction.unmatched3d, (0, 3)),
+    )
+    torch.testing.assert_close(matching_likelihood_loss(grown, larger), matching_likelihood_loss(prediction, batch))
+
+    def loss(p: Tensor, left2d: Tensor, left3d: Tensor) -> Tensor:
+        return matching_likelihood_loss(Prediction(p, unmatched2d=left2d, unmatched3d=left3d), batch)
+
+    values = (prediction.assignment, prediction.unmatched2d, prediction.unmatched3d)
+    assert torch.autograd.gradcheck(loss, tuple(x.clone().requires_grad_() for x in values))
+
+
+def test_matching_likelihood_loss_wants_pairs_to_compare_with() -> None:
+    prediction, batch = _with_bins(plant(1, 5))
+    batch.match3d = None
+    with pytest.raises(ValueError, match="expected an assignment and a batch with `match3d`, got None"):
+        matching_likelihood_loss(prediction, batch)

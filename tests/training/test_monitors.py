@@ -1,0 +1,137 @@
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import wandb
+from lightning import LightningModule, Trainer
+from lightning.pytorch.loggers import CSVLogger
+from matplotlib.image import imread
+from torch import nn
+from torch.utils.data import DataLoader
+
+from bpnp import Batch, Prediction
+from bpnp.training.monitors import OfflineWandbLogger, TrainingMonitor, first_pairs, watched_values
+from bpnp.types import Pose, SolveStats
+
+
+class PlantedModule(LightningModule):
+    """Puts 0.25 of the mass on the true matches, the rest on a clutter point, and says 7 iterations."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+
+    def forward(self, batch: Batch) -> Prediction:
+        assert batch.match3d is not None
+        assert batch.rotation is not None
+        assert batch.translation is not None
+        b, m, n = len(batch), batch.points2d.shape[1], batch.points3d.shape[1]
+        assignment = torch.zeros(b, m, n)
+        assignment[:, m - 1, n - 1] = 0.75
+        matched = int((batch.match3d[0] >= 0).sum())
+        assignment.scatter_(1, batch.match3d.clamp(min=0)[:, None], 0.25 / matched)
+        assignment[:, :, batch.match3d[0] < 0] = 0
+        stats = SolveStats(torch.full((b,), 7), torch.zeros(b), torch.ones(b, dtype=torch.bool))
+        return Prediction(assignment, None, {"pnp": Pose(batch.rotation, batch.translation, stats)})
+
+    def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
+        return self.weight**2
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        pass
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def planted(size: int) -> Batch:
+    points = np.random.default_rng(0).uniform(-1, 1, (size, 8, 3)) + [0, 0, 4]
+    images = points[..., :2] / points[..., 2:]
+    match = np.r_[np.arange(7), -1]
+    return Batch.from_arrays(
+        list(images.astype("f4")), list(points), [np.eye(3)] * size, [np.zeros(3)] * size, [match] * size
+    )
+
+
+def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3) -> None:
+    loader = DataLoader([planted(6), planted(4)], batch_size=None)  # type: ignore[arg-type]
+    trainer = Trainer(
+        default_root_dir=folder,
+        max_epochs=epochs,
+        callbacks=[monitor],
+        logger=logger,  # type: ignore[arg-type]
+        accelerator="cpu",
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        enable_checkpointing=False,
+        log_every_n_steps=1,
+    )
+    trainer.fit(PlantedModule(), loader, loader)
+
+
+def test_the_mass_on_true_matches_and_the_iterations_are_those_planted() -> None:
+    batch = planted(5)
+    values = watched_values(PlantedModule()(batch), batch)
+    assert float(values["true_match_mass"]) == pytest.approx(0.25)
+    assert float(values["pnp_iterations"]) == 7
+    assert watched_values(Prediction(), batch) == {}
+
+
+def test_the_first_pairs_are_those_of_the_batch() -> None:
+    batch = planted(6)
+    few = first_pairs(batch, 2)
+    assert few.ids == batch.ids[:2]
+    assert len(few) == 2
+    torch.testing.assert_close(few.points3d, batch.points3d[:2])
+    unknown = first_pairs(Batch.from_arrays(np.ones((1, 2)), np.ones((1, 3))), 3)
+    assert unknown.match3d is None
+
+
+def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None:
+    fit(tmp_path, TrainingMonitor(pairs=2, every=2), CSVLogger(tmp_path, name="logs"))
+    rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
+    assert [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]] == pytest.approx(
+        [0.25] * 3
+    )
+    speeds = [float(row["train/pairs_per_second"]) for row in rows if row["train/pairs_per_second"]]
+    assert len(speeds) == 3
+    assert min(speeds) > 0
+    drawn = sorted(path.relative_to(tmp_path / "pictures") for path in (tmp_path / "pictures").rglob("*.png"))
+    assert [str(path) for path in drawn] == [f"epoch_000{e}/pair{p}.png" for e in (0, 2) for p in (0, 1)]
+    first, again = (imread(tmp_path / "pictures" / f"epoch_000{epoch}" / "pair0.png") for epoch in (0, 2))
+    np.testing.assert_array_equal(first, again)
+    with pytest.raises(ValueError, match="expected pairs >= 1 and every >= 0, got 0 and 1"):
+        TrainingMonitor(pairs=0, every=1)
+
+
+def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WANDB_MODE", "")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    wandb.finish()  # a run that another test left would be joined
+    logger = OfflineWandbLogger(save_dir=str(tmp_path / "runs"))
+    fit(tmp_path, TrainingMonitor(pairs=2, every=1), logger, epochs=1)
+    assert logger.experiment.offline
+    logger.experiment.finish()
+    (run,) = (tmp_path / "runs" / "wandb").glob("offline-run-*")
+    assert len(list(run.glob("files/media/images/val/pairs_*.png"))) == 2
+    assert b"val/true_match_mass" in next(run.glob("*.wandb")).read_bytes()
+    assert not (tmp_path / "pictures").exists()
+
+
+def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
+    pytest.importorskip("tensorboard", reason="needs tensorboard")
+    from lightning.pytorch.loggers import TensorBoardLogger
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    fit(tmp_path, TrainingMonitor(pairs=2, every=2), TensorBoardLogger(tmp_path, name="board"))
+    events = EventAccumulator(str(tmp_path / "board" / "version_0"), size_guidance={"images": 0})
+    events.Reload()
+    assert [event.value for event in events.Scalars("val/true_match_mass")] == pytest.approx([0.25] * 3)
+    assert len(events.Scalars("train/pairs_per_second")) == 3
+    for name in ("val/pair0", "val/pair1"):
+        pictures = events.Images(name)
+        assert len(pictures) == 2
+        assert min(picture.width for picture in pictures) > 300
+    assert not (tmp_path / "pictures").exists()

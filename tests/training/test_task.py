@@ -1,0 +1,167 @@
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning import Trainer
+from small_data import SMALL_MESHES
+from torch import Tensor, nn
+from torch.utils.data import DataLoader
+
+from bpnp import Batch, BPnPNet, Prediction
+from bpnp.datamodules import MeshDataModule
+from bpnp.report import read_results
+from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
+from bpnp.training.losses import correspondence_loss, pose_loss
+from bpnp.training.task import BlindPnPTask, TrainingDivergedError
+
+
+class CountingSolver(nn.Module):
+    """BPnPNet that notes for each call whether poses were wanted, and can be told to answer NaN."""
+
+    estimates = ("ransac", "pnp")
+
+    def __init__(self, broken_calls: tuple[int, ...] = ()) -> None:
+        super().__init__()
+        self.net = BPnPNet(channels=16, blocks=2)
+        self.wanted: list[bool] = []
+        self.broken_calls = broken_calls
+
+    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+        self.wanted.append(poses)
+        prediction = self.net(batch, poses=poses)
+        if len(self.wanted) - 1 in self.broken_calls:
+            assert prediction.assignment is not None
+            return Prediction(prediction.assignment * math.nan, prediction.assignment_stats, prediction.poses)
+        return prediction
+
+
+def data(tmp_path: Path, **settings: object) -> MeshDataModule:
+    small = dict(a.removeprefix("--data.").split("=") for a in SMALL_MESHES)
+    return MeshDataModule(**({k: int(v) for k, v in small.items()} | {"cache_dir": str(tmp_path / "cache")} | settings))
+
+
+def trainer(tmp_path: Path, **settings: object) -> Trainer:
+    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
+    return Trainer(default_root_dir=tmp_path, num_sanity_val_steps=0, **(quiet | settings))
+
+
+def test_no_pose_is_solved_in_training_before_the_switch(tmp_path: Path) -> None:
+    task = BlindPnPTask(CountingSolver(), learning_rate=1e-4)
+    callbacks = [PoseLossWarmup(start_epoch=1, weight=0.5)]
+    trainer(tmp_path, max_epochs=2, limit_train_batches=3, limit_val_batches=0, callbacks=callbacks,
+            enable_checkpointing=False).fit(task, datamodule=data(tmp_path))  # fmt: skip
+    assert task.solver.wanted == [False] * 3 + [True] * 3
+    assert callbacks[0].switched_at == 1
+    assert task.pose_weight == 0.5
+
+
+def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None:
+    run = trainer(tmp_path, max_epochs=2, limit_train_batches=1, limit_val_batches=0,
+                  callbacks=[PoseLossWarmup(start_epoch=1)])  # fmt: skip
+    run.fit(BlindPnPTask(CountingSolver()), datamodule=data(tmp_path))
+    run.save_checkpoint(tmp_path / "two.ckpt")
+    resumed = BlindPnPTask(CountingSolver())
+    trainer(tmp_path, max_epochs=3, limit_train_batches=1, limit_val_batches=0, enable_checkpointing=False,
+            callbacks=[PoseLossWarmup(start_epoch=50)]).fit(
+        resumed, datamodule=data(tmp_path), ckpt_path=str(tmp_path / "two.ckpt"), weights_only=True
+    )  # fmt: skip
+    assert resumed.solver.wanted == [True]
+
+
+def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) -> None:
+    def run(broken_calls: tuple[int, ...], steps: int) -> BlindPnPTask:
+        torch.manual_seed(3)
+        task = BlindPnPTask(CountingSolver(broken_calls), learning_rate=1e-3)
+        trainer(tmp_path, max_epochs=1, limit_train_batches=steps, limit_val_batches=0,
+                enable_checkpointing=False).fit(task, datamodule=data(tmp_path))  # fmt: skip
+        return task
+
+    broken, short = run((2,), 3), run((), 2)
+    assert broken.skipped.tolist() == [1, 1]
+    for name, value in broken.solver.named_parameters():
+        torch.testing.assert_close(value, short.solver.get_parameter(name), rtol=0, atol=0, msg=name)
+
+
+def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path) -> None:
+    task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))), max_skipped_steps=4)
+    with pytest.raises(TrainingDivergedError, match=r"got 4 steps in a row without.*try a lower model.learning_rate"):
+        trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(task, datamodule=data(tmp_path))
+    assert len(task.solver.wanted) == 4
+
+
+class Untransformed(nn.Module):
+    """In place of the input transform, whose batch norms see a whole batch."""
+
+    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
+        return points
+
+
+def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points3d = rng.uniform(-1, 1, (4, 20, 3))
+    points2d = points3d[..., :2] / (points3d[..., 2:] + 4.5)
+    pose = np.broadcast_to(np.eye(3), (4, 3, 3)), np.broadcast_to([0, 0, 4.5], (4, 3))
+    matches = np.broadcast_to(np.arange(20), (4, 20))
+
+    def batch(first: int, last: int) -> Batch:
+        arrays = (points2d, points3d, *pose, matches)
+        return Batch.from_arrays(*(list(x[first:last]) for x in arrays)).to(torch.float32)
+
+    def gradients(batches: list[Batch], pose_weight: float) -> dict[str, Tensor]:
+        torch.manual_seed(3)
+        solver = BPnPNet(channels=16, blocks=2, image_scale=4.0, centre_features=True)
+        solver.align = Untransformed()
+        task = BlindPnPTask(solver, pose_weight=pose_weight)
+        trainer(tmp_path, max_steps=1, accumulate_grad_batches=len(batches), limit_val_batches=0,
+                enable_checkpointing=False).fit(task, DataLoader(batches, batch_size=None))  # fmt: skip
+        return {name: p.grad for name, p in solver.named_parameters()}
+
+    for pose_weight in (0.0, 0.5):
+        whole = gradients([batch(0, 4)], pose_weight)
+        parts = gradients([batch(0, 2), batch(2, 4)], pose_weight)
+        largest = max(float(g.abs().max()) for g in whole.values())
+        assert largest > 1e-4
+        for name, value in whole.items():  # a bias before a norm has no gradient but rounding
+            torch.testing.assert_close(parts[name], value, rtol=1e-3, atol=1e-4 * largest, msg=name)
+
+
+def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    points3d = [rng.uniform(-1, 1, (20, 3)), rng.uniform(-1, 1, (3, 3))]
+    points2d = [p[:, :2] / (p[:, 2:] + 4.5) for p in points3d]
+    pose = [np.eye(3)] * 2, [np.array([0, 0, 4.5])] * 2
+    batch = Batch.from_arrays(points2d, points3d, *pose, [np.arange(20), np.arange(3)]).to(torch.float32)
+    task = BlindPnPTask(BPnPNet(channels=16, blocks=2), pose_weight=2.0)
+    prediction = task.solver(batch)
+    solved = prediction.poses["pnp"].stats.converged
+    assert not solved[1]
+    losses = task.losses(prediction, batch, "val")
+    expected = correspondence_loss(prediction.assignment, batch.match3d)
+    found = prediction.poses["pnp"]
+    full = pose_loss(found.rotation, found.translation, batch.rotation, batch.translation)
+    expected = torch.where(solved, expected + 2 * full, expected)
+    torch.testing.assert_close(losses, expected)
+
+
+def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
+    module = data(tmp_path, num_points=40, noise_px=0.0)
+    task = BlindPnPTask(BPnPNet(channels=16, blocks=2))
+    run = trainer(tmp_path, callbacks=[ResultsWriter()])
+    run.test(task, datamodule=module, verbose=False)
+    results = read_results(tmp_path / "test")
+    assert len(results.rows) == 7 * 3
+    assert {row.id for row in results.rows} == {pair for batch in module.test_dataloader() for pair in batch.ids}
+    logged = float(run.callback_metrics["test/rotation_q2_deg"])
+    assert logged == pytest.approx(results.estimates["ransac"]["rotation_q2_deg"], rel=1e-6)
+    assert float(run.callback_metrics["test/correspondence_loss"]) == pytest.approx(results.correspondence_loss)
+    run.predict(task, datamodule=module)
+    lines = (tmp_path / "predict" / "poses.csv").read_text().splitlines()
+    assert lines[0] == "id,estimate,qw,qx,qy,qz,tx,ty,tz,found,converged"
+    assert len(lines) == 1 + 7 * 3
+
+
+def test_wrong_settings_are_refused() -> None:
+    with pytest.raises(ValueError, match="expected start_epoch >= 0"):
+        PoseLossWarmup(start_epoch=-1)
