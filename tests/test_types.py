@@ -120,7 +120,7 @@ WRONG = {
     r"`index` for 1 pairs": {"index": [1, 2]},
     r"`rotation` of shape \(3, 3\), got \(3, 4\)": {"rotation": np.zeros((3, 4))},
     r"`translation` of shape \(3,\), got \(4,\)": {"translation": np.zeros(4)},
-    r"`match3d` of shape \(7,\), one entry a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
+    r"`match3d` of shape \(7,\), one a 3D point, got \(5,\)": {"match3d": np.zeros(5, int)},
     r"`match3d` between -1 and 4, got 0 to 5": {"match3d": np.array([0, 1, 2, 3, 4, 5, 0])},
     r"`match3d` between -1 and 4, got -2": {"match3d": np.array([0, 1, 2, 3, 4, -2, 0])},
     r"`points2d` as an array of numbers or a list of them, got None": {"points2d": None},
