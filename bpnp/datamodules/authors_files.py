@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.batching import Pair
 from bpnp.datamodules.restricted import PickleError, load_pickle
+from bpnp.geometry import MIN_POINTS
 
 SPLITS = ("train", "test")
 PREPROCESSED = ("p2d", "p3d", "R_gt", "t_gt", "W_gt", "num_points_2d", "num_points_3d")
 MATCHES = ("matches", "R", "t")
 FOCAL = {"modelnet40": 800.0}  # pixels; for the others nothing is known
-MIN_TRUE = 4  # pairs; fewer do not fix a pose
 PROBED = 50  # samples that decide which side W_gt is indexed by
 AGREEMENT = 0.1  # median distance of a projected 3D point to its 2D point, normalised
 
@@ -152,8 +152,8 @@ def _pair(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) ->
         raise SampleError("expected a rotation matrix, got another matrix")
     if np.linalg.det(rotation) < 0 or translation.shape != (3,) or not np.isfinite(translation).all():
         raise SampleError("expected a rotation and a finite translation, got a reflection or something else")
-    if (match3d >= 0).sum() < MIN_TRUE:
-        raise SampleError(f"expected {MIN_TRUE} or more true pairs, got {(match3d >= 0).sum()}")
+    if (match3d >= 0).sum() < MIN_POINTS:
+        raise SampleError(f"expected {MIN_POINTS} or more true pairs, got {(match3d >= 0).sum()}")
     return Pair(name, points2d.astype("f4"), points3d.astype("f4"), rotation, translation, match3d, focal)
 
 

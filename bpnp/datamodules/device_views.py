@@ -19,10 +19,10 @@ from torch import Tensor
 
 from bpnp.datamodules.batching import Key, PairDataset
 from bpnp.datamodules.mesh_source import MeshSource
-from bpnp.datamodules.outliers import MIN_TRUE, Amounts, Outliers
+from bpnp.datamodules.outliers import Amounts, Outliers
 from bpnp.datamodules.seeded import normal, permutations, row_keys, uniform
 from bpnp.datamodules.views import Views
-from bpnp.geometry import project, transform
+from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 
 SUBSET, POSE, NOISE, HIDDEN, CLUTTER2D, CLUTTER3D, ORDER2D, ORDER3D = range(8)  # what random numbers are for
@@ -135,7 +135,7 @@ def draw_poses(views: Views, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 
 def _with_outliers(points2d: Tensor, points3d: Tensor, outliers: Amounts, stream: Any) -> tuple[Tensor, Tensor, Tensor]:
     """As `outliers.with_outliers`, for pairs whose 3D point j is 2D point j; the order of the true points is random."""
     n = points3d.shape[1]
-    hidden = max(0, min(round(outliers.occlusion * n), n - MIN_TRUE))
+    hidden = max(0, min(round(outliers.occlusion * n), n - MIN_POINTS))
     hidden2d = {"2d": hidden, "3d": 0, "both": hidden // 2}[outliers.occluded_side]
     true = n - hidden
     # The first `true` points keep both sides, the next lose their 2D point, the last their 3D point.

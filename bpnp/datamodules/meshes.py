@@ -18,7 +18,8 @@ from bpnp.datamodules.pools import SurfacePools
 from bpnp.datamodules.procedural import SPLITS, procedural_pools
 from bpnp.datamodules.surface_store import open_surfaces
 from bpnp.datamodules.surfaces import Normalisation
-from bpnp.datamodules.views import MIN_SEEN, Views
+from bpnp.datamodules.views import Views
+from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 
 
@@ -95,9 +96,9 @@ class MeshDataModule(LightningDataModule):
         cache_dir: str = ".cache/bpnp",
     ) -> None:
         super().__init__()
-        if not MIN_SEEN <= num_points <= pool_size:
+        if not MIN_POINTS <= num_points <= pool_size:
             raise ValueError(
-                f"expected `num_points` from {MIN_SEEN} to `pool_size`, got {num_points} and {pool_size}; "
+                f"expected `num_points` from {MIN_POINTS} to `pool_size`, got {num_points} and {pool_size}; "
                 "try a larger `pool_size`"
             )
         self.root, self.cache_dir = None if root is None else Path(root), Path(cache_dir)

@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.datamodules.batching import Pair, PairSource
+from bpnp.geometry import MIN_POINTS
 
 Side = Literal["both", "2d", "3d"]
 DrawnSide = Literal["both", "2d", "3d", "random"]
 Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each pair
-MIN_TRUE = 4  # pairs that occlusion leaves; fewer do not fix a pose
 STREAM = 7  # of random numbers, apart from those that drew the pair
 
 
@@ -111,7 +111,7 @@ def with_outliers(pair: Pair, outliers: Outliers, rng: np.random.Generator) -> P
     """
     amounts = outliers.drawn(rng)
     true3d = np.flatnonzero(pair.match3d >= 0)
-    hidden = max(0, min(round(amounts.occlusion * len(true3d)), len(true3d) - MIN_TRUE))
+    hidden = max(0, min(round(amounts.occlusion * len(true3d)), len(true3d) - MIN_POINTS))
     split = {"2d": hidden, "3d": 0, "both": hidden // 2}[amounts.occluded_side]
     hidden3d = rng.permutation(true3d)[:hidden]
     pair = select(

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.batching import Pair
+from bpnp.geometry import MIN_POINTS
 
 MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
-MIN_SEEN = 4  # points; fewer do not fix a pose
 
 
 @dataclass(frozen=True)
@@ -75,9 +75,9 @@ def draw_pair(
     rotation, translation = draw_pose(views, rng)
     camera = points3d @ rotation.T + translation
     order = rng.permutation(np.flatnonzero(camera[:, 2] > MIN_DEPTH))  # 2D point i shows 3D point order[i]
-    if len(order) < MIN_SEEN:
+    if len(order) < MIN_POINTS:
         raise ValueError(
-            f"expected at least {MIN_SEEN} points in front of the camera, got {len(order)} in {name}; "
+            f"expected at least {MIN_POINTS} points in front of the camera, got {len(order)} in {name}; "
             "try normalisation unit_sphere or a larger `distance`"
         )
     points2d = camera[order, :2] / camera[order, 2:]

@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.backends import MIN_INLIERS, Estimator, mean_residual, opencv_ransac, poselib_ransac
+from bpnp.robust.backends import Estimator, mean_residual, opencv_ransac, poselib_ransac
 from bpnp.robust.consensus import consensus
 from bpnp.types import SolveStats
 
@@ -117,7 +118,7 @@ def _one_by_one(
     rotation, translation = np.full((b, 3, 3), np.nan), np.full((b, 3), np.nan)
     taken, residual, found = np.zeros(b, int), np.full(b, np.inf), np.zeros(b, bool)
     for i, count in enumerate(pairs.mask.sum(-1).tolist()):
-        if count < MIN_INLIERS:
+        if count < MIN_POINTS:
             continue
         x, p = image[i, :count].cpu().numpy(), scene[i, :count].cpu().numpy()
         # Around the origin, so that a scene far from it loses no digits in the minimal solver.

@@ -8,7 +8,8 @@ import numpy as np
 import poselib
 from numpy.typing import NDArray
 
-MIN_INLIERS = 4  # three points fit up to four poses exactly
+from bpnp.geometry import MIN_POINTS
+
 KEPT = 0.9  # share of its inliers that a refit must keep
 
 
@@ -29,7 +30,7 @@ def mean_residual(
     The returned pose itself is scored: a refit to the inliers of another one may have lost them.
     """
     errors = _inlier_errors(found, points2d, points3d, threshold)
-    return float(errors.mean()) if len(errors) >= MIN_INLIERS else None
+    return float(errors.mean()) if len(errors) >= MIN_POINTS else None
 
 
 def _inlier_errors(

@@ -12,14 +12,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.geometry import bearings, transform
+from bpnp.geometry import MIN_POINTS, bearings, transform
 from bpnp.robust.p3p import p3p
 
 SUBSET = 512  # heaviest pairs, on which all hypotheses are tried; with 256, poses are lost at 10 % inliers
 SHORTLIST = 256  # hypotheses that are then tried on all pairs
 SMALLEST_POOL = 16  # heaviest pairs, from which the first triples are drawn
 FINAL_STEPS = 6
-MINIMUM_INLIERS = 4  # three pairs fit up to four poses exactly
 
 
 class Consensus(NamedTuple):
@@ -95,7 +94,7 @@ def consensus(
         score = torch.where(inlier, residual2, bound).mul(pairs.real.unsqueeze(1)).sum(-1).squeeze(1)
         rotation, translation = poses[:, 0, :, :3], poses[:, 0, :, 3]
         translation = scale * translation - (rotation @ centre.unsqueeze(-1)).squeeze(-1)
-        found = (inlier.sum(-1).squeeze(1) >= MINIMUM_INLIERS) & translation.isfinite().all(-1)
+        found = (inlier.sum(-1).squeeze(1) >= MIN_POINTS) & translation.isfinite().all(-1)
         inliers = torch.zeros_like(usable).scatter(1, order, inlier.squeeze(1)) & found.unsqueeze(-1)
         rotation = torch.where(found[:, None, None], rotation, torch.nan).to(points3d.dtype)
         translation = torch.where(found[:, None], translation, torch.nan).to(points3d.dtype)

@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 from scipy.spatial.transform import Rotation
 
+from bpnp.geometry import MIN_POINTS
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread, solid_angle
 
 SAMPLED = 8  # points a cluster, from which its centre is found
 ITERATIONS = 5
-MINIMUM = 4  # points of either side
 FAR = 20.0  # median distances from the median
 FLAT = 1e-6  # second singular value over the first, below which points lie on a line
 
@@ -77,7 +77,7 @@ class Scene:
 
 def degenerate(points: NDArray[np.float64]) -> bool:
     """Whether there are fewer than 4 points, or all of them lie in one place or on one line."""
-    if len(points) < MINIMUM:
+    if len(points) < MIN_POINTS:
         return True
     values = np.linalg.svd(points - points.mean(0), compute_uv=False)
     extent = max(float(np.abs(points).max()), float(values[0]))

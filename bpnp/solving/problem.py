@@ -9,10 +9,10 @@ import numpy.typing as npt
 import torch
 
 from bpnp.cameras import Camera, in_front
+from bpnp.geometry import MIN_POINTS
 
 Array = npt.NDArray[np.float64]
 Unit = Literal["px", "normalised", "rad"]
-FEWEST = 4
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
 UNIT_NORM = 1e-3
@@ -91,9 +91,9 @@ def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: 
         rays = np.column_stack([plane, np.ones(len(plane))])
         bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
-    if len(usable) < FEWEST:
+    if len(usable) < MIN_POINTS:
         raise ValueError(
-            f"expected {FEWEST} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
+            f"expected {MIN_POINTS} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
         )
     return Problem(
         bearings=bearings[usable],
@@ -126,8 +126,10 @@ def _check_points(name: str, points: Array, widths: tuple[int, ...], where: str)
         swapped = points.ndim == 2 and points.shape[1] in (2, 3)
         hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
         raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
-    if len(points) < FEWEST:
-        raise ValueError(f"expected {FEWEST} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
+    if len(points) < MIN_POINTS:
+        raise ValueError(
+            f"expected {MIN_POINTS} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose"
+        )
     bad = np.flatnonzero(~np.isfinite(points).all(-1))
     if len(bad):
         raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
@@ -170,8 +172,8 @@ def _origin(points3d: Array) -> Array:
 def _degenerate(bearings: Array, points3d: Array) -> str | None:
     for name, points in (("2D", bearings), ("3D", points3d)):
         count = len(np.unique(points, axis=0))
-        if count < FEWEST:
-            return f"only {count} different {name} point{'s' if count > 1 else ''}: {FEWEST} or more fix a pose"
+        if count < MIN_POINTS:
+            return f"only {count} different {name} point{'s' if count > 1 else ''}: {MIN_POINTS} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
     if extents[1] <= FLAT * extents[0]:
         return "the 3D points lie on one line: the camera can turn about it"

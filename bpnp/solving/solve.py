@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from bpnp.geometry import MIN_POINTS
 from bpnp.search.many import Progress
 from bpnp.solving.arguments import device_from, each_camera, each_of, each_set, source_from
 from bpnp.solving.matches import count_one_to_one, fit_pose, mutual_nearest, one_to_one
 from bpnp.solving.priors import Prior, checked_prior
-from bpnp.solving.problem import FEWEST, Array, Problem, problem_from
+from bpnp.solving.problem import Array, Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, no_pose
 from bpnp.solving.sources import Found, Options, found_by
 
@@ -164,7 +165,7 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     for _ in range(FIT_ROUNDS):
         projected = problem.project(rotation, translation, problem.local3d)
         pairs = mutual_nearest(problem.image, projected, threshold)
-        if len(pairs) < FEWEST:
+        if len(pairs) < MIN_POINTS:
             break
         target, points = problem.image[pairs[:, 0]], problem.local3d[pairs[:, 1]]
         project = partial(problem.project, points=points)

@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from bpnp.geometry import bearings
+from bpnp.geometry import MIN_POINTS, bearings
 from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import MIN_POINTS, Clock, Found, PairSolver, SinglePair, generator_for, no_pose
+from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair, generator_for, no_pose
 from bpnp.robust.p3p import p3p
 
 PREVIEW = 32  # 2D points on which every hypothesis is tried

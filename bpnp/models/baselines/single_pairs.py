@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch, Pose, Prediction, SolveStats
-
-MIN_POINTS = 4  # on either side; three pairs fit up to four poses exactly
 
 
 @dataclass(frozen=True)
