@@ -1,5 +1,7 @@
-"""Bearings, rigid motion, projection and angles. Pure functions, any leading axes; camera = R p + t."""
+"""Bearings, rigid motion, projection, angles and rotations. Pure functions, any leading axes; camera = R p + t."""
 
+import numpy as np
+import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -37,6 +39,37 @@ def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     x, y, z = vector.unbind(-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+
+
+def retract(
+    step: Float[Tensor, "*b 6"], rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
+) -> tuple[Float[Tensor, "*b 3 3"], Float[Tensor, "*b 3"]]:
+    """Pose (exp([w]x) R, t + s) after the step (w, s): w in radians, s in the units of t.
+
+    The exponential acts on the left, so that camera coordinates y = R p + t change by w x (R p) + s to first order.
+
+    >>> _, translation = retract(torch.tensor([0.0, 0, 0, 1, 2, 3]), torch.eye(3), torch.zeros(3))
+    >>> translation
+    tensor([1., 2., 3.])
+    """
+    return roma.rotvec_to_rotmat(step[..., :3]) @ rotation, translation + step[..., 3:]
+
+
+def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation of a quaternion (x, y, z, w) of any length; one of normal numbers gives a uniform rotation."""
+    return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
+
+
+def random_rotations(
+    count: int, generator: torch.Generator | np.random.Generator | None = None
+) -> Float[Tensor, "count 3 3"]:
+    """Rotations (count, 3, 3) drawn uniformly over SO(3), float64, on the CPU.
+
+    generator: draws 4 normal numbers a rotation; torch's global generator if None.
+    """
+    if isinstance(generator, np.random.Generator):
+        return quaternion_rotation(torch.from_numpy(generator.standard_normal((count, 4))))
+    return quaternion_rotation(torch.randn(count, 4, generator=generator, dtype=torch.float64))
 
 
 def angle_between(a: Float[Tensor, "*#b 3"], b: Float[Tensor, "*#b 3"]) -> Float[Tensor, "*#b"]:

@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import roma
 import torch
 from torch import Tensor
 
-from bpnp.geometry import bearings, project, transform
+from bpnp.geometry import bearings, project, random_rotations, retract, transform
 from bpnp.types import Batch
 
 
@@ -45,8 +44,8 @@ class Planted:
         """A pose `amount` radians off the true one, and about as many scene units."""
         generator = torch.Generator().manual_seed(seed)
         turn, shift = (_normal(generator, len(self.rotation), 3).to(self.rotation.dtype) for _ in range(2))
-        turn = amount * torch.nn.functional.normalize(turn, dim=-1)
-        return roma.rotvec_to_rotmat(turn) @ self.rotation, self.translation + amount * shift
+        turn = torch.nn.functional.normalize(turn, dim=-1)
+        return retract(amount * torch.cat([turn, shift], -1), self.rotation, self.translation)
 
     def batch(self) -> Batch:
         return Batch.from_arrays(self.points2d, self.points3d, self.rotation, self.translation, self.match3d)
@@ -73,7 +72,7 @@ def plant(
     The image points are shuffled and disturbed by normal `noise`; the outliers of each side have no match.
     """
     generator = torch.Generator().manual_seed(seed)
-    rotation = roma.unitquat_to_rotmat(torch.nn.functional.normalize(_normal(generator, size, 4), dim=-1))
+    rotation = random_rotations(size, generator)
     points3d = 0.7 * _normal(generator, size, points + outliers3d, 3).clamp(-2, 2)
     translation = torch.rand(size, 3, generator=generator, dtype=torch.float64) - 0.5
     translation[:, 2] += 5

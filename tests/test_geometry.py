@@ -7,7 +7,18 @@ import torch
 from planted import plant
 from scipy.spatial.transform import Rotation
 
-from bpnp.geometry import angle_between, bearings, camera_centre, hat, project, rotation_angle, transform
+from bpnp.geometry import (
+    angle_between,
+    bearings,
+    camera_centre,
+    hat,
+    project,
+    quaternion_rotation,
+    random_rotations,
+    retract,
+    rotation_angle,
+    transform,
+)
 
 
 def test_bearings_are_unit_rays_through_the_image_points() -> None:
@@ -86,3 +97,45 @@ def test_gradients_are_finite_where_angles_end() -> None:
     angle_between(x, y).sum().backward()
     assert x.grad is not None
     assert x.grad.isfinite().all()
+
+
+def test_a_step_multiplies_by_the_matrix_exponential_on_the_left() -> None:
+    step = torch.randn(2, 5, 6, dtype=torch.float64)
+    pose = random_rotations(10).unflatten(0, (2, 5)), torch.randn(2, 5, 3, dtype=torch.float64)
+    rotation, translation = retract(step, *pose)
+    torch.testing.assert_close(rotation, torch.linalg.matrix_exp(hat(step[..., :3])) @ pose[0])
+    torch.testing.assert_close(translation, pose[1] + step[..., 3:])
+
+
+def test_a_step_has_a_derivative_at_zero() -> None:
+    rotation, translation = random_rotations(1), torch.randn(1, 3, dtype=torch.float64)
+    points = torch.randn(1, 4, 3, dtype=torch.float64)
+
+    def camera(step: torch.Tensor) -> torch.Tensor:
+        return transform(*retract(step, rotation, translation), points)
+
+    zero = torch.zeros(1, 6, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(camera, (zero,))
+
+
+def test_quaternions_of_any_length_are_scipys_rotations() -> None:
+    quaternion = np.random.default_rng(0).normal(size=(20, 4))
+    found = quaternion_rotation(torch.from_numpy(3 * quaternion))
+    np.testing.assert_allclose(found, Rotation.from_quat(quaternion).as_matrix(), atol=1e-14)
+
+
+@pytest.mark.parametrize("kind", ["torch", "numpy"])
+def test_random_rotations_are_uniform_and_repeatable(kind: str) -> None:
+    """Uniform over SO(3): the angle between two has the density (1 - cos a) / pi, each entry the mean square 1/3."""
+
+    def draw() -> torch.Tensor:
+        torch_generator = torch.Generator().manual_seed(4)
+        return random_rotations(4000, torch_generator if kind == "torch" else np.random.default_rng(4))
+
+    rotation = draw()
+    assert torch.equal(rotation, draw())
+    torch.testing.assert_close(torch.linalg.det(rotation), torch.ones(4000, dtype=torch.float64))
+    torch.testing.assert_close(rotation.square().mean(0), torch.full((3, 3), 1 / 3).double(), atol=0.02, rtol=0)
+    angle = rotation_angle(rotation[::2], rotation[1::2])
+    below = (angle < 2.0).double().mean()
+    assert abs(float(below) - (2.0 - math.sin(2.0)) / math.pi) < 0.04

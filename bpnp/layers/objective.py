@@ -8,7 +8,6 @@ cost of an evaluation is O(n), not O(m n). Perturbations act on the left: y = ex
 from dataclasses import dataclass
 from typing import Any
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -103,11 +102,6 @@ def derivatives(q: Tensor, points3d: Tensor, rotation: Tensor, translation: Tens
     top = torch.cat([rotation_block + bend, mixed], -1)
     bottom = torch.cat([mixed.mT, g.sum(-3)], -1)
     return Derivatives(-qu.sum((-2, -1)), _gradient(rotated, h), torch.cat([top, bottom], -2))
-
-
-def retract(step: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """Apply a left perturbation (w, s): exp([w]x) R, t + s."""
-    return roma.rotvec_to_rotmat(step[..., :3]) @ rotation, translation + step[..., 3:]
 
 
 def _point_gradient(q: Tensor, y: Tensor) -> Tensor:

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from bpnp.geometry import hat, is_finite
+from bpnp.geometry import hat, is_finite, retract
 from bpnp.layers.implicit import at_optimum
-from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient, retract
+from bpnp.layers.objective import Derivatives, aggregate, dense_objective, derivatives, pose_gradient
 from bpnp.layers.pacing import steps, unfinished
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats

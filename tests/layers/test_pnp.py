@@ -2,12 +2,11 @@ from typing import Any
 
 import jaxtyping
 import pytest
-import roma
 import torch
 from planted import Planted, plant
 from torch import Tensor
 
-from bpnp.geometry import camera_centre, hat, rotation_angle, transform
+from bpnp.geometry import camera_centre, hat, random_rotations, rotation_angle, transform
 from bpnp.layers import WeightedPnP, weighted_pnp
 from bpnp.layers.objective import aggregate, dense_objective, derivatives, pose_gradient
 from bpnp.types import SolveStats
@@ -147,7 +146,7 @@ def test_the_pose_moves_with_the_scene() -> None:
     assignment = planted.diffuse(0.1)
     rotation, translation = planted.near(0.1)
     r, t, _ = solve(planted, assignment, (rotation, translation), tolerance=1e-12)
-    turn, shift = roma.random_rotmat(dtype=torch.float64), 100 * torch.randn(3, dtype=torch.float64)
+    turn, shift = random_rotations(1)[0], 100 * torch.randn(3, dtype=torch.float64)
     for scale in (1e-3, 1.0, 1e3):
         points3d = scale * planted.points3d @ turn.mT + shift  # p' = s A p + d
         start_r = rotation @ turn.mT
