@@ -20,6 +20,7 @@ GROUND = {
     "compilation",
     "thread_pool",
     "precision",
+    "shapes",
     "distinct_poses",
 }
 # What each part may import beside itself and the ground floor.
