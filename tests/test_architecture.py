@@ -20,7 +20,7 @@ GROUND = {
     "compilation",
     "thread_pool",
     "precision",
-    "shapes",
+    "checks",
     "distinct_poses",
 }
 # What each part may import beside itself and the ground floor.

@@ -1,4 +1,4 @@
-"""Tensor arguments checked against their jaxtyping annotations, for callers that do not run a type checker."""
+"""Arguments that callers without a type checker can get wrong: one clear ValueError each."""
 
 import functools
 import inspect
@@ -40,6 +40,13 @@ def checked_shapes(function: _F) -> _F:
         return function(*arguments, **options)
 
     return run  # type: ignore[return-value]
+
+
+def check_positive(**options: float) -> None:
+    """Raise ValueError that names the first option that is not above zero, NaN included."""
+    for name, value in options.items():
+        if not value > 0:
+            raise ValueError(f"expected `{name}` > 0, got {value}")
 
 
 def _tensor_type(hint: Any) -> Any:
