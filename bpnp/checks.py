@@ -42,7 +42,7 @@ def checked_shapes(function: _F) -> _F:
     return run  # type: ignore[return-value]
 
 
-def check_positive(**options: float) -> None:
+def check_positive(**options: int | float) -> None:
     """Raise ValueError that names the first option that is not above zero, NaN included."""
     for name, value in options.items():
         if not value > 0:
