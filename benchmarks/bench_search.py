@@ -17,7 +17,7 @@ import pandas as pd
 import torch
 
 from bpnp.datamodules import ColmapDataModule, MeshDataModule
-from bpnp.datamodules.batching import PairSource
+from bpnp.datamodules.loader import PairSource
 from bpnp.datamodules.outliers import Outliers
 from bpnp.geometry import bearings
 from bpnp.metrics.errors import rotation_error, translation_error

@@ -16,7 +16,7 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from bpnp.commands import convert_weights, prepare
-from bpnp.datamodules.photos import photo_finder
+from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.localization import localize_command, solve_command
 from bpnp.report import report_command, view_command
 from bpnp.report.dashboards import wandb_command

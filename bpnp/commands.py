@@ -13,7 +13,7 @@ import torch
 from rich.console import Console
 
 from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
-from bpnp.datamodules.preprocessed import prepare_preprocessed
+from bpnp.datamodules.released.module import prepare_preprocessed
 from bpnp.files import written_whole
 from bpnp.models.released import load_released
 from bpnp.training.task import BlindPnPTask

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bpnp.datamodules.procedural import procedural_shape
-from bpnp.datamodules.surfaces import Mesh
+from bpnp.datamodules.meshes.procedural import procedural_shape
+from bpnp.datamodules.meshes.surfaces import Mesh
 
 SMALL_NET = ["--model.solver=bpnp.models.BPnPNet", "--model.solver.channels=16", "--model.solver.blocks=2"]
 SMALL_MESHES = [

@@ -6,7 +6,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.batching import Pair, PairSource
+from bpnp.datamodules.loader import Pair, PairSource
 from bpnp.geometry import MIN_POINTS
 
 Side = Literal["both", "2d", "3d"]

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.batching import Pair
+from bpnp.datamodules.loader import Pair
 from bpnp.datamodules.manifest import StoreError, new_store, read_manifest, write_manifest
 
 KIND = "pairs"

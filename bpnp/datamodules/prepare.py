@@ -9,17 +9,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.colmap_format import FILES, ColmapError
-from bpnp.datamodules.colmap_pairs import ColmapSource
-from bpnp.datamodules.colmap_scenes import find_scenes
+from bpnp.datamodules.colmap.model_files import FILES, ColmapError
+from bpnp.datamodules.colmap.pairs import ColmapSource
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.scenes import find_scenes
+from bpnp.datamodules.loader import Pair
 from bpnp.datamodules.manifest import StoreError, fingerprint
-from bpnp.datamodules.mesh_archives import MeshArchive, open_archive
+from bpnp.datamodules.meshes.archives import MeshArchive, open_archive
+from bpnp.datamodules.meshes.surface_store import open_surfaces, write_surfaces
+from bpnp.datamodules.meshes.surfaces import MeshError, Normalisation
 from bpnp.datamodules.pair_store import PairStore, write_pairs
-from bpnp.datamodules.reconstruction import read_reconstruction
-from bpnp.datamodules.shards import make_once, make_parts
-from bpnp.datamodules.surface_store import open_surfaces, write_surfaces
-from bpnp.datamodules.surfaces import MeshError, Normalisation
+from bpnp.datamodules.parts import make_once, make_parts
 
 MESHES_A_PART = 64
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import Pair
+from bpnp.datamodules.loader import Pair
 from bpnp.datamodules.manifest import StoreError
 from bpnp.datamodules.outliers import Side, select
 from bpnp.datamodules.pair_store import PairStore

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from bpnp.datamodules.colmap_pairs import ColmapSource
-from bpnp.datamodules.colmap_scenes import find_scenes
-from bpnp.datamodules.photos import photo_finder
-from bpnp.datamodules.reconstruction import Reconstruction, read_reconstruction
+from bpnp.datamodules.colmap.pairs import ColmapSource
+from bpnp.datamodules.colmap.photos import photo_finder
+from bpnp.datamodules.colmap.reconstruction import Reconstruction, read_reconstruction
+from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.localization.from_files import add_search_options, write_text
 from bpnp.localization.localized import Localized, images_text, localized, localized_table, summary
 from bpnp.localization.slow_progress import SlowProgress

@@ -13,8 +13,8 @@ from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.reconstruction import ImagePoints
+from bpnp.datamodules.colmap.reconstruction import ImagePoints
+from bpnp.datamodules.loader import Pair
 from bpnp.metrics.errors import centre_error, rotation_error
 from bpnp.report.pictures import VERDICTS
 from bpnp.report.tables import number

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.datamodules.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
+from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
 
 Array = npt.NDArray[np.float64]
 TEXTS = (".csv", ".txt", ".xyz")

@@ -10,7 +10,7 @@ import pytest
 from planted_model import plant_model
 
 from bpnp.cli import main
-from bpnp.datamodules.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.localization.from_models import image_source
 
 

@@ -10,7 +10,7 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader, SequentialSampler
 
-from bpnp.datamodules.batching import BucketSampler, Pair, PairDataset, PairLoader, collate, pair_loader
+from bpnp.datamodules.loader import BucketSampler, Pair, PairDataset, PairLoader, collate, pair_loader
 
 
 class Numbered:

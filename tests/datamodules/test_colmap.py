@@ -7,9 +7,9 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
 
-from bpnp.datamodules.colmap import ColmapDataModule
-from bpnp.datamodules.colmap_format import ColmapError
-from bpnp.datamodules.colmap_scenes import find_scenes, split_scenes
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.module import ColmapDataModule
+from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
 from bpnp.types import Batch
 
 

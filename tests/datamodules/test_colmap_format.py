@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from planted_model import plant_model
 
-from bpnp.datamodules.colmap_format import ColmapError
-from bpnp.datamodules.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 
 
 @pytest.mark.parametrize("suffix", ["bin", "txt"])

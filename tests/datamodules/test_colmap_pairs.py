@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from planted_model import plant_model
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.colmap_format import ColmapError
-from bpnp.datamodules.colmap_pairs import ColmapSource
-from bpnp.datamodules.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.pairs import ColmapSource
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.datamodules.loader import Pair
 
 
 def source(folder: Path, *, plant: dict | None = None, **options) -> ColmapSource:

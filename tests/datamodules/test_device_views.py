@@ -10,13 +10,13 @@ from scipy.stats import ks_2samp, kstest
 
 from bpnp import Batch
 from bpnp.datamodules import MeshDataModule, Outliers
-from bpnp.datamodules.batching import collate
-from bpnp.datamodules.device_views import DeviceViews, KeyDataset
-from bpnp.datamodules.mesh_source import MeshSource
+from bpnp.datamodules.loader import collate
+from bpnp.datamodules.meshes.device_views import DeviceViews, KeyDataset
+from bpnp.datamodules.meshes.pools import SurfacePools
+from bpnp.datamodules.meshes.source import MeshSource
+from bpnp.datamodules.meshes.views import Views
 from bpnp.datamodules.outliers import harder
-from bpnp.datamodules.pools import SurfacePools
 from bpnp.datamodules.seeded import normal, permutations, random_bits, row_keys, uniform
-from bpnp.datamodules.views import Views
 from bpnp.geometry import project, transform
 
 CPU = torch.device("cpu")

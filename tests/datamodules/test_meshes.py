@@ -10,11 +10,11 @@ import trimesh
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import PairSource
-from bpnp.datamodules.mesh_source import MeshSource, hold_out
-from bpnp.datamodules.meshes import MeshDataModule
-from bpnp.datamodules.pools import SurfacePools
-from bpnp.datamodules.views import Views, draw_pair
+from bpnp.datamodules.loader import PairSource
+from bpnp.datamodules.meshes.module import MeshDataModule
+from bpnp.datamodules.meshes.pools import SurfacePools
+from bpnp.datamodules.meshes.source import MeshSource, hold_out
+from bpnp.datamodules.meshes.views import Views, draw_pair
 
 
 def cloud(models: int = 5, samples: int = 400) -> SurfacePools:

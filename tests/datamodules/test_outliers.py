@@ -9,7 +9,7 @@ from jsonargparse import ArgumentParser
 from scipy import stats
 
 from bpnp.datamodules import MeshDataModule
-from bpnp.datamodules.batching import Pair, PairSource
+from bpnp.datamodules.loader import Pair, PairSource
 from bpnp.datamodules.outliers import Outliers, harder, select, with_outliers
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bpnp.datamodules.batching import Pair, PairSource, pair_loader
+from bpnp.datamodules.loader import Pair, PairSource, pair_loader
 from bpnp.datamodules.manifest import StoreError, is_store
 from bpnp.datamodules.pair_store import PairStore, write_pairs
 from bpnp.datamodules.store_source import StoreSource

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bpnp.datamodules.pools import SurfacePools, open_pools
-from bpnp.datamodules.surfaces import MeshError
+from bpnp.datamodules.meshes.pools import SurfacePools, open_pools
+from bpnp.datamodules.meshes.surfaces import MeshError
 
 NAMES = ["a", "b", "c"]
 

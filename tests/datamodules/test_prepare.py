@@ -17,11 +17,11 @@ from bpnp.commands import prepare
 from bpnp.datamodules import ColmapDataModule, MeshDataModule
 from bpnp.datamodules import prepare as preparing
 from bpnp.datamodules.manifest import StoreError, is_store
-from bpnp.datamodules.mesh_folder import folder_pools
+from bpnp.datamodules.meshes.folder import folder_pools
+from bpnp.datamodules.meshes.surface_store import SurfaceStore, open_surfaces, write_surfaces
 from bpnp.datamodules.outliers import Outliers
 from bpnp.datamodules.pair_store import PairStore
 from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
-from bpnp.datamodules.surface_store import SurfaceStore, open_surfaces, write_surfaces
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",

@@ -12,8 +12,8 @@ from bpnp.commands import prepare
 from bpnp.datamodules.manifest import StoreError
 from bpnp.datamodules.outliers import Outliers
 from bpnp.datamodules.pair_store import PairStore
-from bpnp.datamodules.preprocessed import PreprocessedDataModule, prepare_preprocessed
-from bpnp.datamodules.restricted import PickleError
+from bpnp.datamodules.released.module import PreprocessedDataModule, prepare_preprocessed
+from bpnp.datamodules.released.pickles import PickleError
 
 Sample = dict[str, np.ndarray]
 

@@ -9,9 +9,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.pools import SurfacePools
-from bpnp.datamodules.procedural import procedural_pools, procedural_shape
-from bpnp.datamodules.surfaces import normalise, sample_surface
+from bpnp.datamodules.meshes.pools import SurfacePools
+from bpnp.datamodules.meshes.procedural import procedural_pools, procedural_shape
+from bpnp.datamodules.meshes.surfaces import normalise, sample_surface
 
 
 def pools(folder: Path, split: str, count: int, *, seed: int = 0) -> SurfacePools:

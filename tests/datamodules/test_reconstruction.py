@@ -11,7 +11,7 @@ import pytest
 from planted_model import HEIGHT, OPENCV, WIDTH, plant_model
 
 from bpnp.cameras import camera_models
-from bpnp.datamodules.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 SIMPLE_RADIAL = ("SIMPLE_RADIAL", [700.0, 400.0, 300.0, -0.35])

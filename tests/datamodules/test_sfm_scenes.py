@@ -10,10 +10,10 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules import Outliers, Pair, PairSource, SfmSceneDataModule
+from bpnp.datamodules.facades.module import SfmSceneSource
+from bpnp.datamodules.facades.scenes import Walls, draw_scene
+from bpnp.datamodules.facades.views import SfmOptions, draw_camera, hidden, look
 from bpnp.datamodules.outliers import Drawn
-from bpnp.datamodules.sfm_scene_module import SfmSceneSource
-from bpnp.datamodules.sfm_scenes import Walls, draw_scene
-from bpnp.datamodules.sfm_views import SfmOptions, draw_camera, hidden, look
 
 
 def source(*, seed: int = 0, split: str = "train", fresh: bool = True, **options: object) -> SfmSceneSource:

@@ -13,7 +13,7 @@ from report_data import view, write_run
 from rich.console import Console
 
 from bpnp.cli import COMMANDS
-from bpnp.datamodules.photos import photo_finder
+from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.report import plot_pair, view_command, write_page
 from bpnp.report.photos import Box, box_of
 from bpnp.report.solutions import solution_view

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.colmap_format import ColmapError
-from bpnp.datamodules.reconstruction import ImagePoints, Reconstruction
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction
+from bpnp.datamodules.loader import Pair
 
 Side = Literal["both", "2d", "3d"]
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance

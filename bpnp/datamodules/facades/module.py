@@ -5,10 +5,10 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import STAGES, Pair, PairSource, pair_loader
+from bpnp.datamodules.facades.views import SfmOptions, draw_sfm_pair
+from bpnp.datamodules.loader import STAGES, Pair, PairSource, pair_loader
+from bpnp.datamodules.meshes.procedural import SPLITS
 from bpnp.datamodules.outliers import Drawn, DrawnSide, Outliers, bounds, harder
-from bpnp.datamodules.procedural import SPLITS
-from bpnp.datamodules.sfm_views import SfmOptions, draw_sfm_pair
 from bpnp.types import Batch
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from bpnp.datamodules.colmap_scenes import find_scenes
-from bpnp.datamodules.reconstruction import read_projections
+from bpnp.datamodules.colmap.reconstruction import read_projections
+from bpnp.datamodules.colmap.scenes import find_scenes
 
 FOLDERS = ("images", "imgs", "dense/images", "dense0/imgs", "dense0/images")
 UP = 4  # levels above a model: <scene>/sparse/manhattan/0

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 
-from bpnp.datamodules.surfaces import MeshError
+from bpnp.datamodules.meshes.surfaces import MeshError
 
 FORMAT = 1  # raised whenever the files below change their meaning
 

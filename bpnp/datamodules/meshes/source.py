@@ -5,10 +5,10 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.pools import SurfacePools
-from bpnp.datamodules.procedural import SPLITS
-from bpnp.datamodules.views import Views, draw_pair
+from bpnp.datamodules.loader import Pair
+from bpnp.datamodules.meshes.pools import SurfacePools
+from bpnp.datamodules.meshes.procedural import SPLITS
+from bpnp.datamodules.meshes.views import Views, draw_pair
 
 
 def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

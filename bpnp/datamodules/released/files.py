@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.batching import Pair
-from bpnp.datamodules.restricted import PickleError, load_pickle
+from bpnp.datamodules.loader import Pair
+from bpnp.datamodules.released.pickles import PickleError, load_pickle
 from bpnp.geometry import MIN_POINTS
 
 SPLITS = ("train", "test")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, camera_models, colmap_camera
-from bpnp.datamodules.colmap_format import CameraRecord, ColmapError, ImageRecord, read_records
+from bpnp.datamodules.colmap.model_files import CameraRecord, ColmapError, ImageRecord, read_records
 
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
 logger = logging.getLogger(__name__)

@@ -17,11 +17,11 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.datamodules.batching import Key, PairDataset
-from bpnp.datamodules.mesh_source import MeshSource
+from bpnp.datamodules.loader import Key, PairDataset
+from bpnp.datamodules.meshes.source import MeshSource
+from bpnp.datamodules.meshes.views import Views
 from bpnp.datamodules.outliers import Amounts, Outliers
 from bpnp.datamodules.seeded import normal, permutations, row_keys, uniform
-from bpnp.datamodules.views import Views
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.datamodules.manifest import StoreError, new_store, read_manifest, write_manifest
-from bpnp.datamodules.pools import SurfacePools
+from bpnp.datamodules.meshes.pools import SurfacePools
 
 KIND = "surfaces"
 

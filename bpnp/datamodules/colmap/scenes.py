@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bpnp.datamodules.colmap_format import FILES, ColmapError, model_format
+from bpnp.datamodules.colmap.model_files import FILES, ColmapError, model_format
 
 # What lies between the folder of a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
 # <scene>/dense/0/sparse.

@@ -14,8 +14,8 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.mesh_folder import LAYOUT, mesh_files
-from bpnp.datamodules.surfaces import (
+from bpnp.datamodules.meshes.folder import LAYOUT, mesh_files
+from bpnp.datamodules.meshes.surfaces import (
     SUFFIXES,
     MeshError,
     Normalisation,

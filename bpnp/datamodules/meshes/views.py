@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import Pair
+from bpnp.datamodules.loader import Pair
 from bpnp.geometry import MIN_POINTS
 
 MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.pools import SurfacePools, open_pools
-from bpnp.datamodules.surfaces import Mesh, Normalisation, normalise, primitives, sample_surface
+from bpnp.datamodules.meshes.pools import SurfacePools, open_pools
+from bpnp.datamodules.meshes.surfaces import Mesh, Normalisation, normalise, primitives, sample_surface
 
 VERSION = 1  # raised whenever the same seed makes another shape
 

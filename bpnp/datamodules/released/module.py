@@ -8,14 +8,14 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.authors_files import FOCAL, SPLITS, find_parts, read_part
-from bpnp.datamodules.batching import STAGES, Pair, PairSource, pair_loader
+from bpnp.datamodules.loader import STAGES, Pair, PairSource, pair_loader
 from bpnp.datamodules.manifest import fingerprint, is_store
-from bpnp.datamodules.mesh_source import hold_out
+from bpnp.datamodules.meshes.source import hold_out
 from bpnp.datamodules.outliers import Outliers, harder
 from bpnp.datamodules.pair_store import PairStore, write_pairs
+from bpnp.datamodules.parts import make_once
 from bpnp.datamodules.prepare import Prepared, nothing_usable
-from bpnp.datamodules.shards import make_once
+from bpnp.datamodules.released.files import FOCAL, SPLITS, find_parts, read_part
 from bpnp.datamodules.store_source import StoreSource
 from bpnp.types import Batch
 

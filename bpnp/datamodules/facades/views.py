@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.batching import Pair
+from bpnp.datamodules.facades.scenes import Array, Scene, Walls, draw_scene
+from bpnp.datamodules.loader import Pair
 from bpnp.datamodules.outliers import Drawn, DrawnSide, bounds, draw, draw_side
-from bpnp.datamodules.sfm_scenes import Array, Scene, Walls, draw_scene
 
 LONG_SIDE = 1200.0  # of an image, pixels: a focal length of 800 to 1650 pixels at 75 to 40 degrees
 MIN_DEPTH = 0.5  # metres; nothing nearer to the camera is seen

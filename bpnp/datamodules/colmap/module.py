@@ -11,14 +11,14 @@ from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import PairSource, pair_loader
-from bpnp.datamodules.colmap_format import ColmapError
-from bpnp.datamodules.colmap_pairs import ColmapSource, Side
-from bpnp.datamodules.colmap_scenes import find_scenes, split_scenes
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.pairs import ColmapSource, Side
+from bpnp.datamodules.colmap.reconstruction import Reconstruction, read_reconstruction
+from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
+from bpnp.datamodules.loader import PairSource, pair_loader
 from bpnp.datamodules.manifest import is_store
 from bpnp.datamodules.outliers import Outliers, harder
 from bpnp.datamodules.pair_store import PairStore
-from bpnp.datamodules.reconstruction import Reconstruction, read_reconstruction
 from bpnp.datamodules.store_source import StoreSource
 from bpnp.types import Batch
 

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.pools import SurfacePools, open_pools
-from bpnp.datamodules.surfaces import SUFFIXES, Normalisation, normalise, read_mesh, sample_surface
+from bpnp.datamodules.meshes.pools import SurfacePools, open_pools
+from bpnp.datamodules.meshes.surfaces import SUFFIXES, Normalisation, normalise, read_mesh, sample_surface
 
 LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
 

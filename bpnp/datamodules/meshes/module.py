@@ -8,17 +8,17 @@ from lightning import LightningDataModule
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.batching import STAGES, PairDataset, PairSource, pair_loader
-from bpnp.datamodules.device_views import DeviceViews, KeyDataset, ViewKeys
+from bpnp.datamodules.loader import STAGES, PairDataset, PairSource, pair_loader
 from bpnp.datamodules.manifest import StoreError, is_store
-from bpnp.datamodules.mesh_folder import folder_pools
-from bpnp.datamodules.mesh_source import MeshSource, hold_out
+from bpnp.datamodules.meshes.device_views import DeviceViews, KeyDataset, ViewKeys
+from bpnp.datamodules.meshes.folder import folder_pools
+from bpnp.datamodules.meshes.pools import SurfacePools
+from bpnp.datamodules.meshes.procedural import SPLITS, procedural_pools
+from bpnp.datamodules.meshes.source import MeshSource, hold_out
+from bpnp.datamodules.meshes.surface_store import open_surfaces
+from bpnp.datamodules.meshes.surfaces import Normalisation
+from bpnp.datamodules.meshes.views import Views
 from bpnp.datamodules.outliers import Outliers, harder
-from bpnp.datamodules.pools import SurfacePools
-from bpnp.datamodules.procedural import SPLITS, procedural_pools
-from bpnp.datamodules.surface_store import open_surfaces
-from bpnp.datamodules.surfaces import Normalisation
-from bpnp.datamodules.views import Views
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 

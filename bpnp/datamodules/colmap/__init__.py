@@ -1,0 +1,1 @@
+"""Photos with known poses, in COLMAP models."""

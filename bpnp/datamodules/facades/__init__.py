@@ -1,0 +1,1 @@
+"""Random scenes like sparse SfM maps of buildings."""

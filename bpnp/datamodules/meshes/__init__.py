@@ -1,0 +1,1 @@
+"""Meshes, or procedural shapes, seen by virtual cameras."""
