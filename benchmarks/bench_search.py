@@ -21,8 +21,9 @@ from bpnp.datamodules.loader import PairSource
 from bpnp.datamodules.outliers import Outliers
 from bpnp.geometry import bearings
 from bpnp.metrics.errors import rotation_error, translation_error
-from bpnp.search.many import search_candidates
-from bpnp.search.verdict import judge
+from bpnp.search.annealing import Deadline
+from bpnp.search.many import search_poses
+from bpnp.search.settings import SearchSettings
 from bpnp.types import Batch
 
 EVERYTHING = 1e6
@@ -49,7 +50,9 @@ def source(name: str, data: Path, limit: int) -> PairSource:
     return module.sources["test"]
 
 
-def run(name: str, data: Path, limit: int, seed: int, time_limit: float | None, max_batches: int) -> list[dict]:
+def run(
+    name: str, data: Path, limit: int, seed: int, settings: SearchSettings, time_limit: float | None = None
+) -> list[dict]:
     pairs = source(name, data, limit)
     count = len(pairs.sizes)
     rows = []
@@ -57,28 +60,26 @@ def run(name: str, data: Path, limit: int, seed: int, time_limit: float | None, 
         pair = pairs.pair(i, 0)
         batch = Batch.from_arrays(pair.points2d, pair.points3d, pair.rotation, pair.translation)
         start, cpu = time.perf_counter(), time.process_time()
-        found = search_candidates(
-            bearings(batch.points2d),
-            batch.points3d,
+        found = search_poses(
+            bearings(batch.points2d)[0].double().numpy(),
+            batch.points3d[0].double().numpy(),
             seed=seed,
-            time_limit=time_limit,
-            max_batches=max_batches,
+            deadline=Deadline.after(time_limit),
+            settings=settings,
         )
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         assert batch.rotation is not None
         assert batch.translation is not None
-        rotation = float(rotation_error(found.rotation[:, 0], batch.rotation))
-        translation = float(translation_error(found.translation[:, 0], batch.translation))
-        verdict, _ = judge(found, 0, len(pair.points2d), len(pair.points3d))
+        turn, shift = (torch.as_tensor(values)[None] for values in found.best)
         rows.append(
             {
                 "pair": pair.name,
-                "rotation_deg": rotation,
-                "translation": translation,
-                "verdict": verdict,
-                "scale_deg": float(found.scale[0, 0].rad2deg()),
-                "matched": float(found.matched[0, 0]),
-                "batches": int(found.stats.iterations[0]),
+                "rotation_deg": float(rotation_error(turn, batch.rotation.double())),
+                "translation": float(translation_error(shift, batch.translation.double())),
+                "verdict": found.verdict,
+                "scale_deg": float(np.rad2deg(found.residual)),
+                "matched": float(found.candidates.matched[0]) if len(found.candidates) else 0.0,
+                "batches": found.batches,
                 "seconds": seconds,
                 "cpu_seconds": cpu,
                 "points": [len(pair.points2d), len(pair.points3d)],
@@ -123,10 +124,11 @@ def main() -> None:
     parser.add_argument("--pairs", type=Path, help="folder for a CSV of each set's pairs")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    run("psb", options.data, 1, 0, None, 1)  # compiles
+    settings = SearchSettings(max_batches=options.max_batches)
+    run("psb", options.data, 1, 0, SearchSettings(max_batches=1))  # compiles
     results = json.loads(options.output.read_text()) if options.output and options.output.exists() else {}
     for name in options.sets:
-        rows = run(name, options.data, options.limit, options.seed, options.time_limit, options.max_batches)
+        rows = run(name, options.data, options.limit, options.seed, settings, options.time_limit)
         row = summary(name, rows)
         q = " / ".join(f"{value:.2f}" for value in row["rotation_q_deg"])
         print(

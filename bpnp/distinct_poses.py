@@ -1,16 +1,16 @@
 """Picking the best of many poses of which no two are nearly the same."""
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float32]
-SAME_DEG, SAME_SHIFT = 3.0, 0.05  # poses closer than this, in degrees and in extents of the scene, are one
+Array = NDArray[np.floating[Any]]
 
 
-def near(rotation: Array, translation: Array, i: int, degrees: float, shift: float) -> NDArray[np.bool_]:
-    """Which poses are within both limits of pose i."""
+def same_pose(rotation: Array, translation: Array, i: int, degrees: float, shift: float) -> NDArray[np.bool_]:
+    """Which poses (c, 3, 3), (c, 3) are within `degrees` and `shift` of pose i, itself among them; NaN is not."""
     flat = rotation.reshape(-1, 9)
     turned = flat @ flat[i] < 1 + 2 * math.cos(math.radians(degrees))
     return ~turned & (np.linalg.norm(translation - translation[i], axis=-1) <= shift)
@@ -27,5 +27,5 @@ def distinct(
             break
         if free[i]:
             kept.append(i)
-            free &= ~near(rotation, translation, i, degrees, shift)
+            free &= ~same_pose(rotation, translation, i, degrees, shift)
     return np.array(kept, dtype=np.int64)

@@ -110,7 +110,7 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
         rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {error}") from error
-    return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)  # type: ignore[arg-type]
+    return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)
 
 
 def solution_table(solution: Solution) -> Table:

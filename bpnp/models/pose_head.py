@@ -10,9 +10,9 @@ from torch import Tensor, nn
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
+from bpnp.models.search_solver import Refine
 from bpnp.models.support import log_support
 from bpnp.robust.proposals import pose_hypotheses
-from bpnp.search.refine import Refine
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 Rematch = Callable[[Pose], Prediction]  # the assignment under a pose

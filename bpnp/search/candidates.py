@@ -1,80 +1,78 @@
-"""The distinct poses that a search has met, and how sure the best of them is."""
+"""Candidate poses of one pair: the one record of them, and how poses that are the same are merged."""
 
 import math
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import SAME_DEG, SAME_SHIFT, distinct, near
-from bpnp.search.scene import Scene
-from bpnp.search.starts import Array
-
-OTHER_DEG = 10.0  # poses farther apart than this answer differently
-FAR_AHEAD, FAR_HITS, AHEAD, SAFE_HITS = 100.0, 2, 20.0, 4  # nats, and batches that found the pose
-SAFE_MATCHED, OVER_CHANCE, PLAUSIBLE, PLAUSIBLE_MATCHED = 0.2, 6.0, 2.0, 0.25
-MOST_STALLED, BETTER = 4, 0.002  # batches, and nats a bearing
+from bpnp.distinct_poses import distinct, same_pose
+from bpnp.search.settings import SearchSettings
 
 
-class Pool(NamedTuple):
-    """Distinct poses in the frame of a `Scene`, best first.
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """c poses of one pair, camera = R p + t, and how well they explain the bearings.
 
-    result (c, 3): likelihood, matched share and scale. hits (c,): batches whose own starts ended there.
+    rotation: (c, 3, 3). translation: (c, 3). In the frame of a `Scene` in float32, in that of the user in float64.
+    score: (c,) mean log-likelihood of the bearings, nats; -inf for a pose that the points do not fix.
+    matched: (c,) expected share of min(m, n) points that have a partner.
+    scale: (c,) standard deviation of the residuals per axis, radians, at which score and matched were taken.
+    hits: (c,) batches whose own starts ended at this pose.
     """
 
-    rotation: Array
-    translation: Array
-    result: Array
+    rotation: NDArray[Any]
+    translation: NDArray[Any]
+    score: NDArray[Any]
+    matched: NDArray[Any]
+    scale: NDArray[Any]
     hits: NDArray[np.int64]
 
-    def joined(self, other: "Pool", count: int) -> "Pool":
-        """The best `count` distinct poses of both; a pose that both have counts the hits of both."""
-        rotation = np.concatenate([self.rotation, other.rotation])
-        translation = np.concatenate([self.translation, other.translation])
-        result, hits = np.concatenate([self.result, other.result]), np.concatenate([self.hits, other.hits])
-        kept = distinct(rotation, translation, result[:, 0], count, SAME_DEG, SAME_SHIFT)
-        total = np.array(
-            [hits[near(rotation, translation, i, SAME_DEG, SAME_SHIFT)].sum() for i in kept.tolist()], dtype=np.int64
-        )  # fmt: skip
-        return Pool(rotation[kept], translation[kept], result[kept], total)
+    @classmethod
+    def unscored(cls, rotation: NDArray[Any], translation: NDArray[Any], *, hits: int = 0) -> "Candidates":
+        """Poses to start from."""
+        c = len(rotation)
+        zero = np.zeros(c, np.float32)
+        return cls(rotation, translation, np.full(c, -math.inf, np.float32), zero, zero, np.full(c, hits, np.int64))
+
+    @classmethod
+    def none(cls) -> "Candidates":
+        return cls.unscored(np.empty((0, 3, 3), np.float32), np.empty((0, 3), np.float32))
+
+    def __len__(self) -> int:
+        return len(self.rotation)
+
+    def __getitem__(self, chosen: slice | NDArray[Any]) -> "Candidates":
+        return Candidates(*(getattr(self, f.name)[chosen] for f in fields(self)))
+
+    @classmethod
+    def concatenated(cls, parts: "Sequence[Candidates]") -> "Candidates":
+        """All poses of the parts, one after the other."""
+        return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
-def is_safe(pool: Pool, scene: Scene) -> bool:
-    """Whether more starts would hardly change the answer, and no other pose comes close.
+def best_distinct(
+    candidates: Candidates, count: int, degrees: float, shift: float, sources: NDArray[np.int64] | None = None
+) -> Candidates:
+    """The best `count` poses of which no two are closer than `degrees` and `shift`, best first.
 
-    A pose whose matches are unique says so itself. Where points lie as close as the residuals, the pose must lead the
-    others and have come out of several batches while none found a better one.
+    A pose has the hits of all poses that are the same: the most of each source, and of the sources the sum.
+    sources: (c,) where each candidate is from; one batch that reached a pose twice counts once. None: all are of one.
     """
-    ahead, hits = lead(pool, scene), int(pool.hits[0])
-    found = (ahead > FAR_AHEAD and hits >= FAR_HITS) or (ahead > AHEAD and hits >= SAFE_HITS)
-    return unique(pool, scene) or (found and plausible(pool, scene))
+    kept = distinct(candidates.rotation, candidates.translation, candidates.score, count, degrees, shift)
+    origin = np.zeros(len(candidates), np.int64) if sources is None else sources
+    hits = []
+    for i in kept.tolist():
+        same = same_pose(candidates.rotation, candidates.translation, i, degrees, shift)
+        hits.append(sum(int(candidates.hits[same & (origin == source)].max()) for source in np.unique(origin[same])))
+    return replace(candidates[kept], hits=np.array(hits, np.int64))
 
 
-def is_exhausted(pool: Pool, scene: Scene, stalled: int) -> bool:
-    """Whether batches keep ending at the best pose, or `stalled` of them in a row did not better it."""
-    return (int(pool.hits[0]) >= SAFE_HITS or stalled >= MOST_STALLED) and plausible(pool, scene)
-
-
-def unique(pool: Pool, scene: Scene) -> bool:
-    """Whether many points are matched at a scale at which chance would give few of them a neighbour."""
-    _, matched, scale = pool.result[0]
-    chance = len(scene.points3d) / scene.solid_angle * math.pi * (2 * float(scale)) ** 2
-    return bool(matched > max(SAFE_MATCHED, OVER_CHANCE * chance))
-
-
-def plausible(pool: Pool, scene: Scene) -> bool:
-    """Whether the residuals are about the spacing of the bearings or less, and enough points are matched.
-
-    Larger residuals say that only a shape fits. Any pose has some neighbours: wrong ones of sparse points had up to a
-    quarter of the points matched.
-    """
-    _, matched, scale = pool.result[0]
-    spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.bearings))
-    return bool(scale < PLAUSIBLE * spacing and matched > PLAUSIBLE_MATCHED)
-
-
-def lead(pool: Pool, scene: Scene) -> float:
-    """Log-likelihood of all bearings under the best pose over that under the next other one, nats."""
-    other = ~near(pool.rotation, pool.translation, 0, OTHER_DEG, math.inf)
-    gap = pool.result[0, 0] - pool.result[other, 0].max() if other.any() else math.inf
-    return float(gap) * len(scene.bearings)
+def merged(parts: Sequence[Candidates], count: int, settings: SearchSettings) -> Candidates:
+    """The best `count` distinct poses of several batches; a pose has the hits of all batches that found it."""
+    sources = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    return best_distinct(
+        Candidates.concatenated(parts), count, settings.same_deg, settings.same_shift, sources
+    )  # fmt: skip

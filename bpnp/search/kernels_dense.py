@@ -1,8 +1,7 @@
 """Alignment of many poses on the CPU: each start runs through all its scales in one fused loop that stays in the cache.
 
-docs/search.md states the mathematics, `bpnp.search.alignment` is the same for other devices. Arrays are
-float32 and coordinate-major, (3, m) bearings and (3, n) points, so that loops over points vectorise. The starts are
-independent of each other, so that shares of them go to several threads.
+docs/search.md states the mathematics. Arrays are float32 and coordinate-major, (3, m) bearings and (3, n) points, so
+that loops over points vectorise. The starts are independent of each other: shares of them go to several threads.
 """
 
 import math
@@ -15,6 +14,7 @@ from bpnp.compilation import compiler
 F = np.float32
 compiled = compiler(fastmath=True, boundscheck=False)
 LARGEST_TURN = 0.5  # radians in one step
+RELAXATION = 1.7  # of the steps on clusters: expectation-maximisation takes short ones
 POWER = 256  # of the kernel: eight squarings
 
 
@@ -206,7 +206,7 @@ def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scal
 
 @compiled
 def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
-            relaxation: Any, score: Any) -> None:  # fmt: skip
+            score: Any) -> None:  # fmt: skip
     """Anneal every start (S, 3, 3), (S, 3) in place; score (S,) is the likelihood at the last scale, -inf if lost.
 
     outlier: o / s^2 of `Scene.outlier_density`.
@@ -219,6 +219,6 @@ def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, sca
             score[k] = assign(
                 f, a, p, b, rotation[k], translation[k], scale, outlier * scale * scale, kernel, row, q
             )  # fmt: skip
-            if not move(q, p, rotation[k], translation[k], relaxation, hessian, gradient, step):
+            if not move(q, p, rotation[k], translation[k], F(RELAXATION), hessian, gradient, step):
                 score[k] = -np.inf
                 break

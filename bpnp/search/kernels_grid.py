@@ -14,6 +14,7 @@ from bpnp.search.kernels_dense import F, compiled, move
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
 CAPACITY = 96  # neighbours kept of a point
+SWEEPS = 4
 CELLS = 64  # along the longest side of the grid
 
 
@@ -81,7 +82,7 @@ def neighbours(grid: Any, x: Any, y: Any, z: Any, radius: Any, index: Any, squar
 
 
 @compiled
-def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, sweeps: int,
+def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
                   index: Any, kernel: Any, count: Any, row: Any, column: Any, q: Any) -> Any:  # fmt: skip
     """Fill q_j by Sinkhorn with slack; return the mean log-likelihood of the bearings and the matched share.
 
@@ -106,7 +107,7 @@ def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any
     for i in range(m):
         likelihood += math.log((row[i] / F(n) + outlier) / (scale * scale))
         row[i] = F(1) / math.sqrt(slack + row[i])
-    for _ in range(sweeps):
+    for _ in range(SWEEPS):
         for j in range(n):
             total = F(0)
             for e in range(count[j]):
@@ -134,8 +135,8 @@ def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any
 
 
 @compiled
-def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, sweeps: int,
-                   relaxation: Any, patience: int, result: Any) -> None:  # fmt: skip
+def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int,
+                   result: Any) -> None:  # fmt: skip
     """Anneal every start (S, 3, 3), (S, 3) in place to the scale that explains the bearings best.
 
     A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
@@ -151,7 +152,7 @@ def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: A
         since = 0
         for scale in scales:
             likelihood, matched = assign_sparse(
-                grid, p, rotation[k], translation[k], scale, outlier * scale * scale, sweeps, index, kernel, count,
+                grid, p, rotation[k], translation[k], scale, outlier * scale * scale, index, kernel, count,
                 row, column, q,
             )  # fmt: skip
             since += 1
@@ -160,7 +161,7 @@ def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: A
                 best_rotation[:] = rotation[k]
                 best_translation[:] = translation[k]
                 since = 0
-            if since > patience or not move(q, p, rotation[k], translation[k], relaxation, hessian, gradient, step):
+            if since > patience or not move(q, p, rotation[k], translation[k], F(1), hessian, gradient, step):
                 break
         rotation[k] = best_rotation
         translation[k] = best_translation

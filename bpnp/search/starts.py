@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
-from torch import Tensor
+
+from bpnp.search.settings import Recipe
 
 Array = NDArray[np.float32]
 
@@ -18,8 +18,8 @@ class PosePrior(NamedTuple):
     Without a translation only the rotation is known.
     """
 
-    rotation: Float[Tensor, "3 3"]
-    translation: Float[Tensor, " 3"] | None
+    rotation: ArrayLike
+    translation: ArrayLike | None
     rotation_sigma_deg: float
     translation_sigma: float = math.inf
 
@@ -27,23 +27,12 @@ class PosePrior(NamedTuple):
 class GravityPrior(NamedTuple):
     """The direction up, in the camera and in the scene, known to within `sigma_deg` (one standard deviation)."""
 
-    up_camera: Float[Tensor, " 3"]
-    up_scene: Float[Tensor, " 3"]
+    up_camera: ArrayLike
+    up_scene: ArrayLike
     sigma_deg: float = 2.0
 
 
 Prior = PosePrior | GravityPrior
-
-
-class Spread(NamedTuple):
-    """How translations are drawn around the weak-perspective one.
-
-    off_centre: 0 looks at the mean of the points; up to 1, at a point of the scene between the mean and any of them.
-    log_depth: the depth is multiplied by exp(u), u uniform in +- this.
-    """
-
-    off_centre: float
-    log_depth: float
 
 
 def super_fibonacci(count: int) -> NDArray[np.float64]:
@@ -74,7 +63,7 @@ def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) ->
 
 
 def draw_poses(
-    bearings: Array, points3d: Array, count: int, spread: Spread, prior: Prior | None, rng: np.random.Generator
+    bearings: Array, points3d: Array, count: int, recipe: Recipe, prior: Prior | None, rng: np.random.Generator
 ) -> tuple[Array, Array]:
     """Rotations (count, 3, 3) and translations (count, 3) to start from.
 
@@ -88,9 +77,9 @@ def draw_poses(
     across = sample @ rotation.transpose(0, 2, 1)
     across = across - (across @ axis)[..., None] * axis
     extent = np.sqrt(((across - across.mean(1, keepdims=True)) ** 2).sum(-1).mean(-1))
-    depth = extent / angular_spread(bearings) * np.exp(spread.log_depth * rng.uniform(-1, 1, count))
+    depth = extent / angular_spread(bearings) * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
     middle = points3d.mean(0)
-    seen = middle + spread.off_centre * rng.random((count, 1)) * (
+    seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )
     translation = depth[:, None] * axis - np.einsum("sij,sj->si", rotation, seen)

@@ -22,11 +22,10 @@ def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
     raise ValueError(f'expected `solver` "search", a module from Batch to Prediction, or a checkpoint, got {solver!r}')
 
 
-def device_from(wanted: str | torch.device | None, module: nn.Module | None) -> torch.device:
-    """The wanted device, or that of the module."""
+def device_from(wanted: str | torch.device | None) -> torch.device | None:
+    """The device that a user names, if it can be used."""
     if wanted is None:
-        parameter = None if module is None else next(module.parameters(), None)
-        return torch.device("cpu") if parameter is None else parameter.device
+        return None
     try:
         device = torch.device(wanted)
         torch.empty(0, device=device)

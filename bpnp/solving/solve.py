@@ -11,13 +11,13 @@ import torch
 from torch import nn
 
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.many import Progress
+from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import device_from, each_camera, each_of, each_set, source_from
 from bpnp.solving.matches import count_one_to_one, fit_pose, mutual_nearest, one_to_one
 from bpnp.solving.priors import Prior, checked_prior
 from bpnp.solving.problem import Array, Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, no_pose
-from bpnp.solving.sources import Found, Options, found_by
+from bpnp.solving.sources import Options, Progress, results_of
 
 SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
 FIT_ROUNDS = 5
@@ -52,7 +52,7 @@ def solve(
         image (radians for bearings). By default three times the residuals' own scale.
     clutter: share of the points that is expected to have no partner, if known.
     time_limit: seconds after which the search ends with what it has.
-    device: where a module computes, by default where it is, or the search its coarse rounds, by default on the host.
+    device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
     progress: called with (pair, batch of starts, seconds).
 
     A pose that is not to be trusted has the verdict "failed"; so have points from which none follows (on one line, or
@@ -93,7 +93,7 @@ def solve_many(
     cameras = each_camera(camera, len(sets2d))
     priors = {i: checked_prior(given) for i, given in enumerate(each_of("prior", prior, len(sets2d)))}
     module, threshold = source_from(solver), _float(inlier_threshold)
-    options = Options(_float(clutter), seed, _float(time_limit), device_from(device, module), progress)
+    options = Options(_float(clutter), seed, _float(time_limit), device_from(device), progress)
     problems = [
         problem_from(x, p, lens, where=f" in pair {i}" if len(sets2d) > 1 else "")
         for i, (x, p, lens) in enumerate(zip(sets2d, sets3d, cameras, strict=True))
@@ -105,8 +105,8 @@ def solve_many(
         for i, problem in enumerate(problems)
         if problem.degenerate is not None
     }
-    for i, found in found_by(module, solvable, priors, options):
-        solutions[i] = _finished(problems[i], found, threshold, dropped[i])
+    for i, result, seconds in results_of(module, solvable, priors, options):
+        solutions[i] = _finished(problems[i], result, seconds, threshold, dropped[i])
     return [solutions[i] for i in range(len(problems))]
 
 
@@ -114,13 +114,15 @@ def _float(value: float | int | None) -> float | None:
     return None if value is None else float(value)
 
 
-def _finished(problem: Problem, found: Found, inlier_threshold: float | None, dropped: int) -> Solution:
+def _finished(
+    problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None, dropped: int
+) -> Solution:
     """Matches, a last fit to them, and the inliers of every candidate."""
-    start = time.perf_counter()
-    if not len(found.rotation):
-        return _failed(problem, found.reason, inlier_threshold, dropped)
-    threshold = inlier_threshold or SCALES * float(found.scale[0]) * problem.per_radian
-    rotation, translation = _fitted(problem, found.rotation[0], found.translation[0], threshold)
+    start, found = time.perf_counter(), result.candidates
+    if not len(found):
+        return _failed(problem, result.reason, inlier_threshold, dropped)
+    threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+    rotation, translation = _fitted(problem, *result.best, threshold)
     projected = problem.project(rotation, translation, problem.local3d)
     matches = one_to_one(problem.image, projected, threshold)
     counts = [len(matches)] + [
@@ -146,10 +148,10 @@ def _finished(problem: Problem, found: Found, inlier_threshold: float | None, dr
             Candidate(r, t, float(score), count)
             for r, t, score, count in zip(rotations, translations, found.score, counts, strict=True)
         ),
-        verdict=found.verdict,
-        reason=found.reason,
-        stats=SolutionStats(found.iterations, found.residual, found.converged, dropped),
-        seconds=found.seconds + time.perf_counter() - start,
+        verdict=result.verdict,
+        reason=result.reason,
+        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", dropped),
+        seconds=seconds + time.perf_counter() - start,
         points2d=problem.points2d,
         points3d=problem.points3d,
     )

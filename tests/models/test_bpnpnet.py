@@ -9,7 +9,7 @@ from torch import Tensor
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.search.annealing import SHAKES
+from bpnp.search.settings import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_loss
 
 SMALL: dict[str, Any] = {"channels": 16, "blocks": 2}
@@ -70,7 +70,7 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     crowd = net(batch).poses["refined"].stats.iterations
     net.pose_stage.hypotheses = 0
     alone = net(batch).poses["refined"].stats.iterations
-    assert int(alone) <= 2 * (1 + SHAKES) < int(crowd)
+    assert int(alone) <= 2 * (1 + DEFAULT.shaking.copies) < int(crowd)
     with pytest.raises(ValueError, match="expected a number of `hypotheses`, got -1"):
         BPnPNet(**SMALL, hypotheses=-1)
 

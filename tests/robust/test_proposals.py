@@ -7,8 +7,8 @@ from torch import Tensor
 
 from bpnp.geometry import project, transform
 from bpnp.metrics import rotation_error
+from bpnp.models.search_solver import refine
 from bpnp.robust.proposals import pose_hypotheses
-from bpnp.search.refine import refine
 
 
 def blurred(scene: Planted, share: float) -> Tensor:

@@ -1,16 +1,20 @@
 """The training-free search and the refinement find planted poses, and say when they do not."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 import roma
 import torch
 from planted import plant
+from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import bearings
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
-from bpnp.search.many import search, search_candidates
-from bpnp.search.refine import refine
+from bpnp.models.search_solver import refine, search
+from bpnp.search.many import search_poses
+from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior, super_fibonacci
 from bpnp.types import Batch
 
@@ -61,20 +65,20 @@ def test_neighbours_padding_and_batch_size_do_not_matter(problem):
 
 
 def test_the_seed_decides(problem):
-    first, second = (search_candidates(problem.bearings[:1], problem.points3d[:1], seed=3) for _ in range(2))
-    for a, b in zip(first[:5], second[:5], strict=True):
-        torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
+    points = problem.bearings[0].numpy(), problem.points3d[0].numpy()
+    first, second = (search_poses(*points, seed=3).candidates for _ in range(2))
+    for field in fields(first):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
 
 
 def test_candidates_are_distinct_and_fall_in_score(problem):
-    candidates = search_candidates(problem.bearings[:1], problem.points3d[:1])
-    score = candidates.score[0][candidates.score[0].isfinite()]
-    assert (score.diff() <= 0).all()
-    rotation, translation = candidates.rotation[0][: len(score)], candidates.translation[0][: len(score)]
-    for i in range(len(score)):
+    candidates = search_poses(problem.bearings[0].numpy(), problem.points3d[0].numpy()).candidates
+    assert (np.diff(candidates.score) <= 0).all()
+    for i in range(len(candidates)):
         for j in range(i):
-            apart = rotation_error(rotation[i : i + 1], rotation[j : j + 1]) > 2.9
-            assert apart or (translation[i] - translation[j]).norm() > 0.01
+            turn = Rotation.from_matrix(candidates.rotation[i].T @ candidates.rotation[j])
+            apart = np.degrees(turn.magnitude()) > 2.9
+            assert apart or np.linalg.norm(candidates.translation[i] - candidates.translation[j]) > 0.01
 
 
 @pytest.mark.parametrize("case", ["three", "line2d", "line3d", "same2d", "same3d"])
@@ -104,14 +108,16 @@ def test_points_without_a_relation_are_not_called_solved():
     generator = torch.Generator().manual_seed(0)
     f = bearings(torch.rand(1, 120, 2, generator=generator) - 0.5)
     p = torch.rand(1, 120, 3, generator=generator)
-    *_, stats = search(f, p, max_batches=4)
+    *_, stats = search(f, p, settings=SearchSettings(max_batches=4))
     assert not stats.converged.any()
 
 
 def test_a_rough_pose_saves_batches(problem):
     rotation, translation = problem.near(0.05, seed=1)
     prior = PosePrior(rotation[0], translation[0], rotation_sigma_deg=4, translation_sigma=0.1)
-    r, t, stats = search(problem.bearings[:1], problem.points3d[:1], prior=prior, max_batches=1)
+    r, t, stats = search(
+        problem.bearings[:1], problem.points3d[:1], prior=prior, settings=SearchSettings(max_batches=1)
+    )
     assert rotation_error(r, problem.rotation[:1]) < 0.5
     assert stats.iterations.item() == 1
 
@@ -148,15 +154,21 @@ def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
 
 
 def test_search_as_a_solver(problem):
-    prediction = Search(max_batches=8)(problem.batch())
+    prediction = Search(settings=SearchSettings(max_batches=8))(problem.batch())
     assert prediction.assignment is None
     found(prediction.poses["search"].rotation, prediction.poses["search"].translation, problem, 0.5)
 
 
-@pytest.mark.parametrize("wrong", [{"max_batches": 0}, {"time_limit": 0.0}, {"clutter": 1.0}])
+@pytest.mark.parametrize("wrong", [{"time_limit": 0.0}, {"clutter": 1.0}])
 def test_wrong_budgets_are_refused(problem, wrong):
     with pytest.raises(ValueError, match="expected"):
         search(problem.bearings, problem.points3d, **wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"max_batches": 0}, {"starts": 0}, {"recipes": ()}, {"outliers": 1.0}])
+def test_settings_without_a_meaning_are_refused(wrong):
+    with pytest.raises(ValueError, match="expected"):
+        SearchSettings(**wrong)
 
 
 def test_a_time_limit_ends_the_search():
@@ -175,6 +187,6 @@ def test_points_at_the_end_of_the_world_do_not_matter(problem):
     points3d[0, far] *= 1e5
     camera = points3d[0, far] @ problem.rotation[0].T + problem.translation[0]
     rays[0, far] = torch.nn.functional.normalize(camera, dim=-1)
-    rotation, _, stats = search(rays, points3d, max_batches=8)
+    rotation, _, stats = search(rays, points3d, settings=SearchSettings(max_batches=8))
     assert bool(stats.converged[0])
     assert rotation_error(rotation, problem.rotation[:1]).item() < 1

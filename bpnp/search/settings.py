@@ -1,0 +1,154 @@
+"""Every constant that tunes the search, in one argument: what it is, its unit, and why it has this value."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How the starts of a batch are drawn around the weak-perspective pose.
+
+    first_scale: where annealing begins, in spreads of the bearings. From 0.3 most starts within 30 degrees of the true
+        rotation reach it; from far below only those within about 10.
+    off_centre: 0 puts the mean of the 3D points on the mean bearing; up to 1, a point between it and any 3D point, for
+        cameras that see a part of the scene.
+    log_depth: the depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
+    """
+
+    first_scale: float
+    off_centre: float
+    log_depth: float
+
+
+@dataclass(frozen=True)
+class ClusterStage:
+    """Annealing of many poses on weighted clusters of both sides.
+
+    clusters: of each side, at most; one iteration costs their number squared.
+    last_scale: in spreads of the bearings. iterations: scales from the first to the last, one Gauss-Newton step each.
+    kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
+    """
+
+    clusters: int
+    last_scale: float
+    iterations: int
+    kept: int
+    apart_deg: float
+
+
+@dataclass(frozen=True)
+class FineStage:
+    """Annealing of a few poses on all 3D points, to the scale at which the likelihood is largest.
+
+    bearings: used before the last stage, which uses all; more cost time and hardly change which pose is best.
+    smallest_scale: radians, a tenth of a pixel at a focal length of 500 pixels; relative_smallest: in spreads of the
+        bearings, for narrow views. The smaller of both is the end of the annealing.
+    cooling: factor from one scale to the next. patience: scales after the likeliest one before a pose is left.
+    """
+
+    bearings: int = 1000
+    smallest_scale: float = 2e-4
+    relative_smallest: float = 1e-3
+    cooling: float = 0.82
+    patience: int = 3
+
+
+@dataclass(frozen=True)
+class Shaking:
+    """Starts around the best poses so far: ways out of a narrow optimum beside a better one.
+
+    poses: that are shaken. copies: of each. rotation_deg, translation: standard deviations; the latter in spreads of
+    the bearings times the depth. Both are about what separates the optima of one basin.
+    """
+
+    poses: int = 4
+    copies: int = 6
+    rotation_deg: float = 6.0
+    translation: float = 0.1
+
+
+@dataclass(frozen=True)
+class RefineSettings:
+    """How `refine_poses` chooses among many starts: beyond `direct` they compete on clusters.
+
+    competitors: go from the coarse clusters to the finer ones. direct: are annealed on all points.
+    """
+
+    competitors: int = 32
+    direct: int = 8
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """When a pose is accepted (`bpnp.search.verdict`).
+
+    other_deg: poses with rotations farther apart are different answers.
+    far_lead, far_hits: a pose is safe if it leads the next different one by so many nats and came out of so many
+    batches; lead, hits: or by these. The lead is of the log-likelihood of all bearings together.
+    matched, over_chance: or if this share of the points is matched and so many times the share expected by chance.
+    plausible_scale: largest residuals, in half the spacing of the bearings; larger ones fit a shape, not points.
+    plausible_matched: least share of matched points; wrong poses of sparse points had up to a quarter.
+    stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search.
+    """
+
+    other_deg: float = 10.0
+    far_lead: float = 100.0
+    far_hits: int = 2
+    lead: float = 20.0
+    hits: int = 4
+    matched: float = 0.2
+    over_chance: float = 6.0
+    plausible_scale: float = 2.0
+    plausible_matched: float = 0.25
+    stalled: int = 4
+    better: float = 0.002
+
+
+@dataclass(frozen=True)
+class SearchSettings:
+    """All of it; the stages are described in docs/search.md.
+
+    max_batches: of starts. starts: a batch; 1200 rotations leave no gap over 25 degrees.
+    recipes: of the batches, in turn.
+    outliers: share of the points without a partner that the assignment expects where the caller gives none.
+    end_outliers: shares that the two best poses are annealed with in the last stage too, and the likelihood chooses.
+    least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
+    end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
+    kept: candidates from batch to batch, and in the end.
+    same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
+    bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
+    sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
+    starts_a_check: starts that are annealed on clusters between two looks at the clock, if time is limited.
+    """
+
+    max_batches: int = 32
+    starts: int = 1200
+    recipes: tuple[Recipe, ...] = (Recipe(0.30, 0.0, 0.5), Recipe(0.30, 1.0, 0.8), Recipe(0.35, 0.5, 1.2))
+    coarse: ClusterStage = ClusterStage(64, last_scale=0.1, iterations=10, kept=48, apart_deg=3.0)
+    middle: ClusterStage = ClusterStage(256, last_scale=0.04, iterations=16, kept=10, apart_deg=1.0)
+    fine: FineStage = FineStage()
+    shaking: Shaking = Shaking()
+    refine: RefineSettings = RefineSettings()
+    evidence: Evidence = Evidence()
+    outliers: float = 0.3
+    end_outliers: tuple[float, ...] = (0.03, 0.6)
+    least_outliers: float = 0.02
+    end_scale: float = 2.0
+    kept: int = 8
+    same_deg: float = 3.0
+    same_shift: float = 0.05
+    bulk: float = 20.0
+    sampled: int = 8
+    lloyd_iterations: int = 5
+    starts_a_check: int = 32
+
+    def __post_init__(self) -> None:
+        if self.max_batches < 1 or self.starts < 1 or not self.recipes:
+            raise ValueError(
+                f"expected one or more `max_batches`, `starts` and `recipes`, got {self.max_batches}, {self.starts} "
+                f"and {len(self.recipes)}; try SearchSettings()"
+            )
+        if not (0 < self.outliers < 1 and all(0 < share < 1 for share in self.end_outliers)):
+            raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
+
+
+DEFAULT = SearchSettings()
