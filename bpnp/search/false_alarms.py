@@ -1,0 +1,178 @@
+"""How likely a pose fits by chance: the a-contrario number of false alarms, for 4 points or 10,000.
+
+The question: were the image points unrelated to the scene, how many of all the poses that could have been tried would
+fit as well as this one? Unrelated means: at scales finer than h, image point i falls with the density l_i of the
+projected points around it, wherever those happen to lie. A pose that explains it predicts the mixture
+
+    x_i = 1 - w + w g_i / l_i,    g_i = sum_j N(f_i - u_j; s^2),    l_i = max(sum_j N(f_i - u_j; h_i^2), n / A)
+
+u_j the direction in which the pose sees scene point j, N the normal density on the tangent plane, s the scale of the
+residuals, w the share of the image points that have a partner, h_i = max(3 s, half the distance to the 8th neighbour),
+and A the solid angle of the view. For unrelated points x_i has the mean 1, so that the product of the x_i exceeds a
+bound b with a probability of at most 1 / b (Markov). From this follow
+
+    log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
+
+T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2). The three largest
+x_i are left out, whatever their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number
+of image points within 2 s of point i: keypoints that lie together are one observation. The mean over a fixed set of
+(s, w) counts what was looked at. Where gravity is known, two pairs fix the pose; a prior reduces T to the share of the
+poses that it allows.
+
+Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; L. Moisan, B. Stival, A probabilistic
+criterion to detect rigid point matches, IJCV 2004. That the likelihood ratio takes the place of a binomial tail keeps
+the evidence of dense points, whose neighbours lie as close as their residuals.
+"""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.compilation import compiler
+
+Array = NDArray[np.float64]
+compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
+
+SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # w
+SCALE_STEP = 1.5  # from one s to the next
+COARSEST = 0.5  # largest s, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
+OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
+MOST_SMOOTHED = 256  # projected points from which l is estimated
+MOST_NEIGHBOURS = 64  # of one image point in g and c
+FARTHEST = 40.0  # squared distance over s^2 beyond which a pair adds nothing to g
+TOGETHER = 2.0  # distance in s below which image points are one observation
+MOST_POINTS = 2000  # image points that are looked at, evenly spread over the given ones
+FLOOR = 2e-4  # smallest s in spreads of the bearings: some hundredths of a pixel of an ordinary camera
+
+
+def log10_false_alarms(
+    bearings: Array,
+    points3d: Array,
+    rotation: Array,
+    translation: Array,
+    *,
+    normals3d: Array | None = None,
+    labels2d: NDArray[np.int64] | None = None,
+    labels3d: NDArray[np.int64] | None = None,
+    floor: float | None = None,
+    fixing_pairs: int = 3,
+    log10_share: float = 0.0,
+) -> float:
+    """log10 of the expected number of poses that fit unrelated points as well as (rotation, translation); see above.
+
+    bearings: (m, 3) unit vectors. points3d: (n, 3). normals3d: (n, 3) unit, outward: points that face away are not
+    seen. labels2d (m,), labels3d (n,): only points of one label are partners, -1 of any. floor: smallest scale of the
+    residuals, radians. fixing_pairs: pairs that fix a pose, 3, or 2 where gravity is known. log10_share: log10 of the
+    share of all poses that could have been tried, below 0 with a prior.
+
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform(-1, 1, (12, 3))
+    >>> seen = points + [0, 0, 6]
+    >>> rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
+    >>> log10_false_alarms(rays, points, np.eye(3), np.array([0.0, 0, 6])) < -10  # the true pose
+    True
+    >>> log10_false_alarms(rays, points, np.eye(3), np.array([0.3, 0, 5])) > 0  # another one
+    True
+    """
+    m, n = len(bearings), len(points3d)
+    seen = _directions(points3d, rotation, translation, normals3d)
+    if m <= fixing_pairs or int(np.isfinite(seen[:, 0]).sum()) <= fixing_pairs:
+        return _log10_tests(m, n, fixing_pairs) + log10_share
+    view = _View(bearings)
+    floor = max(floor or 0.0, FLOOR * view.spread)
+    coarsest = max(COARSEST * math.sqrt(view.solid_angle / m), 2 * floor)
+    steps = max(3, 1 + math.ceil(math.log(coarsest / floor) / math.log(SCALE_STEP)))
+    scales = np.geomspace(floor, coarsest, steps)
+    chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
+    crowd = cKDTree(bearings).query(bearings[chosen], min(m, MOST_NEIGHBOURS))[0].reshape(len(chosen), -1)
+    together = (crowd[:, None] <= TOGETHER * scales[:, None]).sum(-1)
+    logs = np.zeros((len(chosen), len(scales), len(SHARES)))
+    for rows, columns in _label_groups(chosen, labels2d, labels3d, n):
+        used = seen[columns][np.isfinite(seen[columns, 0])]
+        near2 = np.full((len(rows), 1), np.inf)
+        if len(used):
+            near2 = cKDTree(used).query(bearings[chosen[rows]], min(len(used), MOST_NEIGHBOURS))[0] ** 2
+        near2 = near2.reshape(len(rows), -1)
+        part = np.empty((len(rows), *logs.shape[1:]))
+        _log_ratios(near2, view.density(bearings[chosen[rows]], used), scales, SHARES, part)
+        logs[rows] = part
+    fixing = np.partition(logs, len(chosen) - fixing_pairs, 0)[-fixing_pairs:]
+    evidence = (logs / together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
+    mean = float(np.logaddexp.reduce(evidence.ravel())) - math.log(evidence.size)
+    return _log10_tests(m, n, fixing_pairs) + log10_share - mean / math.log(10)
+
+
+def _log10_tests(m: int, n: int, pairs: int) -> float:
+    """log10 of 2 (m)_k (n)_k / k!: ordered choices of k pairs, with about two poses each."""
+    choices = [(m - i) * (n - i) / (i + 1) for i in range(pairs)]
+    return math.log10(2 * max(math.prod(max(choice, 1.0) for choice in choices), 1.0))
+
+
+def _directions(points3d: Array, rotation: Array, translation: Array, normals3d: Array | None) -> Array:
+    """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
+    camera = points3d @ rotation.T + translation
+    length = np.linalg.norm(camera, axis=-1, keepdims=True)
+    seen = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
+    if normals3d is not None:
+        seen[(seen * (normals3d @ rotation.T)).sum(-1) >= 0] = np.nan
+    return seen
+
+
+class _View:
+    """The rectangle on the tangent plane whose principal standard deviations are those of the bearings."""
+
+    def __init__(self, bearings: Array) -> None:
+        self.centre = bearings.mean(0)
+        centred = bearings - self.centre
+        self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
+        variance, axes = np.linalg.eigh(centred.T @ centred / max(len(bearings) - 1, 1))
+        self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
+        self.solid_angle = float(np.clip(4 * self.half_widths.prod(), 1e-24, 4 * math.pi))
+
+    def density(self, bearings: Array, directions: Array) -> Array:
+        """Directions per steradian around each bearing, smoothed by OUTLINE spreads; at least their mean density."""
+        inside = (np.abs((directions - self.centre) @ self.axes) <= self.half_widths).all(-1)
+        mean = max(int((inside & (directions @ self.centre > 0)).sum()), 1) / self.solid_angle
+        some = directions[:: -(-len(directions) // MOST_SMOOTHED)] if len(directions) else directions
+        if not len(some):
+            return np.full(len(bearings), mean)
+        width2 = (OUTLINE * self.spread) ** 2
+        squared = np.maximum(2 - 2 * bearings @ some.T, 0)
+        smooth = np.exp(squared / (-2 * width2)).sum(1) / (2 * math.pi * width2) * (len(directions) / len(some))
+        return np.maximum(smooth, mean)
+
+
+def _label_groups(
+    chosen: NDArray[np.int64], labels2d: NDArray[np.int64] | None, labels3d: NDArray[np.int64] | None, n: int
+) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
+    if labels2d is None or labels3d is None:
+        return [(np.arange(len(chosen)), np.arange(n))]
+    own = labels2d[chosen]
+    return [
+        (np.flatnonzero(own == label), np.flatnonzero((labels3d == label) | (labels3d == -1) | (label == -1)))
+        for label in np.unique(own).tolist()
+    ]
+
+
+@compiled
+def _log_ratios(near2: Array, density: Array, scales: Array, shares: Array, result: Array) -> None:
+    """log x_i for every image point, scale and share, into result (k, S, W).
+
+    near2 (k, l): squared chords to the nearest projected points, ascending. density (k,): l_i, per steradian.
+    """
+    count, width = near2.shape
+    for i in range(count):
+        for a in range(len(scales)):
+            variance = scales[a] * scales[a]
+            predicted = 0.0
+            for j in range(width):
+                if not near2[i, j] < FARTHEST * variance:
+                    break
+                predicted += math.exp(-0.5 * near2[i, j] / variance)
+            ratio = predicted / (2 * math.pi * variance * density[i])
+            for b in range(len(shares)):
+                result[i, a, b] = math.log(1 - shares[b] + shares[b] * ratio)
