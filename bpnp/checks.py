@@ -34,10 +34,11 @@ def checked_shapes(function: _F) -> _F:
     @functools.wraps(function)
     def run(*arguments: Any, **options: Any) -> Any:
         sizes: dict[str, tuple[int, str]] = {}
-        for name, value in signature.bind(*arguments, **options).arguments.items():
+        bound = signature.bind(*arguments, **options)
+        for name, value in bound.arguments.items():
             if name in expected and not (value is None and signature.parameters[name].default is None):
                 _check(name, value, expected[name], sizes)
-        return function(*arguments, **options)
+        return function(*bound.args, **bound.kwargs)
 
     return run  # type: ignore[return-value]
 

@@ -2,19 +2,19 @@
 
 from typing import Literal, NamedTuple
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
+from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.backends import Estimator, mean_residual, opencv_ransac, poselib_ransac
-from bpnp.robust.consensus import consensus
+from bpnp.robust.backends import BACKENDS
+from bpnp.robust.sampling import take
+from bpnp.robust.scoring import Pairs, residuals
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]
-ESTIMATORS: dict[str, Estimator] = {"poselib": poselib_ransac, "opencv": opencv_ransac}
 
 
 class PairList(NamedTuple):
@@ -42,13 +42,15 @@ def top_pairs(
     scores = assignment.detach()
     if mask2d is not None or mask3d is not None:
         scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
-    k = min(int(pairs_factor * min(m, n)), m * n)
+    k = min(max(1, int(pairs_factor * min(m, n))), m * n)
     probability, flat = scores.flatten(1).topk(k, dim=-1)
     mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
     return PairList(flat // n, flat % n, probability, mask)
 
 
+@checked_shapes
 @full_precision
+@torch.no_grad()
 def ransac_pnp(
     assignment: Float[Tensor, "b m n"],
     points2d: Float[Tensor, "b m 2"],
@@ -64,75 +66,42 @@ def ransac_pnp(
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
     """Pose from the k = pairs_factor * min(m, n) most probable pairs by RANSAC with a P3P solver.
 
-    assignment: P; its order alone matters. points2d: normalised image coordinates. points3d: scene units.
-    backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC, then EPnP on its
-        inliers: the paper's, with 1000 iterations. Where EPnP loses inliers of the pose that it refits, as it may on
-        points of one plane, SQPnP does it.
+    assignment: P; only the order of its entries matters. points2d: normalised image coordinates. points3d: scene units.
+    backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with 1000 iterations,
+        then EPnP on its inliers, the paper's, or SQPnP where EPnP loses inliers, as it may on points of one plane;
+        "torch", `consensus`, a whole batch at once; "auto", torch on cuda, else poselib.
     threshold: largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
     seed: of the sampling, the same for each sample, so that a pose does not depend on the other samples.
 
-    Returns rotation, translation and stats (residual: mean reprojection error of the inliers, root mean square for
-    "torch"; iterations: hypotheses, or the bound on them where the backend does not tell, 0 without 4 pairs). A sample
-    for which no pose has 4 inliers holds NaN and `converged` False. No gradient: the pose only starts a solver that has
-    one.
-    Raises ValueError for an unknown backend.
+    Returns rotation, translation and stats (residual: mean reprojection error of the inliers; iterations: hypotheses,
+    or the bound on them where the backend does not tell). A sample for which no pose has 4 inliers holds NaN and
+    `converged` False. No gradient: the pose is the initial pose of a solver that has one.
+    Raises ValueError for arguments of wrong shape or type, an unknown backend and options that are not positive.
+
+    >>> points3d = torch.rand(1, 50, 3)
+    >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
+    >>> rotation, translation, stats = ransac_pnp(torch.eye(50)[None], camera[..., :2] / camera[..., 2:], points3d)
+    >>> torch.allclose(translation, torch.tensor([[0.0, 0.0, 4.0]]), atol=1e-3)
+    True
     """
-    if backend not in ("auto", "torch", *ESTIMATORS):
+    if backend not in ("auto", *BACKENDS):
         raise ValueError(f"expected `backend` auto, poselib, opencv or torch, got {backend!r}")
+    check_positive(pairs_factor=pairs_factor, threshold=threshold, max_iterations=max_iterations)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
-    pairs = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
-    image, scene = _pick(points2d, pairs.index2d), _pick(points3d, pairs.index3d)
-    if backend == "torch":
-        rotation, translation, stats = _together(image, scene, pairs, threshold, max_iterations, seed)
-    else:
-        rotation, translation, stats = _one_by_one(
-            ESTIMATORS[backend], image, scene, pairs, threshold, max_iterations, seed
-        )
-    return rotation.to(assignment), translation.to(assignment), stats
-
-
-def _pick(points: Float[Tensor, "b m d"], index: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
-    return points.detach().gather(1, index.unsqueeze(-1).expand(-1, -1, points.shape[-1])).double()
-
-
-def _together(
-    image: Tensor, scene: Tensor, pairs: PairList, threshold: float, hypotheses: int, seed: int
-) -> tuple[Tensor, Tensor, SolveStats]:
-    """All samples at once on their device, a fixed amount of work. Probability zero is a pair like any other."""
-    weights = pairs.probability.double().clamp_min(torch.finfo(torch.float64).tiny)
-    rotation, translation, inliers, score, found = consensus(
-        image, scene, weights, mask=pairs.mask, threshold=threshold, hypotheses=hypotheses, seed=seed
-    )
-    outliers = pairs.mask.sum(-1) - inliers.sum(-1)
-    # The score is the truncated sum of squares: what is left of it are the inliers'.
-    squared = (score - outliers * threshold**2).clamp_min(0) / inliers.sum(-1).clamp_min(1)
-    residual = torch.where(found, squared.sqrt(), torch.inf)
-    return rotation, translation, SolveStats(torch.full_like(outliers, hypotheses), residual, found)
-
-
-def _one_by_one(
-    estimate: Estimator, image: Tensor, scene: Tensor, pairs: PairList, threshold: float, iterations: int, seed: int
-) -> tuple[Tensor, Tensor, SolveStats]:
-    b = len(image)
-    rotation, translation = np.full((b, 3, 3), np.nan), np.full((b, 3), np.nan)
-    taken, residual, found = np.zeros(b, int), np.full(b, np.inf), np.zeros(b, bool)
-    for i, count in enumerate(pairs.mask.sum(-1).tolist()):
-        if count < MIN_POINTS:
-            continue
-        x, p = image[i, :count].cpu().numpy(), scene[i, :count].cpu().numpy()
-        # Around the origin, so that a scene far from it loses no digits in the minimal solver.
-        centre = p.mean(0)
-        result = estimate(x, p - centre, threshold, iterations, seed)
-        taken[i] = iterations if result is None else result.iterations
-        error = None if result is None else mean_residual(result, x, p - centre, threshold)
-        if result is None or error is None:
-            continue
-        rotation[i], translation[i] = result.rotation, result.translation - result.rotation @ centre
-        residual[i], found[i] = error, True
-    device = image.device
-    stats = SolveStats(*(torch.as_tensor(x, device=device) for x in (taken, residual, found)))
-    return torch.as_tensor(rotation, device=device), torch.as_tensor(translation, device=device), stats
+    chosen = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
+    image, scene = take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double()
+    pairs = Pairs(image, scene, chosen.mask)
+    rotation, translation, iterations = BACKENDS[backend](pairs, threshold, max_iterations, seed)
+    # The returned pose itself is scored: a refit to the inliers of another pose may have lost them.
+    poses = torch.cat([rotation, translation.unsqueeze(-1)], -1).unsqueeze(1)
+    squared, inlier, *_ = (values.squeeze(1) for values in residuals(poses, pairs, threshold**2))
+    count = inlier.sum(-1)
+    found = count >= MIN_POINTS
+    error = torch.where(inlier, squared, 0).sqrt().sum(-1) / count
+    stats = SolveStats(iterations, torch.where(found, error, torch.inf), found)
+    rotation = torch.where(found[:, None, None], rotation, torch.nan)
+    return rotation.to(assignment), torch.where(found[:, None], translation, torch.nan).to(assignment), stats
 
 
 class RansacPnP(nn.Module):

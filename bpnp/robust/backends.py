@@ -1,94 +1,96 @@
-"""RANSAC of other libraries on candidate pairs of one sample: PoseLib's, and OpenCV's as in the paper."""
+"""RANSAC of this and of other libraries on candidate pairs, most probable first: one signature, one pose a sample."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import poselib
+import torch
+from jaxtyping import Float, Int
 from numpy.typing import NDArray
+from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
+from bpnp.robust.consensus import consensus
+from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals
 
-KEPT = 0.9  # share of its inliers that a refit must keep
+KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
+Array = NDArray[np.float64]
+# points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
+SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
 
 
 class Estimate(NamedTuple):
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    iterations: int
+    """Poses, NaN for none. iterations: hypotheses, or the bound on them where the library does not tell."""
+
+    rotation: Float[Tensor, "b 3 3"]
+    translation: Float[Tensor, "b 3"]
+    iterations: Int[Tensor, " b"]
 
 
-Estimator = Callable[[NDArray[np.float64], NDArray[np.float64], float, int, int], Estimate | None]
+def torch_ransac(pairs: Pairs, threshold: float, max_iterations: int, seed: int) -> Estimate:
+    """`consensus`: all samples at once on their device, `max_iterations` hypotheses each."""
+    weights = -torch.arange(pairs.real.shape[1], device=pairs.real.device, dtype=torch.float64)
+    found = consensus(
+        pairs.points2d, pairs.points3d, weights.expand(pairs.real.shape), mask=pairs.real,
+        threshold=threshold, hypotheses=max_iterations, seed=seed,
+    )  # fmt: skip
+    return Estimate(found.rotation, found.translation, pairs.real.sum(-1).fill_(max_iterations))
 
 
-def mean_residual(
-    found: Estimate, points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float
-) -> float | None:
-    """Mean reprojection error of the inliers of a pose; None if it is not finite or has too few in front of it.
-
-    The returned pose itself is scored: a refit to the inliers of another one may have lost them.
-    """
-    errors = _inlier_errors(found, points2d, points3d, threshold)
-    return float(errors.mean()) if len(errors) >= MIN_POINTS else None
-
-
-def _inlier_errors(
-    found: Estimate, points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float
-) -> NDArray[np.float64]:
-    """Reprojection errors up to the threshold of points in front of the camera; none for a pose that is not finite."""
-    if not (np.isfinite(found.rotation).all() and np.isfinite(found.translation).all()):
-        return np.empty(0)
-    y = points3d @ found.rotation.T + found.translation
-    front = y[:, 2] > 0
-    error = np.linalg.norm(y[front, :2] / y[front, 2:] - points2d[front], axis=-1)
-    return error[error <= threshold]
+def _each(estimate: SingleEstimator, pairs: Pairs, threshold: float, max_iterations: int, seed: int) -> Estimate:
+    """One sample after the other; those with fewer than 4 pairs have no pose and no iterations."""
+    pairs, centre, scale = normalised(pairs)
+    poses, iterations = pairs.points3d.new_full((len(pairs.real), 1, 3, 4), torch.nan), pairs.real.sum(-1)
+    for i, count in enumerate(iterations.tolist()):
+        iterations[i] = 0 if count < MIN_POINTS else max_iterations
+        x, p = (points[i][pairs.real[i]].cpu().numpy() for points in pairs[:2])
+        if count >= MIN_POINTS and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
+            poses[i, 0], iterations[i] = torch.as_tensor(found[0]), found[1]
+    rotation, translation = in_scene(poses, centre, scale)
+    return Estimate(rotation.squeeze(1), translation.squeeze(1), iterations)
 
 
-def poselib_ransac(
-    points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float, max_iterations: int, seed: int
-) -> Estimate | None:
+def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
+    """LO-RANSAC with progressive sampling."""
     options = {
-        "max_reproj_error": threshold,
-        "max_iterations": max_iterations,
-        "min_iterations": min(1000, max_iterations),
-        "progressive_sampling": True,
-        "seed": seed,
-    }
+        "max_reproj_error": threshold, "max_iterations": max_iterations, "min_iterations": min(1000, max_iterations),
+        "progressive_sampling": True, "seed": seed,
+    }  # fmt: skip
     camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}
-    pose, info = poselib.estimate_absolute_pose(points2d, points3d, camera, options, {})
-    return Estimate(pose.R, pose.t, int(info["iterations"]))
+    pose, info = poselib.estimate_absolute_pose(x, p, camera, options, {})
+    return pose.Rt, int(info["iterations"])
 
 
-def opencv_ransac(
-    points2d: NDArray[np.float64], points3d: NDArray[np.float64], threshold: float, max_iterations: int, seed: int
-) -> Estimate | None:
+def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int] | None:
+    """P3P-RANSAC, then EPnP on its inliers, as in the paper; SQPnP where EPnP loses inliers."""
     del seed  # OpenCV's generator starts afresh at each call
-    try:  # with the P3P flag, OpenCV itself ends with EPnP on the inliers
+    try:
         ok, rotvec, translation, inliers = cv2.solvePnPRansac(
-            points3d,
-            points2d,
-            np.eye(3),
-            None,
-            iterationsCount=max_iterations,
-            reprojectionError=threshold,
-            flags=cv2.SOLVEPNP_P3P,
+            p, x, np.eye(3), None, iterationsCount=max_iterations, reprojectionError=threshold, flags=cv2.SOLVEPNP_P3P
         )
         if not ok:
             return None
-        found = _estimate(rotvec, translation, max_iterations)
+        pose = np.column_stack([cv2.Rodrigues(rotvec)[0], translation])
         # EPnP has no unique solution for points of one plane: it may have left the pose that it was to refit.
-        x, p = (points[inliers.ravel()] for points in (points2d, points3d))
-        kept = len(_inlier_errors(found, x, p, threshold))
-        if kept < KEPT * len(x):
+        x, p = x[inliers.ravel()], p[inliers.ravel()]
+        kept = _count_inliers(pose, x, p, threshold)
+        if kept < KEPT_SHARE * len(x):
             ok, rotvec, translation = cv2.solvePnP(p, x, np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP)
-            other = _estimate(rotvec, translation, max_iterations)
-            if ok and len(_inlier_errors(other, x, p, threshold)) > kept:
-                return other
+            other = np.column_stack([cv2.Rodrigues(rotvec)[0], translation])
+            pose = other if ok and _count_inliers(other, x, p, threshold) > kept else pose
     except cv2.error:  # degenerate inliers: OpenCV has no pose to offer
         return None
-    return found
+    return pose, max_iterations
 
 
-def _estimate(rotvec: Any, translation: Any, iterations: int) -> Estimate:
-    return Estimate(np.asarray(cv2.Rodrigues(rotvec)[0], float), np.asarray(translation, float).ravel(), iterations)
+def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
+    points2d, points3d, real = (torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool)))
+    return int(residuals(torch.as_tensor(pose)[None, None], Pairs(points2d, points3d, real), threshold**2).inlier.sum())
+
+
+BACKENDS: dict[str, Callable[[Pairs, float, int, int], Estimate]] = {
+    "poselib": partial(_each, _poselib), "opencv": partial(_each, _opencv), "torch": torch_ransac,
+}  # fmt: skip

@@ -31,7 +31,14 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *,
     bearings: rays in the camera frame, of any length. points3d: scene units, any scale and offset. Computed in float64,
     returned in the type of `points3d`. The four slots have no order, and where two solutions meet both are given.
     Collinear or repeated points, rays that no pose explains, NaN and infinity give `valid` False. Work and shapes do
-    not depend on the data, so nothing waits for the device.
+    not depend on the data, so nothing waits for the device. Raises nothing.
+
+    >>> points3d = torch.eye(3)
+    >>> camera = points3d + torch.tensor([0.0, 0.0, 5.0])
+    >>> solution = p3p(camera, points3d)
+    >>> rotation_is_found = (solution.rotation - torch.eye(3)).abs().amax((-2, -1)) < 1e-5
+    >>> bool((rotation_is_found & solution.valid).any())
+    True
     """
     rays = bearings.double().movedim((-2, -1), (0, 1)).contiguous()
     points = points3d.double().movedim((-2, -1), (0, 1)).contiguous()
@@ -62,6 +69,18 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *,
         rotation.movedim((0, 1, 2), (-2, -1, -3)).to(dtype), translation.movedim((0, 1), (-1, -2)).to(dtype),
         valid.movedim(0, -1),
     )  # fmt: skip
+
+
+def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b h 3 3"]) -> Float[Tensor, "b s 3 4"]:
+    """Poses [R | t] of all triples of a sample in s = 2 h + 2 slots, those without a pose NaN and last.
+
+    A triple has fewer than two solutions on average. Solutions beyond the s-th are dropped.
+    """
+    solution = p3p(rays, points3d)
+    poses = torch.cat([solution.rotation, solution.translation.unsqueeze(-1)], -1).flatten(1, 2)
+    filled = solution.valid.flatten(1).byte().argsort(dim=1, descending=True, stable=True)
+    index = filled[:, : 2 * points3d.shape[1] + 2, None, None]
+    return poses.gather(1, index.expand(-1, -1, 3, 4))
 
 
 def _sides2(points: Tensor) -> Tensor:
@@ -104,16 +123,10 @@ def _ratios(cosines: Tensor, lengths2: Tensor) -> tuple[Tensor, Tensor]:
 
 def _adjugate(symmetric: Tensor) -> Tensor:
     xx, xy, xw, yy, yw, ww = symmetric
-    return torch.stack(
-        [
-            yy * ww - yw * yw,
-            xw * yw - xy * ww,
-            xy * yw - xw * yy,
-            xx * ww - xw * xw,
-            xy * xw - xx * yw,
-            xx * yy - xy * xy,
-        ]
-    )
+    return torch.stack([
+        yy * ww - yw * yw, xw * yw - xy * ww, xy * yw - xw * yy,
+        xx * ww - xw * xw, xy * xw - xx * yw, xx * yy - xy * xy,
+    ])  # fmt: skip
 
 
 def _trace(a: Tensor, b: Tensor) -> Tensor:
@@ -161,28 +174,26 @@ def _split(pair: Tensor) -> Tensor:
 
 
 def _meet(lines: Tensor, conic1: Tensor, conic2: Tensor) -> tuple[Tensor, Tensor]:
-    """(x, y) of the points where the lines (2, 3, ...) meet the conics, four slots (4, ...)."""
+    """(x, y) of the points where the lines a x + b y + c = 0 (2, 3, ...) meet the conics, four slots (4, ...)."""
     a, b, c = lines.unbind(1)
-    # The coordinate with the smaller coefficient is free: (x, y) = (slope u + offset, u) or (u, slope u + offset).
-    steep = a.abs() > b.abs()
-    pivot = torch.where(steep, a, b)
-    slope, offset = -torch.where(steep, b, a) / pivot, -c / pivot
-    first, second = (_restrict(conic, steep, slope, offset) for conic in (conic1, conic2))
-    # Both restrictions have the same roots; the smaller one is less accurate.
+    size = (a * a + b * b).sqrt()
+    a, b, c = a / size, b / size, c / size
+    # The points of a line are (-a c, -b c) + u (b, -a).
+    along, foot = torch.stack([b, -a, torch.zeros_like(c)]), torch.stack([-a * c, -b * c, torch.ones_like(c)])
+    first, second = (
+        torch.stack([_form(conic, along, along), _form(conic, along, foot), _form(conic, foot, foot)])
+        for conic in (conic1, conic2)
+    )
+    # Both conics have the same points on the line; the one of smaller coefficients is less accurate.
     u = _quadratic_roots(torch.where(first.abs().amax(0) > second.abs().amax(0), first, second))
-    other = slope * u + offset
-    return torch.where(steep, other, u).flatten(0, 1), torch.where(steep, u, other).flatten(0, 1)
+    return (u * along[0] + foot[0]).flatten(0, 1), (u * along[1] + foot[1]).flatten(0, 1)
 
 
-def _restrict(conic: Tensor, steep: Tensor, slope: Tensor, offset: Tensor) -> Tensor:
-    """The conic on a line, as coefficients a, b, c of a u^2 + 2 b u + c."""
+def _form(conic: Tensor, p: Tensor, q: Tensor) -> Tensor:
+    """p^T C q."""
     xx, xy, xw, yy, yw, ww = conic
-    bound2, free2 = torch.where(steep, xx, yy), torch.where(steep, yy, xx)
-    bound, free = torch.where(steep, xw, yw), torch.where(steep, yw, xw)
-    mixed = bound2 * slope + xy
-    quadratic = (mixed + xy) * slope + free2
-    linear = mixed * offset + bound * slope + free
-    return torch.stack([quadratic, linear, (bound2 * offset + 2 * bound) * offset + ww])
+    mixed = xy * (p[0] * q[1] + p[1] * q[0]) + xw * (p[0] * q[2] + p[2] * q[0]) + yw * (p[1] * q[2] + p[2] * q[1])
+    return xx * p[0] * q[0] + yy * p[1] * q[1] + ww * p[2] * q[2] + mixed
 
 
 def _quadratic_roots(coefficients: Tensor) -> Tensor:

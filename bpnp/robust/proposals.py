@@ -1,28 +1,33 @@
-"""Many poses from one soft assignment: minimal samples of its pairs, for a search that needs no assignment to judge.
+"""Poses proposed by a soft assignment: P3P on triples of pairs drawn in proportion to their probability.
 
-An assignment that places each point to within a tenth of the others has few true pairs among its most probable ones,
-and a consensus on these is often wrong. Among poses of triples drawn from it some are near the truth all the same.
+An assignment that is only roughly right has few true pairs among its most probable ones, and a consensus on these is
+often wrong. Some of the poses of triples drawn from it are near the true pose all the same: initial poses for a search.
 """
 
 import math
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.checks import check_positive, checked_shapes
 from bpnp.distinct_poses import distinct
-from bpnp.geometry import bearings, transform
+from bpnp.geometry import bearings
 from bpnp.precision import full_precision
-from bpnp.robust.p3p import p3p
+from bpnp.robust.p3p import poses_of_triples
+from bpnp.robust.sampling import take, weighted_draws
+from bpnp.robust.scoring import Pairs, in_scene, normalised, truncated_scores
 from bpnp.types import SolveStats
 
+TRIPLES = 1024  # solved for each sample
 DRAWN = 4  # triples drawn for each that is solved: those of the widest triangles
 SCORED = 512  # pairs drawn to score the poses on
-MINIMUM_PAIRS = 3
+APART_DEG = 15.0  # smallest angle between two proposals
 
 
+@checked_shapes
 @full_precision
+@torch.no_grad()
 def pose_hypotheses(
     assignment: Float[Tensor, "b m n"],
     points2d: Float[Tensor, "b m 2"],
@@ -31,94 +36,64 @@ def pose_hypotheses(
     count: int,
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
-    triples: int = 1024,
     threshold: float = 0.2,
-    apart_deg: float = 15.0,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"], SolveStats]:
-    """The `count` best poses, any two of them `apart_deg` apart, of triples of pairs drawn in proportion to P.
+    """The s = `count` best poses, any two of them 15 degrees apart, of triples of pairs drawn in proportion to P.
 
-    Of the triples drawn those with the largest products of their triangles' areas on both sides are solved (`p3p`):
-    a small triangle turns the errors of its pairs into large ones of the pose. A pose scores
-    sum_k min(r_k^2, threshold^2) over other pairs k drawn from P, r_k the reprojection error and infinite behind the
-    camera, which estimates the expectation under P.
+    Of the triples drawn those with the largest products of their triangles' areas on both sides are solved (`p3p`): a
+    small triangle magnifies the errors of its pairs. A pose scores sum_k min(r_k^2, threshold^2) over other pairs k
+    drawn from P, r_k the reprojection error and infinite behind the camera, which estimates the expectation under P.
 
     assignment: P, non-negative, of any sum. points2d: normalised image coordinates. points3d: scene units.
-    count: s, slots of the result. triples: solved for each sample. seed: of the draws, the same for each sample.
-    threshold: in root mean square distances of the sample's image points from their mean.
+    threshold: in root mean square distances of the sample's image points from their mean. seed: of the draws, the same
+    for each sample: a sample's result depends neither on the other samples nor on padding. Not differentiable.
 
-    Returns rotation, translation, best first, NaN in empty slots, and stats (iterations: triples solved; residual:
-    root mean truncated square of the best pose, normalised units; converged: there is a pose). A sample whose P has no
-    mass or is not finite, or with fewer than 3 points of a side, has none. Not differentiable. A sample's result
-    depends neither on the other samples nor on padding.
-    Raises ValueError for options out of range.
+    Returns rotation, translation, best first, NaN in empty slots, and stats (iterations: triples solved; residual: root
+    mean truncated square of the best pose, normalised image units; converged: there is a pose). A sample whose P has no
+    mass or is not finite, or with fewer than 3 points of a side, has none.
+    Raises ValueError for arguments of wrong shape or type and options that are not positive.
     """
-    b = len(assignment)
-    for name, value in {"count": count, "triples": triples, "threshold": threshold}.items():
-        if not value > 0:
-            raise ValueError(f"expected a positive `{name}`, got {value}")
-    if not 0 <= apart_deg < 180:
-        raise ValueError(f"expected `apart_deg` in [0, 180), got {apart_deg}")
-    rotation, translation = points3d.new_full((b, count, 3, 3), torch.nan), points3d.new_full((b, count, 3), torch.nan)
-    solved = torch.zeros(b, dtype=torch.long, device=assignment.device)
-    residual = points3d.new_full((b,), torch.inf)
-    for i in range(b):
-        real2d = slice(None) if mask2d is None else mask2d[i]
-        real3d = slice(None) if mask3d is None else mask3d[i]
-        probability = assignment[i].detach()[real2d][:, real3d]
-        image, scene = points2d[i].detach()[real2d].double(), points3d[i].detach()[real3d].double()
-        total = probability.double().sum()
-        if min(probability.shape) < MINIMUM_PAIRS or not (total.isfinite() and total > 0):
-            continue
-        # Around the origin and of unit extent: a scene far from it loses no digits in the minimal solver.
-        centre = scene.mean(0)
-        size = (scene - centre).square().sum(-1).mean().sqrt().clamp(min=1e-30)
-        bound = (threshold * (image - image.mean(0)).square().sum(-1).mean().sqrt()) ** 2
-        index2d, index3d = _draw(probability, 3 * DRAWN * triples + SCORED, seed)
-        pairs2d, pairs3d = image[index2d], ((scene - centre) / size)[index3d]
-        turns, shifts = _poses(pairs2d[SCORED:].unflatten(0, (-1, 3)), pairs3d[SCORED:].unflatten(0, (-1, 3)), triples)
-        cost = _cost(turns, shifts, pairs2d[:SCORED], pairs3d[:SCORED], bound)
-        turned, shifted, score = (x.cpu().numpy().astype(np.float32) for x in (turns, shifts, -cost))
-        best = torch.as_tensor(distinct(turned, shifted, score, count, apart_deg, math.inf), device=cost.device)
-        solved[i] = triples
-        if len(best):
-            rotation[i, : len(best)] = turns[best].to(rotation)
-            moved = size * shifts[best] - turns[best] @ centre
-            translation[i, : len(best)] = moved.to(translation)
-            residual[i] = cost[best[0]].sqrt().to(residual)
-    return rotation, translation, SolveStats(solved, residual, residual.isfinite())
+    check_positive(count=count, threshold=threshold)
+    b, m, n = assignment.shape
+    real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
+    real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
+    probability = assignment.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), 0).flatten(1)
+    mass = probability.sum(-1, dtype=torch.float64)
+    usable = mass.isfinite() & (mass > 0) & (torch.minimum(real2d.sum(-1), real3d.sum(-1)) >= 3)
+
+    drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN * TRIPLES, seed)
+    chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
+    pairs, centre, scale = normalised(chosen)
+    poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in pairs[:2]))
+    sample = Pairs(*(values[:, :SCORED] for values in pairs))
+    threshold2 = threshold**2 * _variance(points2d, real2d)
+    score = truncated_scores(poses, sample, threshold2.float()[:, None, None]) / SCORED
+
+    best = poses.new_full((b, count, 3, 4), torch.nan)
+    residual = poses.new_full((b,), torch.inf)
+    for i in usable.nonzero().flatten().tolist():
+        r, t, value = (x.float().cpu().numpy() for x in (poses[i, ..., :3], poses[i, ..., 3], -score[i]))
+        index = torch.as_tensor(distinct(r, t, value, count, APART_DEG, math.inf), device=poses.device)
+        best[i, : len(index)] = poses[i, index]
+        if len(index):
+            residual[i] = score[i, index[0]].sqrt()
+    stats = SolveStats(TRIPLES * usable.long(), residual.to(points3d), residual.isfinite())
+    rotation, translation = in_scene(best, centre, scale)
+    return rotation.to(points3d), translation.to(points3d), stats
 
 
-def _draw(probability: Float[Tensor, "m n"], count: int, seed: int) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"]]:
-    """Pairs, each in proportion to its probability."""
-    total = probability.double().flatten().cumsum(0)
-    uniform = torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(total.device)
-    # The first sum above the number drawn: never a pair of probability zero.
-    flat = torch.searchsorted(total, uniform * total[-1], right=True).clamp(max=len(total) - 1)
-    return flat // probability.shape[1], flat % probability.shape[1]
-
-
-def _poses(
-    image: Float[Tensor, "k 3 2"], scene: Float[Tensor, "k 3 3"], triples: int
-) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
-    """Every pose of the `triples` widest triples."""
-    (x, y), (along, across) = (image[:, 1:] - image[:, :1]).unbind(1), (scene[:, 1:] - scene[:, :1]).unbind(1)
-    area2d = (x[:, 0] * y[:, 1] - x[:, 1] * y[:, 0]).abs()
+def _poses_of_widest(image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"]) -> Float[Tensor, "b s 3 4"]:
+    """Poses of the TRIPLES triples whose triangles have the largest products of areas."""
+    (x, y), (along, across) = ((points[:, :, 1:] - points[:, :, :1]).unbind(2) for points in (image, scene))
+    area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)
-    widest = (area2d * area3d).topk(triples).indices
-    found = p3p(bearings(image[widest]), scene[widest])
-    return found.rotation[found.valid], found.translation[found.valid]
+    widest = (area2d * area3d).topk(TRIPLES).indices
+    return poses_of_triples(bearings(take(image, widest)), take(scene, widest))
 
 
-def _cost(
-    rotation: Float[Tensor, "s 3 3"],
-    translation: Float[Tensor, "s 3"],
-    image: Float[Tensor, "k 2"],
-    scene: Float[Tensor, "k 3"],
-    bound: Float[Tensor, ""],
-) -> Float[Tensor, " s"]:
-    """Mean truncated squared reprojection error of each pose, in float32."""
-    camera = transform(rotation.float(), translation.float(), scene.float().expand(len(rotation), -1, -1))
-    depth = camera[..., 2]
-    squared = (camera[..., :2] / depth.unsqueeze(-1) - image.float()).square().sum(-1)
-    return torch.where(depth > 0, squared, torch.inf).clamp(max=bound.float()).mean(-1)
+def _variance(points: Float[Tensor, "b m 2"], real: Bool[Tensor, "b m"]) -> Float[Tensor, " b"]:
+    """Mean squared distance of a sample's points from their mean."""
+    count = real.sum(-1, keepdim=True).clamp(min=1)
+    mean = torch.where(real.unsqueeze(-1), points, 0).sum(1) / count
+    return torch.where(real, (points - mean.unsqueeze(1)).square().sum(-1), 0).sum(-1) / count.squeeze(-1)

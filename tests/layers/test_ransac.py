@@ -1,3 +1,6 @@
+from collections.abc import Callable
+from typing import Any
+
 import jaxtyping
 import pytest
 import torch
@@ -164,7 +167,45 @@ def test_more_hypotheses_are_more_iterations() -> None:
     assert layer(assignment, planted.points2d, planted.points3d)[2].iterations.max() > 1000
 
 
+def without_type_checker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Call the layers as users do, who run no jaxtyping."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
 def test_names_the_backends(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)  # as users run it
+    without_type_checker(monkeypatch)
     with pytest.raises(ValueError, match="expected `backend` .*poselib.*got 'magsac'"):
         ransac_pnp(torch.ones(1, 4, 4), torch.ones(1, 4, 2), torch.ones(1, 4, 3), backend="magsac")
+
+
+@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("points2d", lambda p, x, y: (p, torch.cat([x, x[..., :1]], -1), y)),  # bearings for image coordinates
+        ("points3d", lambda p, x, y: (p, x, y[..., :2])),
+        ("assignment", lambda p, x, y: (p[0], x[0], y[0])),
+        ("assignment", lambda p, x, y: (p[:0], x[:0], y[:0])),
+        ("points2d", lambda p, x, y: (p, x[:, :0], y)),
+        ("points3d", lambda p, x, y: (p, x, y[:, 1:])),
+        ("points3d", lambda p, x, y: (p, x, y[:1])),
+        ("assignment", lambda p, x, y: (p.long(), x, y)),
+        ("points2d", lambda p, x, y: (p, x.int(), y)),
+        ("points3d", lambda p, x, y: (p, x, y.numpy())),
+    ],
+)
+def test_wrong_shapes_and_types_are_named(
+    backend: str, name: str, change: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without_type_checker(monkeypatch)
+    planted = plant(2, 12)
+    with pytest.raises(ValueError, match=rf"^expected `{name}` .*got"):
+        ransac_pnp(*change(planted.permutation(), planted.points2d, planted.points3d), backend=backend)
+
+
+@pytest.mark.parametrize("option", [{"pairs_factor": 0.0}, {"threshold": -0.01}, {"max_iterations": 0}])
+def test_options_must_be_positive(option: dict[str, Any]) -> None:
+    planted = plant(2, 12)
+    ((name, value),) = option.items()
+    with pytest.raises(ValueError, match=f"expected `{name}` > 0, got {value}"):
+        ransac_pnp(planted.permutation(), planted.points2d, planted.points3d, **option)

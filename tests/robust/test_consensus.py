@@ -11,6 +11,7 @@ from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
 from bpnp.geometry import rotation_angle
+from bpnp.robust import scoring
 from bpnp.robust.consensus import Consensus, consensus
 
 THRESHOLD = 0.01
@@ -199,7 +200,9 @@ def test_same_seed_same_result_and_other_seeds_the_same_pose() -> None:
     assert rotation_angle(first.rotation[0], other.rotation[0]) < np.deg2rad(0.1)
 
 
-def test_neither_the_global_generator_nor_the_parts_nor_autocast_change_the_result() -> None:
+def test_neither_the_global_generator_nor_the_parts_nor_autocast_change_the_result(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     problem = planted(8)
     x, p, w = problem.tensors(torch.float32)
     state = torch.random.get_rng_state()
@@ -207,7 +210,8 @@ def test_neither_the_global_generator_nor_the_parts_nor_autocast_change_the_resu
     assert torch.equal(torch.random.get_rng_state(), state)
     with torch.autocast("cpu", dtype=torch.bfloat16):
         torch.testing.assert_close(consensus(x, p, w).rotation, expected.rotation, atol=1e-6, rtol=0)
-    torch.testing.assert_close(consensus(x, p, w, chunk=5000).rotation, expected.rotation, atol=1e-6, rtol=0)
+    monkeypatch.setattr(scoring, "CHUNK", 5000)
+    torch.testing.assert_close(consensus(x, p, w).rotation, expected.rotation, atol=1e-6, rtol=0)
 
 
 def test_no_gradient_and_no_step_that_reads_the_data() -> None:
@@ -219,9 +223,11 @@ def test_no_gradient_and_no_step_that_reads_the_data() -> None:
 
 def test_wrong_arguments_are_named() -> None:
     x, p, w = planted(10).tensors()
-    with pytest.raises(ValueError, match=r"at least one, got \[\(1, 0\), \(1, 0\), \(1, 0\)"):
+    with pytest.raises(ValueError, match=r"expected `points2d` .*no empty axis, got \(1, 0, 2\)"):
         consensus(x[:, :0], p[:, :0], w[:, :0])
-    with pytest.raises(ValueError, match="expected a positive `threshold`, got -0.01"):
+    with pytest.raises(ValueError, match=r"expected `weights` .*k = 600 as in `points2d`, got \(1, 599\)"):
+        consensus(x, p, w[:, 1:])
+    with pytest.raises(ValueError, match="expected `threshold` > 0, got -0.01"):
         consensus(x, p, w, threshold=-0.01)
-    with pytest.raises(ValueError, match="expected a positive `hypotheses`, got 0"):
+    with pytest.raises(ValueError, match="expected `hypotheses` > 0, got 0"):
         consensus(x, p, w, hypotheses=0)

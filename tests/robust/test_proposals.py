@@ -28,7 +28,7 @@ def errors(rotation: Tensor, scene: Planted) -> Tensor:
 
 
 def test_a_blurred_assignment_proposes_the_pose() -> None:
-    scene = plant(20, 200, noise=0.0025)
+    scene = plant(60, 200, noise=0.0025)
     assignment = blurred(scene, 0.1)
     on_truth = (assignment * (scene.permutation() > 0)).sum((-2, -1))
     assert on_truth.max() < 0.06
@@ -37,7 +37,7 @@ def test_a_blurred_assignment_proposes_the_pose() -> None:
     assert (error.amin(-1) < 15).double().mean() >= 0.95
     assert (error[:, 0] < 15).double().mean() < (error.amin(-1) < 15).double().mean()
     nearest = error.argmin(-1)
-    shift = (translation[torch.arange(20), nearest] - scene.translation).norm(dim=-1)
+    shift = (translation[torch.arange(60), nearest] - scene.translation).norm(dim=-1)
     assert shift.median() < 1.5  # of about 5 units; a blurred triple tells the depth badly
     assert stats.converged.all()
 
@@ -54,12 +54,12 @@ def test_an_assignment_that_is_right_gives_the_exact_pose_first() -> None:
 
 def test_the_poses_are_apart_and_the_best_comes_first() -> None:
     scene = plant(1, 80)
-    rotation, _, _ = pose_hypotheses(blurred(scene, 0.1), scene.points2d, scene.points3d, count=12, apart_deg=25.0)
+    rotation, _, _ = pose_hypotheses(blurred(scene, 0.1), scene.points2d, scene.points3d, count=12)
     found = rotation[0][rotation[0].isfinite().all((-2, -1))]
     assert len(found) > 3
     cosine = (torch.einsum("sij,tij->st", found, found).fill_diagonal_(-1) - 1) / 2
-    assert cosine.max() <= torch.tensor(25.0).deg2rad().cos() + 1e-5
-    fewer, _, _ = pose_hypotheses(blurred(scene, 0.1), scene.points2d, scene.points3d, count=3, apart_deg=25.0)
+    assert cosine.max() <= torch.tensor(15.0).deg2rad().cos() + 1e-5
+    fewer, _, _ = pose_hypotheses(blurred(scene, 0.1), scene.points2d, scene.points3d, count=3)
     assert torch.equal(fewer[0], rotation[0, :3])
 
 
@@ -99,9 +99,7 @@ def test_a_sample_without_pairs_has_no_pose_and_the_others_do() -> None:
     assert errors(rotation, scene)[3, 0] < 1e-5
 
 
-@pytest.mark.parametrize(
-    "options", [{"count": 0}, {"triples": 0}, {"threshold": 0.0}, {"apart_deg": 180.0}, {"apart_deg": -1.0}]
-)
+@pytest.mark.parametrize("options", [{"count": 0}, {"threshold": 0.0}, {"threshold": -0.1}])
 def test_options_out_of_range_are_named(options: dict[str, Any]) -> None:
     scene = plant(1, 8)
     with pytest.raises(ValueError, match=rf"expected.*`{next(iter(options))}`"):
