@@ -75,8 +75,8 @@ def measure(points: int, *, poses: bool) -> Run:
 
         return hook
 
-    net.sinkhorn.register_forward_pre_hook(lambda *_: ends("features, cost"))
-    for stage, layer in (("Sinkhorn", net.sinkhorn), ("RANSAC", net.pose_stage.ransac), ("PnP", net.pose_stage.pnp)):
+    net.transport.register_forward_pre_hook(lambda *_: ends("features, cost"))
+    for stage, layer in (("Sinkhorn", net.transport), ("RANSAC", net.ransac), ("PnP", net.pnp)):
         layer.register_forward_hook(solved(stage))
     training_losses(net, batch, poses).mean().backward()
     ends("backward")

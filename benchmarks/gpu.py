@@ -47,7 +47,7 @@ def make_step(mode: str, batch: int, points: int, *, poses: bool, device: torch.
     problem = planted(batch, points, kind="smooth", level=LEVEL)
     net = planted_network(problem, autocast=torch.bfloat16 if "bf16" in mode else None).to(device)
     if "compile" in mode:
-        for part in (net.features2d, net.features3d, net.align):
+        for part in (net.features2d, net.features3d):
             part.compile()
     return training_step(net, problem.batch.to(device), poses=poses)
 

@@ -168,7 +168,9 @@ def _step_rows(b: int, size: Size) -> Iterable[Row]:
     problem = planted(b, size.points, kind="smooth", level=10)
     net = planted_network(problem)
     with torch.no_grad():
-        inputs = f"smooth, {diagonal_mass(net.sinkhorn(net.cost(problem.batch))[0]):.0%}"
+        assignment = net.match(problem.batch).assignment
+    assert assignment is not None
+    inputs = f"smooth, {diagonal_mass(assignment):.0%}"
     for poses, what, target in ((False, "correspondence loss", ">= 3x"), (True, "with pose loss", ">= 7x")):
         ours, paper = (training_step(deepcopy(net), problem.batch, poses=poses, paper=p) for p in (False, True))
         yield Row(f"training step, {what}", inputs, b, target, race(ours, paper, rounds=size.rounds))

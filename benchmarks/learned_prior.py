@@ -25,7 +25,7 @@ from bpnp.datamodules import ColmapDataModule, MeshDataModule
 from bpnp.datamodules.outliers import Outliers
 from bpnp.metrics import rotation_error
 from bpnp.models import TrainedNet, load_network, load_pretrained
-from bpnp.models.pretrained import LEARNED
+from bpnp.models.weights import LEARNED
 
 RIGHT_DEG = 5.0
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.models.bpnpnet import BPnPNet, pairwise_distance
-from bpnp.models.nets.features import PointFeatures
+from bpnp.models.nets.features import ImageFeatures, SceneFeatures
 from bpnp.types import Batch
 
 Kind = Literal["smooth", "independent"]
@@ -74,25 +74,25 @@ def planted_network(problem: Problem, *, autocast: torch.dtype | None = None) ->
 
     autocast: dtype of the nets' products, none for float32; features and layers stay in float32.
     """
-    net = BPnPNet(centre_features=True, image_scale=4.0)
-    net.features2d = _PlantedFeatures(net.features2d, problem.features2d, autocast)
-    net.features3d = _PlantedFeatures(net.features3d, problem.features3d, autocast)
-    return net
+    return BPnPNet(
+        _PlantedFeatures(ImageFeatures(centre=True, scale=4.0), problem.features2d, autocast),
+        _PlantedFeatures(SceneFeatures(centre=True), problem.features3d, autocast),
+    )
 
 
-class _PlantedFeatures(PointFeatures):
+class _PlantedFeatures(nn.Module):
     """Unit vector of a planted feature and a small part of that of the network."""
 
-    def __init__(self, inner: PointFeatures, planted: Tensor, autocast: torch.dtype | None) -> None:
-        nn.Module.__init__(self)
-        self.enter, self.blocks, self.centre = inner.enter, inner.blocks, inner.centre
-        self.autocast = autocast
+    def __init__(self, inner: nn.Module, planted: Tensor, autocast: torch.dtype | None) -> None:
+        super().__init__()
+        self.inner, self.autocast = inner, autocast
         self.register_buffer("planted", planted)
 
     def forward(self, points: Tensor, mask: Tensor) -> Tensor:
         with torch.autocast(points.device.type, dtype=self.autocast, enabled=self.autocast is not None):
-            z = super().forward(points, mask)
-        return nn.functional.normalize(self.get_buffer("planted") + NET_SHARE * z.to(self.enter.weight.dtype), dim=-1)
+            z = self.inner(points, mask)
+        planted = self.get_buffer("planted")
+        return nn.functional.normalize(planted + NET_SHARE * z.to(planted.dtype), dim=-1)
 
 
 def _axis_rotation(angle: Tensor, i: int, j: int) -> Tensor:

@@ -28,7 +28,7 @@ def training_step(net: BPnPNet, batch: Batch, *, poses: bool, paper: bool = Fals
 
 def training_losses(net: BPnPNet, batch: Batch, poses: bool) -> Tensor:
     """L_c + L_p of each sample (b,)."""
-    prediction = net(batch, poses=poses)
+    prediction = net(batch) if poses else net.match(batch)
     assert prediction.assignment is not None
     losses = _matching(prediction.assignment, batch)
     if not poses:

@@ -6,8 +6,11 @@ import typing
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+import numpy as np
+import torch
 from torch import Tensor
 
+Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 
@@ -78,3 +81,67 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
     if str(value.dtype).removeprefix("torch.") not in kind.dtypes:
         numbers = kind.__name__.split("[")[0].lower()
         raise ValueError(f"expected `{name}` of type {numbers}, got {value.dtype}; try .{numbers}()")
+
+
+def listed(name: str, values: Arrays, ndim: int) -> list[Tensor]:
+    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
+    if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
+        return [_as_tensor(name, v) for v in values]
+    array = _as_tensor(name, values)
+    if array.numel() == 0 and array.ndim != ndim:
+        raise ValueError(f"expected at least one pair, got an empty `{name}`")
+    return list(array) if array.ndim == ndim + 1 else [array]
+
+
+def _as_tensor(name: str, values: Arrays) -> Tensor:
+    if isinstance(values, Tensor):
+        return values.cpu()
+    try:
+        array = np.asarray(values)
+        return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
+
+
+def checked_points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
+    """The points of pair i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
+    if points.ndim != 2 or points.shape[1] != dim:
+        hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
+        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in pair {i}{hint}")
+    if len(points) == 0:
+        raise ValueError(f"expected at least one point in `{name}`, got none in pair {i}")
+    if not points.isfinite().all():
+        bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
+        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of pair {i}")
+    return points
+
+
+def checked_match(i: int, match: Tensor, m: int, n: int) -> Tensor:
+    """The match3d of pair i, (n,). Raises ValueError for another shape, other than integers, or what is no 2D point."""
+    if match.shape != (n,):
+        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in pair {i}")
+    if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
+        raise ValueError(
+            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in pair {i}; try .astype(int)"
+        )
+    if int(match.min()) < -1 or int(match.max()) >= m:
+        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
+    return match.long()
+
+
+def stacked(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
+    """One tensor of the values of all pairs. Raises ValueError for another shape, NaN or infinity."""
+    for i, value in enumerate(values):
+        if value.shape != shape:
+            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in pair {i}")
+        if not value.isfinite().all():
+            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in pair {i}")
+    return torch.stack([v.to(dtype) for v in values])
+
+
+def padded(sets: list[Tensor], size: int, value: int = 0) -> Tensor:
+    """One tensor (b, size, ...) of sets of different sizes."""
+    result = sets[0].new_full((len(sets), size, *sets[0].shape[1:]), value)
+    for i, values in enumerate(sets):
+        result[i, : len(values)] = values
+    return result

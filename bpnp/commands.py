@@ -40,7 +40,7 @@ def convert_weights(arguments: list[str]) -> None:
         "--pnp", choices=("newton", "lbfgs"), default="newton", help="lbfgs is the paper's (default: newton)"
     )
     chosen = parser.parse_args(arguments)
-    task = BlindPnPTask(load_released(chosen.file, ransac_backend=chosen.ransac, pnp_method=chosen.pnp))
+    task = BlindPnPTask(load_released(chosen.file, backend=chosen.ransac, method=chosen.pnp))
     checkpoint: dict[str, Any] = {
         "epoch": 0,
         "global_step": 0,

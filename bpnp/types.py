@@ -9,15 +9,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any, TypeVar, cast
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from bpnp.checks import Arrays, checked_match, checked_points, listed, padded, stacked
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")
-Arrays = Any  # one array, or a sequence of arrays of different sizes; numpy or torch
 
 
 @dataclass(frozen=True)
@@ -54,6 +53,8 @@ class Pose:
 class Prediction:
     """A solver's answer: the joint probability of every pair, and each pose estimate by name.
 
+    assignment: what the solver's own transport gave. rematched: that of the last round, of a solver that matches again
+        under its pose in evaluation.
     unmatched2d, unmatched3d: the probability that a point has no partner, of an assignment with bins for them.
     """
 
@@ -62,6 +63,7 @@ class Prediction:
     poses: dict[str, Pose] = field(default_factory=dict)
     unmatched2d: Float[Tensor, "b m"] | None = None
     unmatched3d: Float[Tensor, "b n"] | None = None
+    rematched: Float[Tensor, "b m n"] | None = None
 
     def to(self, *args: Any, **kwargs: Any) -> "Prediction":
         return _moved(self, *args, **kwargs)
@@ -133,38 +135,39 @@ class Batch:
 
         Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
         or a match3d that holds no integers or an index that is no 2D point.
+
+        >>> batch = Batch.from_arrays([torch.rand(5, 2), torch.rand(7, 2)], [torch.rand(9, 3), torch.rand(6, 3)])
+        >>> tuple(batch.points2d.shape), batch.count2d.tolist(), batch.count3d.tolist()
+        ((2, 7, 2), [5, 7], [9, 6])
         """
-        sets2d, sets3d = _as_list("points2d", points2d, 2), _as_list("points3d", points3d, 2)
+        sets2d, sets3d = listed("points2d", points2d, 2), listed("points3d", points3d, 2)
         size = len(sets2d)
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in sets2d) else torch.float32
-        sets2d = [_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
-        sets3d = [_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
-        rotations = None if rotation is None else _as_list("rotation", rotation, 2)
-        translations = None if translation is None else _as_list("translation", translation, 1)
-        matches = None if match3d is None else _as_list("match3d", match3d, 1)
-        focals = [torch.ones(())] if focal is None else _as_list("focal", focal, 0)
+        sets2d = [checked_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
+        sets3d = [checked_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
+        rotations = None if rotation is None else listed("rotation", rotation, 2)
+        translations = None if translation is None else listed("translation", translation, 1)
+        matches = None if match3d is None else listed("match3d", match3d, 1)
+        focals = [torch.ones(())] if focal is None else listed("focal", focal, 0)
         focals = focals * size if len(focals) == 1 else focals
         for name, values in (("points3d", sets3d), ("rotation", rotations), ("translation", translations),
                              ("match3d", matches), ("focal", focals), ("index", index), ("ids", ids)):  # fmt: skip
             if values is not None and len(values) != size:
                 raise ValueError(f"expected `{name}` for {size} pairs as in `points2d`, got {len(values)}")
-        m, n = max(len(x) for x in sets2d), max(len(x) for x in sets3d)
-        padded_match = None
+        m, n = max(map(len, sets2d)), max(map(len, sets3d))
         if matches is not None:
-            padded_match = torch.full((size, n), -1, dtype=torch.long)
-            for i, match in enumerate(matches):
-                padded_match[i, : len(sets3d[i])] = _match(i, match, len(sets2d[i]), len(sets3d[i]))
+            matches = [checked_match(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
         return cls(
-            points2d=_pad(sets2d, m),
-            points3d=_pad(sets3d, n),
+            points2d=padded(sets2d, m),
+            points3d=padded(sets3d, n),
             mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
             mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
-            focal=_stack("focal", focals, (), dtype),
+            focal=stacked("focal", focals, (), dtype),
             index=torch.arange(size) if index is None else torch.as_tensor(index, dtype=torch.long),
-            ids=tuple(str(i) for i in range(size)) if ids is None else tuple(ids),
-            rotation=None if rotations is None else _stack("rotation", rotations, (3, 3), dtype),
-            translation=None if translations is None else _stack("translation", translations, (3,), dtype),
-            match3d=padded_match,
+            ids=tuple(map(str, range(size))) if ids is None else tuple(ids),
+            rotation=None if rotations is None else stacked("rotation", rotations, (3, 3), dtype),
+            translation=None if translations is None else stacked("translation", translations, (3,), dtype),
+            match3d=None if matches is None else padded(matches, n, -1),
         )
 
 
@@ -187,63 +190,3 @@ def _mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
         changed = {f.name: _mapped(getattr(value, f.name), function) for f in fields(value)}
         return cast(_T, type(value)(**changed))
     return value
-
-
-def _as_list(name: str, values: Arrays, ndim: int) -> list[Tensor]:
-    """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
-    if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
-        return [_as_tensor(name, v) for v in values]
-    array = _as_tensor(name, values)
-    if array.numel() == 0 and array.ndim != ndim:
-        raise ValueError(f"expected at least one pair, got an empty `{name}`")
-    return list(array) if array.ndim == ndim + 1 else [array]
-
-
-def _as_tensor(name: str, values: Arrays) -> Tensor:
-    if isinstance(values, Tensor):
-        return values.cpu()
-    try:
-        array = np.asarray(values)
-        return torch.as_tensor(np.array(array, array.dtype.newbyteorder("=")))
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
-
-
-def _points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
-    if points.ndim != 2 or points.shape[1] != dim:
-        hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
-        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in pair {i}{hint}")
-    if len(points) == 0:
-        raise ValueError(f"expected at least one point in `{name}`, got none in pair {i}")
-    if not points.isfinite().all():
-        bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
-        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of pair {i}")
-    return points
-
-
-def _match(i: int, match: Tensor, m: int, n: int) -> Tensor:
-    if match.shape != (n,):
-        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in pair {i}")
-    if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
-        raise ValueError(
-            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in pair {i}; try .astype(int)"
-        )
-    if int(match.min()) < -1 or int(match.max()) >= m:
-        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
-    return match.long()
-
-
-def _stack(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    for i, value in enumerate(values):
-        if value.shape != shape:
-            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in pair {i}")
-        if not value.isfinite().all():
-            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in pair {i}")
-    return torch.stack([v.to(dtype) for v in values])
-
-
-def _pad(sets: list[Tensor], size: int) -> Tensor:
-    padded = sets[0].new_zeros(len(sets), size, sets[0].shape[1])
-    for i, points in enumerate(sets):
-        padded[i, : len(points)] = points
-    return padded

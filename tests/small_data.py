@@ -3,11 +3,18 @@
 from pathlib import Path
 
 import numpy as np
+from torch import nn
 
+from bpnp import BPnPNet
 from bpnp.datamodules.meshes.procedural import procedural_shape
 from bpnp.datamodules.meshes.surfaces import Mesh
+from bpnp.layers import RansacPnP
+from bpnp.models import Refinement
+from bpnp.models.nets import ImageFeatures, SceneFeatures
 
-SMALL_NET = ["--model.solver=bpnp.models.BPnPNet", "--model.solver.channels=16", "--model.solver.blocks=2"]
+SMALL_NET = ["--model.solver=bpnp.models.BPnPNet"] + [
+    f"--model.solver.features{side}.{size}" for side in ("2d", "3d") for size in ("channels=16", "depth=2")
+]
 SMALL_MESHES = [
     "--data.num_points=24",
     "--data.pool_size=64",
@@ -17,6 +24,31 @@ SMALL_MESHES = [
     "--data.train_pairs=24",
     "--data.batch_size=4",
 ]
+
+
+def small_net(
+    channels: int = 16,
+    depth: int = 2,
+    *,
+    batch_norm: bool = False,
+    centre: bool = False,
+    scale: float = 1.0,
+    normalise: bool = False,
+    refine: bool = True,
+    threshold: float = 0.01,
+    transport: nn.Module | None = None,
+    rounds: int = 0,
+) -> BPnPNet:
+    """BPnPNet with features of few channels."""
+    size = {"channels": channels, "depth": depth, "batch_norm": batch_norm, "centre": centre}
+    return BPnPNet(
+        ImageFeatures(**size, scale=scale),  # type: ignore[arg-type]
+        SceneFeatures(**size, normalise=normalise),  # type: ignore[arg-type]
+        transport,
+        RansacPnP(threshold=threshold),
+        refinement=Refinement(enabled=refine),
+        rounds=rounds,
+    )
 
 
 def write_mesh_tree(root: Path, *, train: int = 3, test: int = 2) -> Path:

@@ -125,7 +125,7 @@ def test_paper_ransac_finds_the_pose(bench: SimpleNamespace) -> None:
 def test_both_networks_learn_the_same(bench: SimpleNamespace, poses: bool) -> None:
     problem = bench.problems.planted(2, 40, kind="independent", level=0.9, seed=3)
     net, batch = bench.problems.planted_network(problem).double(), problem.batch.to(torch.float64)
-    net.sinkhorn.tolerance = 1e-12
+    net.transport.tolerance = 1e-12
     gradients = []
     for losses in (bench.steps.training_losses, bench.steps.paper_losses):
         net.zero_grad()
@@ -199,9 +199,9 @@ def test_gpu_command_needs_a_gpu(
 def test_gpu_step_learns(bench: SimpleNamespace, mode: str) -> None:
     problem = bench.problems.planted(2, 30, kind="smooth", level=10.0)
     net = bench.problems.planted_network(problem, autocast=torch.bfloat16 if mode == "bf16" else None)
-    before = net.features3d.blocks[3].linear_a.weight.clone()
+    before = net.features3d.inner.blocks[3].linear_a.weight.clone()
     bench.steps.training_step(net, problem.batch, poses=True)()
-    change = net.features3d.blocks[3].linear_a.weight - before
+    change = net.features3d.inner.blocks[3].linear_a.weight - before
     assert change.isfinite().all()
     assert 0 < float(change.detach().abs().max()) < 2e-5
 

@@ -85,7 +85,16 @@ def _with_dustbin(
 
 
 class Sinkhorn(nn.Module):
-    """`sinkhorn` with its options as a module; `mu` and `dustbin` may be learned."""
+    """`sinkhorn` with its options as a module; `mu` and `dustbin` may be learned.
+
+    Args:
+        mu: entropy weight of the transport.
+        learn_mu: whether mu is learned.
+        dustbin: cost of leaving a point unmatched; null for a full assignment.
+        learn_dustbin: whether that cost is learned.
+        tolerance: L1 error of the marginals at which the transport stops.
+        max_iterations: pairs of scalings, at most.
+    """
 
     def __init__(
         self,
@@ -103,8 +112,8 @@ class Sinkhorn(nn.Module):
         if learn_dustbin and dustbin is None:
             raise ValueError("expected a `dustbin` cost to learn from, got None; try 1.0")
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu))) if learn_mu else None
-        self.mu = mu
-        self.dustbin = dustbin
+        self.mu, self.learn_mu = mu, learn_mu
+        self.dustbin, self.learn_dustbin = dustbin, learn_dustbin
         self.bin_cost = nn.Parameter(torch.tensor(float(dustbin))) if learn_dustbin and dustbin is not None else None
         self.tolerance = tolerance
         self.max_iterations = max_iterations

@@ -207,7 +207,13 @@ def _judge(
 
 
 class WeightedPnP(nn.Module):
-    """`weighted_pnp` with its options as a module."""
+    """`weighted_pnp` with its options as a module.
+
+    Args:
+        method: newton, or lbfgs as in the paper.
+        tolerance: norm of the gradient per unit of weight at which a sample stops, radians and scene radii.
+        max_iterations: of the solver, at most.
+    """
 
     def __init__(self, *, method: Method = "newton", tolerance: float = 1e-9, max_iterations: int = 50) -> None:
         super().__init__()

@@ -105,7 +105,16 @@ def ransac_pnp(
 
 
 class RansacPnP(nn.Module):
-    """`ransac_pnp` with its options as a module."""
+    """`ransac_pnp` with its options as a module.
+
+    Args:
+        backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
+            its device), or auto (torch on cuda, else poselib).
+        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
+        threshold: inlier threshold, normalised image coordinates.
+        max_iterations: most hypotheses; the paper has 1000.
+        seed: of the sampling.
+    """
 
     def __init__(
         self,

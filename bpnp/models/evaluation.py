@@ -1,33 +1,190 @@
-"""Match again under a pose: the distance of the features and that of the reprojections judge a pair together."""
+"""What an evaluation adds to a network's poses: points matched again under the pose, and refinement.
+
+Both judge a pair (i, j) by d_ij = r_ij^2 / (2 s^2), where r_ij is the chord between bearing i and the direction of
+R p_j + t and s the standard deviation of the residuals in radians: -log of a normal density but for a constant.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
 
 from bpnp.geometry import bearings, chords
-from bpnp.types import Batch, Pose
+from bpnp.models.pose_head import pnp_pose
+from bpnp.models.search_solver import Refine
+from bpnp.robust.proposals import pose_hypotheses
+from bpnp.types import Batch, Pose, Prediction, SolveStats
 
-FIRST_WIDTH = 5.0  # of the first round, in widths of the last
-FEATURES = 0.03  # weight of the feature distances beside a pose, which by then tells more than they do
-LIMIT = 12.0  # nats; a pair further off than five widths is not to be told from one at the other end of the image
+REFINED = "refined"  # name of the third pose
+FIRST_WIDTH = 5.0  # s of the first round, in widths of the last
+FEATURE_WEIGHT = 0.03  # of the feature distances in a round, where the pose tells more about a pair than they do
+FARTHEST = 12.0  # nats; d of a pair five widths apart, beyond which pairs are alike
+TRUST = 0.7  # weight of the assignment in `log_support`; the rest is uniform
+ALONE = 0.2  # share of the image points without a partner
+WIDTH = 0.01  # s of `log_support`, radians: RANSAC's default threshold
 
 
-def widths(rounds: int, last: float) -> list[float]:
-    """Standard deviations of the reprojections, radians, falling by the same factor from round to round."""
+def residual_energy(
+    batch: Batch, rotation: Float[Tensor, "b 3 3"], translation: Float[Tensor, "b 3"], width: float
+) -> Float[Tensor, "b m n"]:
+    """d_ij = r_ij^2 / (2 s^2) with s = `width`, in the dtype of the pose; NaN without a pose."""
+    rays, points3d = bearings(batch.points2d).to(rotation), batch.points3d.to(rotation)
+    return chords(rays, points3d, rotation, translation).square() / (2 * width**2)
+
+
+def round_widths(rounds: int, ransac: nn.Module) -> list[float]:
+    """s of each round in radians, falling by the same factor to the `threshold` of `ransac`."""
+    if rounds < 0:
+        raise ValueError(f"expected a number of `rounds`, got {rounds}; try 0 for none")
+    if rounds == 0:
+        return []
+    last = getattr(ransac, "threshold", None)
+    if last is None:
+        raise ValueError(f"expected a `ransac` with a `threshold`, got {type(ransac).__name__}; try `rounds` 0")
     return [float(width) for width in np.geomspace(FIRST_WIDTH * last, last, rounds)]
+
+
+def match_again(
+    prediction: Prediction,
+    cost: Float[Tensor, "b m n"],
+    batch: Batch,
+    *,
+    transport: nn.Module,
+    pnp: nn.Module,
+    widths: Sequence[float],
+) -> Prediction:
+    """The prediction with the pose "pnp" after rounds of transport and weighted PnP, the first round under "ransac".
+
+    cost: of the network's own assignment, which stays `assignment`; that of the last round is `rematched`.
+    transport: with `entropy`, its mu. widths: s of each round; none leaves the prediction as it is.
+    """
+    pose, assignment = prediction.poses["ransac"], None
+    for width in widths:
+        given = cost_under_pose(cost, batch, pose, width=width, mu=transport.entropy)  # type: ignore[arg-type]
+        assignment, _ = transport(given, batch.mask2d, batch.mask3d)
+        pose = pnp_pose(pnp, assignment, batch, pose)
+    if assignment is None:
+        return prediction
+    return replace(prediction, poses=prediction.poses | {"pnp": pose}, rematched=assignment)
 
 
 def cost_under_pose(
     cost: Float[Tensor, "b m n"], batch: Batch, pose: Pose, *, width: float, mu: float | Tensor
 ) -> Float[Tensor, "b m n"]:
-    """w M_ij + mu min(r_ij^2 / (2 s^2), L), r_ij the chord between bearing i and the direction of R p_j + t.
+    """w M_ij + mu min(d_ij, L): distances M of the features and residuals under a pose judge a pair together.
 
-    cost: M, distances of the features. width: s, radians. mu: entropy weight of the transport that takes the result,
-    whose assignment is then in proportion to exp(-w M_ij / mu) times a Gaussian of the residual with a floor. No
-    gradient reaches the pose; a sample without one keeps its M.
+    The entropic transport of this cost assigns in proportion to exp(-w M_ij / mu) times a normal density of the
+    residual with a floor. No gradient reaches the pose; a sample without one keeps its M.
     """
     rotation, translation = pose.rotation.detach().to(cost), pose.translation.detach().to(cost)
-    residual = chords(bearings(batch.points2d).to(cost), batch.points3d.to(cost), rotation, translation)
-    surprise = (residual.square() / (2 * width**2)).clamp(max=LIMIT)
-    return torch.where(pose.found[:, None, None], FEATURES * cost + mu * surprise, cost)
+    energy = residual_energy(batch, rotation, translation, width).clamp(max=FARTHEST)
+    return torch.where(pose.found[:, None, None], FEATURE_WEIGHT * cost + mu * energy, cost)
+
+
+def log_support(prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
+    """Log-likelihood ratio of the bearings: under the pose and the assignment, against bearings without a partner.
+
+    L = sum_i log(o + (1 - o) sum_j Q_ij A exp(-d_ij) / (2 pi s^2)) with A = 2 pi times the variance of the bearings, o
+    = `ALONE` and Q_ij = P(j | i) mixed with a uniform distribution (`TRUST`). In nats: above zero the assignment
+    speaks for the pose, below against it; -inf without a pose.
+    """
+    assignment = prediction.assignment
+    assert assignment is not None
+    mass = assignment.sum(2) if prediction.unmatched2d is None else assignment.sum(2) + prediction.unmatched2d
+    given = assignment / mass.clamp_min(torch.finfo(assignment.dtype).tiny).unsqueeze(2)
+    real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
+    partner = (TRUST * given + (1 - TRUST) / batch.count3d[:, None, None]) * real
+    rays = bearings(batch.points2d) * batch.mask2d.unsqueeze(2)
+    mean = rays.sum(1) / batch.count2d.unsqueeze(1)
+    variance = rays.square().sum((1, 2)) / batch.count2d - mean.square().sum(1)
+    energy = residual_energy(batch, pose.rotation, pose.translation, WIDTH)
+    density = torch.exp(-energy) * (variance / WIDTH**2)[:, None, None]
+    each = torch.log(ALONE + (1 - ALONE) * (partner * density).sum(2)) * batch.mask2d
+    return torch.where(pose.found, each.sum(1), -math.inf)
+
+
+class Refinement(nn.Module):
+    """The pose "refined": annealed without the assignment from the network's poses and from poses that it proposes.
+
+    Where the assignment is against the result (`log_support` < 0), the pose annealed from the network's poses alone
+    takes its place if the assignment is for that.
+
+    Args:
+        hypotheses: poses that the assignment proposes as starts, at most; 0 for none.
+        enabled: False leaves predictions as they are.
+    """
+
+    def __init__(self, *, hypotheses: int = 192, enabled: bool = True) -> None:
+        super().__init__()
+        if hypotheses < 0:
+            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
+        self.hypotheses, self.enabled = hypotheses, enabled
+        self.anneal = Refine()
+
+    def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
+        if not self.enabled:
+            return prediction
+        own = list(prediction.poses.values())
+        starts = torch.stack([pose.rotation for pose in own], 1), torch.stack([pose.translation for pose in own], 1)
+        refined = self._annealed(batch, *self._with_hypotheses(prediction, batch, *starts))
+        doubtful = log_support(prediction, batch, refined) < 0
+        if self.hypotheses and bool(doubtful.any()):
+            again = self._annealed(batch, *(torch.where(_like(doubtful, x), x, torch.nan) for x in starts))
+            better = doubtful & (log_support(prediction, batch, again) > 0)
+            refined = _chosen(better, again, refined)
+        return replace(prediction, poses=prediction.poses | {REFINED: refined})
+
+    def _annealed(self, batch: Batch, rotation: Tensor, translation: Tensor) -> Pose:
+        rays = bearings(batch.points2d)
+        return Pose(*self.anneal(rays, batch.points3d, rotation, translation, batch.mask2d, batch.mask3d))
+
+    def _with_hypotheses(
+        self, prediction: Prediction, batch: Batch, rotation: Tensor, translation: Tensor
+    ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
+        if not self.hypotheses:
+            return rotation, translation
+        assert prediction.assignment is not None
+        proposed_r, proposed_t, _ = pose_hypotheses(
+            prediction.assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
+            mask3d=batch.mask3d,
+        )  # fmt: skip
+        rotation = torch.cat([rotation, proposed_r.to(rotation)], 1)
+        return rotation, torch.cat([translation, proposed_t.to(translation)], 1)
+
+
+@contextmanager
+def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
+    """Within the block every `Refinement` of a solver is off unless `enabled`; afterwards each is as it was."""
+    found = [module for module in solver.modules() if isinstance(module, Refinement)]
+    before = [module.enabled for module in found]
+    try:
+        for module in found:
+            module.enabled &= enabled
+        yield
+    finally:
+        for module, was in zip(found, before, strict=True):
+            module.enabled = was
+
+
+def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
+    """The first pose of the chosen samples, the second of the others."""
+
+    def pick(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(_like(chosen, a), a, b)
+
+    one, other = first.stats, second.stats
+    stats = SolveStats(
+        pick(one.iterations, other.iterations),
+        pick(one.residual, other.residual),
+        pick(one.converged, other.converged),
+    )
+    return Pose(pick(first.rotation, second.rotation), pick(first.translation, second.translation), stats)
+
+
+def _like(chosen: Bool[Tensor, " b"], values: Tensor) -> Bool[Tensor, "b ..."]:
+    return chosen.reshape(-1, *[1] * (values.ndim - 1))

@@ -1,18 +1,22 @@
 """A matcher for clutter: attention within and between the two sets, and a bin for every point without a partner."""
 
 import math
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.layers.assignment import sinkhorn
+from bpnp.layers.pnp import WeightedPnP
+from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.nets.normalisation import centred
-from bpnp.models.pose_head import PoseStage
-from bpnp.models.pretrained import Restorable
+from bpnp.models.pose_head import pnp_pose, ransac_pose
+from bpnp.models.weights import TrainedNet
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
@@ -25,7 +29,7 @@ class RobustFrame(NamedTuple):
     radius: Float[Tensor, "b 1 1"]
 
 
-class Matcher(Restorable):
+class Matcher(TrainedNet):
     """Pose from unmatched points of which many have no partner.
 
     Points are encoded from their coordinates in a robust frame of their set and from their nearest neighbours; blocks
@@ -35,52 +39,71 @@ class Matcher(Restorable):
 
     Args:
         channels: width, a multiple of heads.
-        blocks: attention blocks.
+        depth: attention blocks.
         heads: of each attention.
         neighbours: nearest neighbours that a point is described by; 0 for none.
         mu: entropy weight of the transport at the start of a training; it is learned.
-        sinkhorn_tolerance: L1 error of the marginals at which the transport stops.
-        pose: options of the pose stage, as a mapping; `bpnp.models.pose_head.PoseStage` lists them.
+        tolerance: L1 error of the marginals at which the transport stops.
+        ransac, pnp, refinement: as in `BPnPNet`.
+
+    >>> net = Matcher(channels=32, depth=2).eval()
+    >>> prediction = net.match(Batch.from_arrays(torch.rand(20, 2), torch.rand(30, 3)))
+    >>> mass = prediction.assignment.sum(2) + prediction.unmatched2d
+    >>> bool(torch.allclose(mass, torch.full((1, 20), 1 / 50)))
+    True
     """
 
     def __init__(
         self,
         *,
         channels: int = 128,
-        blocks: int = 6,
+        depth: int = 6,
         heads: int = 4,
         neighbours: int = 8,
         mu: float = 0.1,
-        sinkhorn_tolerance: float = 1e-6,
-        pose: dict[str, Any] | None = None,
+        tolerance: float = 1e-6,
+        ransac: RansacPnP | nn.Module | None = None,
+        pnp: WeightedPnP | nn.Module | None = None,
+        refinement: Refinement | None = None,
     ) -> None:
         super().__init__()
-        self.settings: dict[str, Any] = {
-            k: v for k, v in locals().items() if k not in ("self", "__class__")
-        }  # fmt: skip
         if not mu > 0:
             raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+        self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
+        self.mu, self.tolerance = mu, tolerance
         self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
         self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
         around = {"neighbours": neighbours}
         self.around2d = Neighbourhood(2, channels, **around) if neighbours else None
         self.around3d = Neighbourhood(3, channels, **around) if neighbours else None
-        self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(blocks))
+        self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(channels)
         self.project = nn.Linear(channels, channels)
         self.leave = nn.Linear(channels, 1)
         self.bin_cost = nn.Parameter(torch.ones(()))
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))
-        self.sinkhorn_tolerance = sinkhorn_tolerance
-        self.pose_stage = PoseStage(**(pose or {}))
-        self.estimates = self.pose_stage.estimates
+        self.ransac = RansacPnP() if ransac is None else ransac
+        self.pnp = WeightedPnP() if pnp is None else pnp
+        self.refinement = Refinement() if refinement is None else refinement
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
-        """Prediction with the assignment, its bins and, if `poses`, the estimates of the pose stage."""
+    @property
+    def estimates(self) -> tuple[str, ...]:
+        """Names of the poses in evaluation."""
+        return ("ransac", "pnp", "refined") if self.refinement.enabled else ("ransac", "pnp")
+
+    def forward(self, batch: Batch) -> Prediction:
+        """The assignment, its bins and the poses "ransac" and "pnp"; in evaluation "refined" too."""
+        prediction = self.match(batch)
+        assert prediction.assignment is not None
+        ransac = ransac_pose(self.ransac, prediction.assignment, batch)
+        pnp = pnp_pose(self.pnp, prediction.assignment, batch, ransac)
+        prediction = replace(prediction, poses={"ransac": ransac, "pnp": pnp})
+        return prediction if self.training else self.refinement(prediction, batch)
+
+    def match(self, batch: Batch) -> Prediction:
+        """The assignment and its bins, without poses."""
         plan, stats = self.transport(batch)
-        assignment = plan[:, :-1, :-1]
-        prediction = Prediction(assignment, stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
-        return self.pose_stage(prediction, batch) if poses else prediction
+        return Prediction(plan[:, :-1, :-1], stats, unmatched2d=plan[:, :-1, -1], unmatched3d=plan[:, -1, :-1])
 
     def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
         """Plan over the points and one bin on each side (last row, last column).
@@ -101,7 +124,7 @@ class Matcher(Restorable):
         cols = torch.cat([batch.mask3d / total, batch.count2d.unsqueeze(-1) / total], 1)
         return sinkhorn(
             cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, mask2d=mask2d, mask3d=mask3d,
-            tolerance=self.sinkhorn_tolerance,
+            tolerance=self.tolerance,
         )  # fmt: skip
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:

@@ -14,6 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from bpnp.layers.pnp import Method, WeightedPnP
+from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.models.bpnpnet import BPnPNet
 
 # A checkpoint may hold its best error as a numpy scalar. The function that makes one has two names, by numpy's version.
@@ -64,18 +66,19 @@ def _transform_maps() -> Iterator[tuple[str, TensorMap]]:
     widths = (3, 64, 128, 1024, 512, 256)
     layers = ("conv1", "conv2", "conv3", "fc1", "fc2")
     for i, layer in enumerate(layers):
-        yield from _linear(f"stn.{layer}", f"align.linears.{i}", widths[i + 1], widths[i], conv=layer[0] == "c")
+        ours, conv = f"features3d.align.linears.{i}", layer.startswith("conv")
+        yield from _linear(f"stn.{layer}", ours, widths[i + 1], widths[i], conv=conv)
         for name in ("weight", "bias", "running_mean", "running_var"):
             shape = (widths[i + 1],)
-            yield f"stn.bn{i + 1}.{name}", TensorMap(shape, f"align.norms.{i}.{name}", shape)
-        yield f"stn.bn{i + 1}.num_batches_tracked", TensorMap((), f"align.norms.{i}.num_batches_tracked", ())
-    yield from _linear("stn.fc3", "align.out", 9, 256, conv=False)
+            yield f"stn.bn{i + 1}.{name}", TensorMap(shape, f"features3d.align.norms.{i}.{name}", shape)
+        yield f"stn.bn{i + 1}.num_batches_tracked", TensorMap((), f"features3d.align.norms.{i}.num_batches_tracked", ())
+    yield from _linear("stn.fc3", "features3d.align.out", 9, 256, conv=False)
 
 
-def load_released(path: str | Path, **settings: Any) -> BPnPNet:
+def load_released(path: str | Path, *, backend: Backend = "auto", method: Method = "newton") -> BPnPNet:
     """The network of a ``*.pth.tar`` file in evaluation mode: the same assignment as the authors' for every pair.
 
-    settings: further arguments of `BPnPNet` that have no weights, such as `ransac_backend`.
+    backend, method: of `bpnp.layers.RansacPnP` and `bpnp.layers.WeightedPnP`, which have no weights.
     Only tensors, plain containers and numbers are unpickled. Raises FileNotFoundError, or ValueError that names the
     file and, where one tensor is wrong (missing, unexpected, of another shape, not finite), its key.
     """
@@ -98,7 +101,7 @@ def load_released(path: str | Path, **settings: Any) -> BPnPNet:
             f"expected the {len(maps)} tensors of BPnPNet's released code in {file}, got "
             f"{'; '.join(sorted(problems)[:3])}{more}; try the authors' file as it was downloaded"
         )
-    net = BPnPNet(**settings)
+    net = BPnPNet(ransac=RansacPnP(backend=backend), pnp=WeightedPnP(method=method))
     net.load_state_dict({m.ours: state[key].reshape(m.our_shape) for key, m in maps.items()})
     return net.eval()
 

@@ -120,10 +120,8 @@ class Search(nn.Module):
         super().__init__()
         self.seed, self.time_limit, self.settings = seed, time_limit, settings
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+    def forward(self, batch: Batch) -> Prediction:
         """Prediction with the estimate "search" and no assignment."""
-        if not poses:
-            return Prediction()
         pose = Pose(
             *search(
                 bearings_of(batch.points2d), batch.points3d, mask2d=batch.mask2d, mask3d=batch.mask3d,

@@ -50,7 +50,8 @@ def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MOST_
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
     match3d = unknown if batch.match3d is None else _host(batch.match3d)
-    assigned3d = unknown if prediction.assignment is None else _host(prediction.assignment.argmax(-2))
+    assignment = prediction.assignment if prediction.rematched is None else prediction.rematched
+    assigned3d = unknown if assignment is None else _host(assignment.argmax(-2))
     poses = {name: (_host(pose.rotation), _host(pose.translation)) for name, pose in prediction.poses.items()}
     truth = None
     if batch.rotation is not None and batch.translation is not None:

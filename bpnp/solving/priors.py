@@ -8,7 +8,7 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bpnp.models import TrainedNet, load_network, load_pretrained
-from bpnp.models.pretrained import LEARNED
+from bpnp.models.weights import LEARNED
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Prior = PosePrior | GravityPrior | TrainedNet

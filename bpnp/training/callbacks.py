@@ -16,7 +16,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
 from bpnp.files import written_whole
-from bpnp.models.checkpoint import read_checkpoint
+from bpnp.models.weights import read_checkpoint
 from bpnp.report import report
 from bpnp.report.results import PairRow, write_results
 from bpnp.report.rows import rows_from
@@ -115,7 +115,7 @@ class CompileNets(Callback):
         backend: of torch.compile.
     """
 
-    def __init__(self, names: Sequence[str] = ("features2d", "features3d", "align"), backend: str = "inductor") -> None:
+    def __init__(self, names: Sequence[str] = ("features2d", "features3d"), backend: str = "inductor") -> None:
         self.names = tuple(names)
         self.backend = backend
 

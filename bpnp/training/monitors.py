@@ -154,7 +154,7 @@ class FeatureSpread(Callback):
             rank_zero_warn(
                 f"expected features that differ from point to point, got a spread of {lowest:.2g} at step "
                 f"{trainer.global_step}, below {self.threshold} since step {self.collapsed_since}: the features have "
-                "collapsed; try a lower model.learning_rate, a warm-up, or centre_features of the solver"
+                "collapsed; try a lower model.learning_rate, a warm-up, or `centre` of the solver's features"
             )
 
     def _measure(self, name: str, net: nn.Module, inputs: tuple[Any, ...], features: Tensor) -> None:

@@ -1,47 +1,72 @@
-"""What an assignment is trained with: its true pairs, the true pose, or neither."""
+"""What a solver is trained with: the true pairs of an assignment, the true pose, or neither."""
 
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.training.losses import (
     correspondence_loss,
     correspondence_loss_from_pose,
     matching_likelihood_loss,
+    pose_loss,
     self_supervised_loss,
 )
-from bpnp.types import Batch, Prediction
+from bpnp.types import Batch, Pose, Prediction
 
 MatchingLoss = Literal["correspondence", "likelihood", "reprojection"]
 
 
+@dataclass(frozen=True)
+class Losses:
+    """The terms of L = L_c + gamma_p L_p (paper Eq. 13) for each sample; zero, without a gradient, where there is none.
+
+    matched, posed: the samples that have a matching loss, and a pose loss.
+    """
+
+    matching: Float[Tensor, " b"]
+    matched: Bool[Tensor, " b"]
+    pose: Float[Tensor, " b"] | None = None
+    posed: Bool[Tensor, " b"] | None = None
+    pose_weight: float = 0.0
+
+    @property
+    def total(self) -> Float[Tensor, " b"]:
+        """L, whose mean over the batch has the mean of L_c over the samples with one; NaN if no sample has."""
+        matching = self.matching * (len(self.matched) / self.matched.sum())
+        return matching if self.pose is None else matching + self.pose_weight * self.pose
+
+
 def matching_losses(
     prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None, estimate: str
-) -> tuple[Tensor, Tensor]:
-    """The loss of each sample's assignment, and which samples have one; the others' is zero, without a gradient.
+) -> Losses:
+    """The loss of each sample's assignment.
 
     kind: correspondence (`correspondence_losses`, with `angle`), likelihood (`matching_likelihood_loss`), or
-        reprojection, which looks at no label (`self_supervised_loss` under the pose `estimate`). Raises ValueError for
-        a prediction without an assignment, or a batch without the labels that the kind needs.
+        reprojection, which looks at no label (`self_supervised_loss` under the pose `estimate`).
+    Raises ValueError for a prediction without an assignment, or a batch without the labels that the kind needs.
     """
     if prediction.assignment is None:
         raise ValueError("expected a solver with an assignment to train, got none; try bpnp.models.BPnPNet")
     everyone = torch.ones(len(batch), dtype=torch.bool, device=prediction.assignment.device)
     if kind == "likelihood":
-        return matching_likelihood_loss(prediction, batch), everyone
+        return Losses(matching_likelihood_loss(prediction, batch), everyone)
     if kind == "reprojection":
         pose = prediction.poses[estimate]
-        return self_supervised_loss(prediction.assignment, batch, pose), pose.stats.converged
+        return Losses(self_supervised_loss(prediction.assignment, batch, pose), pose.stats.converged)
     known = correspondence_losses(prediction, batch, angle=angle)
     if known is None:
         raise ValueError(
             "expected pairs with `match3d` for matching_loss correspondence, got none; try matching_loss reprojection"
         )
-    return known, everyone
+    return Losses(known, everyone)
 
 
-def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Tensor | None:
+def correspondence_losses(
+    prediction: Prediction, batch: Batch, *, angle: float | None
+) -> Float[Tensor, " b"] | None:  # fmt: skip
     """L_c per sample (paper Eq. 9); None if there is no assignment, or nothing to compare it with.
 
     angle: None for the true pairs; else all pairs within it, radians, under the true pose.
@@ -50,14 +75,22 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
         return None
     if angle is None:
         return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-    rotation, translation = known_values(batch.rotation, "rotation"), known_values(batch.translation, "translation")
+    rotation, translation = _true_pose(batch)
     return correspondence_loss_from_pose(
         prediction.assignment, batch.points2d, batch.points3d, rotation, translation, angle=angle
     )
 
 
-def known_values(value: Tensor | None, name: str) -> Tensor:
-    """What a batch holds. Raises ValueError where it holds nothing."""
-    if value is None:
-        raise ValueError(f"expected a batch with its true `{name}`, got None")
-    return value
+def pose_losses(pose: Pose, batch: Batch, *, bounds: tuple[float, float] | None) -> Float[Tensor, " b"]:
+    """L_p per sample (paper Eq. 10); zero, without a gradient, where the pose did not converge."""
+    solved, truth = pose.stats.converged, _true_pose(batch)
+    # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
+    rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
+    translation = torch.where(solved[:, None], pose.translation, truth[1])
+    return pose_loss(rotation, translation, *truth, bounds=bounds) * solved
+
+
+def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
+    if batch.rotation is None or batch.translation is None:
+        raise ValueError("expected a batch with its true `rotation` and `translation`, got None")
+    return batch.rotation, batch.translation

@@ -1,6 +1,7 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
 import time
+from dataclasses import replace
 from typing import Any, Literal, cast
 
 import torch
@@ -11,12 +12,14 @@ from torchmetrics import MetricCollection
 
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.models.checkpoint import check_solver
-from bpnp.training.losses import RELEASED_BOUNDS, pose_loss
-from bpnp.training.supervision import MatchingLoss, correspondence_losses, known_values, matching_losses
+from bpnp.models.composition import described
+from bpnp.models.evaluation import REFINED, refinement_enabled
+from bpnp.models.weights import check_solver, solver_state
+from bpnp.training.losses import RELEASED_BOUNDS
+from bpnp.training.supervision import Losses, MatchingLoss, correspondence_losses, matching_losses, pose_losses
 from bpnp.types import Batch, Prediction
 
-Stage = Literal["train", "val", "test"]
+Stage = Literal["val", "test"]
 CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
 
 
@@ -29,7 +32,8 @@ class BlindPnPTask(LightningModule):
 
     Args:
         solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses, the first of
-            which is reported without its name (`val/rotation_q2_deg`) and selects checkpoints.
+            which is reported without its name (`val/rotation_q2_deg`) and selects checkpoints. If it has a method
+            `match(batch)` for a prediction without poses, that is what a training step without a pose calls.
         learning_rate: of Adam; the paper has 1e-5.
         weight_decay: of Adam; the paper has 0, the released code 1e-3.
         pose_weight: gamma_p of Eq. 13. While it is 0 no pose is solved in training; `PoseLossWarmup` raises it.
@@ -41,6 +45,7 @@ class BlindPnPTask(LightningModule):
         correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
             correspondences; null for the true ones.
         max_skipped_steps: end the run after so many steps in a row without a finite loss and gradient.
+        refine_validation: whether validation refines poses, as tests do; it takes most of the time of a validation.
     """
 
     def __init__(
@@ -55,6 +60,7 @@ class BlindPnPTask(LightningModule):
         matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
         max_skipped_steps: int = 20,
+        refine_validation: bool = False,
     ) -> None:
         super().__init__()
         self.solver = BPnPNet() if solver is None else solver
@@ -71,12 +77,15 @@ class BlindPnPTask(LightningModule):
         # Steps left out in all, and in a row: on the device, so that counting them never waits for it.
         self.skipped: Tensor
         self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
-        self.estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
+        self.refine_validation = refine_validation
+        estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
+        validated = tuple(name for name in estimates if refine_validation or name != REFINED)
+        self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
         self.pose_metrics = nn.ModuleDict(
             {
                 f"{stage}_{name}": MetricCollection([PoseQuartiles(), PoseRecall()])
-                for stage in ("val", "test")
-                for name in self.estimates
+                for stage, names in self.estimates.items()
+                for name in names
             }
         )
         self.loss_metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in ("val", "test")})
@@ -85,14 +94,18 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        prediction = self.solver(batch, poses=self.pose_weight > 0 or self.matching_loss == "reprojection")
-        loss = self.losses(prediction, batch, "train").mean()
-        self._log_train(loss=loss, skipped_steps=self.skipped[0].float())
+        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection"
+        solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
+        prediction = solve(batch)
+        losses = self.losses(prediction, batch)
+        loss = losses.total.mean()
+        self._log_train(loss=loss, skipped_steps=self.skipped[0].float(), **self._figures(losses, prediction, batch))
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> None:
-        self._evaluate(batch, "val")
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
+        """As `test_step`; without refinement unless `refine_validation`."""
+        return self._evaluate(batch, "val")
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
         """The prediction, the seconds that it took, and the correspondence loss per pair; for the results writer."""
@@ -101,37 +114,16 @@ class BlindPnPTask(LightningModule):
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
         return self.solver(batch)
 
-    def losses(self, prediction: Prediction, batch: Batch, stage: Stage) -> Tensor:
-        """L_c + gamma_p L_p per sample; a sample whose pose did not converge has no L_p, and is counted."""
-        matching, trained = matching_losses(
+    def losses(self, prediction: Prediction, batch: Batch) -> Losses:
+        """The matching loss and, with a weight, that of the pose; a sample whose pose did not converge has none."""
+        losses = matching_losses(
             prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle, estimate=self.pose_estimate
         )
-        if stage == "train":
-            correspondence = self.matching_loss == "correspondence"
-            known = matching if correspondence else self.correspondence_losses(prediction, batch)
-            logged = {} if known is None else {"correspondence_loss": known.mean()}
-            if not correspondence:
-                logged |= {"matching_loss": matching.sum() / trained.sum(), "left_out": 1 - trained.float().mean()}
-            self._log_train(**logged, **_assignment_stats(prediction))
-        # A mean over the batch is then one over the samples that have a loss; without any it is NaN, and no step.
-        matching = matching * (len(trained) / trained.sum())
         if self.pose_weight == 0:
-            return matching
+            return losses
         pose = prediction.poses[self.pose_estimate]
-        solved = pose.stats.converged
-        rotation_gt = known_values(batch.rotation, "rotation")
-        translation_gt = known_values(batch.translation, "translation")
-        # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
-        rotation = torch.where(solved[:, None, None], pose.rotation, rotation_gt)
-        translation = torch.where(solved[:, None], pose.translation, translation_gt)
-        errors = pose_loss(rotation, translation, rotation_gt, translation_gt, bounds=self.pose_bounds) * solved
-        if stage == "train":
-            self._log_train(without_pose=1 - solved.float().mean(), pose_loss=errors.sum() / solved.sum())
-        return matching + self.pose_weight * errors
-
-    def correspondence_losses(self, prediction: Prediction, batch: Batch) -> Tensor | None:
-        """L_c per sample; None if the solver has no assignment or the batch nothing to compare it with."""
-        return correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        values = pose_losses(pose, batch, bounds=self.pose_bounds)
+        return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
@@ -156,12 +148,12 @@ class BlindPnPTask(LightningModule):
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
-        settings = getattr(self.solver, "settings", {})
-        checkpoint["solver"] = {"class": type(self.solver).__name__, "settings": dict(settings)}
+        checkpoint["solver"] = described(self.solver)
         checkpoint["skipped_steps"] = self.skipped.tolist()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        check_solver(checkpoint.get("solver", {}), type(self.solver).__name__, getattr(self.solver, "settings", {}))
+        saved, weights = checkpoint.get("solver", {}), solver_state(checkpoint["state_dict"])
+        check_solver(saved, weights, described(self.solver), self.solver.state_dict())
         self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
 
     def on_validation_epoch_end(self) -> None:
@@ -171,10 +163,11 @@ class BlindPnPTask(LightningModule):
         self._log_metrics("test")
 
     def _evaluate(self, batch: Batch, stage: Stage) -> dict[str, Any]:
-        prediction, seconds = self._timed(batch)
-        for name, pose in prediction.poses.items():
-            self._pose_metrics(stage, name).update(pose, batch)
-        losses = self.correspondence_losses(prediction, batch)
+        with refinement_enabled(self.solver, stage == "test" or self.refine_validation):
+            prediction, seconds = self._timed(batch)
+        for name in self.estimates[stage]:
+            self._pose_metrics(stage, name).update(prediction.poses[name], batch)
+        losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
             self._loss_metric(stage).update(losses, batch.index)
         return {"prediction": prediction, "seconds": seconds, "losses": losses}
@@ -195,8 +188,26 @@ class BlindPnPTask(LightningModule):
     def _log_train(self, **values: Tensor | float) -> None:
         self.log_dict({f"train/{k}": v for k, v in values.items()}, on_step=True, on_epoch=False, batch_size=1)
 
+    def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
+        """What a training step logs beside its loss."""
+        figures: dict[str, Tensor] = {}
+        known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        if known is not None:
+            figures["correspondence_loss"] = known.detach().mean()
+        if self.matching_loss != "correspondence":
+            figures["matching_loss"] = losses.matching.sum() / losses.matched.sum()
+            figures["left_out"] = 1 - losses.matched.float().mean()
+        if losses.pose is not None and losses.posed is not None:
+            figures["without_pose"] = 1 - losses.posed.float().mean()
+            figures["pose_loss"] = losses.pose.sum() / losses.posed.sum()
+        stats = prediction.assignment_stats
+        if stats is not None:
+            figures["sinkhorn_iterations"] = stats.iterations.float().mean()
+            figures["sinkhorn_unconverged"] = 1 - stats.converged.float().mean()
+        return figures
+
     def _log_metrics(self, stage: Stage) -> None:
-        for i, name in enumerate(self.estimates):
+        for i, name in enumerate(self.estimates[stage]):
             metrics = self._pose_metrics(stage, name)
             values = metrics.compute()
             metrics.reset()
@@ -204,23 +215,14 @@ class BlindPnPTask(LightningModule):
             if i == 0:
                 self._log_all({f"{stage}/{k}": v for k, v in values.items()})
         loss = self._loss_metric(stage)
-        if loss.update_called:
+        # compute() is a collective call: all processes make it, or none.
+        if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self._log_all({f"{stage}/correspondence_loss": loss.compute()})
             loss.reset()
 
     def _log_all(self, values: dict[str, Tensor]) -> None:
         # The metrics have already been gathered over processes.
         self.log_dict({k: v.float() for k, v in values.items()})
-
-
-def _assignment_stats(prediction: Prediction) -> dict[str, Tensor]:
-    stats = prediction.assignment_stats
-    if stats is None:
-        return {}
-    return {
-        "sinkhorn_iterations": stats.iterations.float().mean(),
-        "sinkhorn_unconverged": 1 - stats.converged.float().mean(),
-    }
 
 
 def _wait(device: torch.device) -> None:

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 import torch
+from small_data import small_net
 
-from bpnp import BPnPNet
 from bpnp.cli import main
 from bpnp.report import read_results
 from bpnp.report.results import PairRow
@@ -157,7 +157,7 @@ def test_rows_survive_the_disk_with_their_infinities(tmp_path: Path) -> None:
 
 
 def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
-    task = BlindPnPTask(BPnPNet(channels=16, blocks=1))
+    task = BlindPnPTask(small_net(16, 1))
     content: dict[str, object] = {"state_dict": task.state_dict()}
     task.on_save_checkpoint(content)
     weights = tmp_path / "last.ckpt"

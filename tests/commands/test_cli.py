@@ -25,10 +25,19 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in text for command in ("fit", "validate", "test", "predict", "report"))
 
 
-def test_options_of_the_network_are_explained(capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("part", "told"),
+    [
+        ("solver.help=bpnp.models.BPnPNet", "cost (b, m, n) and both masks to the assignment"),
+        ("solver.transport.help=bpnp.layers.Sinkhorn", "entropy weight of the transport"),
+    ],
+)
+def test_options_of_the_network_and_its_parts_are_explained(
+    part: str, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(SystemExit):
-        main(["fit", "--model.solver.help=bpnp.models.BPnPNet"])
-    assert "entropy weight of the transport" in capsys.readouterr().out
+        main(["fit", "--model.solver=bpnp.models.BPnPNet", f"--model.{part}"])
+    assert told in " ".join(capsys.readouterr().out.split())
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from bpnp.models.baselines.random_ransac import probability_of_true_triple
 from bpnp.models.baselines.single_pairs import PairSolver
 from bpnp.models.baselines.softposit.algorithm import softposit
 from bpnp.models.baselines.softposit.slack_assignment import slack_scalings
+from bpnp.models.nets import ImageFeatures, SceneFeatures
 
 QUICK: dict[str, PairSolver] = {
     "softposit": SoftPOSIT(max_steps=25, time_limit=None),
@@ -180,7 +181,8 @@ def test_hungarian_pairs_lead_to_the_planted_pose() -> None:
             return 1 - (torch.arange(batch.points2d.shape[1])[:, None] == batch.match3d.unsqueeze(1)).to(batch.points2d)
 
     batch = plant(2, 40, seed=8).batch()
-    prediction = Hungarian(net=TrueCosts(channels=16, blocks=1))(batch)
+    net = TrueCosts(ImageFeatures(channels=16, depth=1), SceneFeatures(channels=16, depth=1))
+    prediction = Hungarian(net=net)(batch)
     for name in Hungarian.estimates:
         assert prediction.poses[name].stats.converged.all()
         assert (rotation_error(prediction.poses[name].rotation, batch.rotation) < 1e-3).all()

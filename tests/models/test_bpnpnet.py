@@ -1,18 +1,18 @@
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from planted import padded, plant
+from small_data import small_net
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
+from bpnp.models import Refinement
 from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.models.nets import PointFeatures
 from bpnp.search.settings import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_loss
-
-SMALL: dict[str, Any] = {"channels": 16, "blocks": 2}
 
 
 def different_sizes(*sizes: int, dtype: torch.dtype = torch.float64) -> Batch:
@@ -23,13 +23,13 @@ def different_sizes(*sizes: int, dtype: torch.dtype = torch.float64) -> Batch:
 def overfitted() -> tuple[BPnPNet, Batch, list[float]]:
     """A small net after a few dozen steps of the correspondence loss on one pair."""
     torch.manual_seed(0)
-    net = BPnPNet(channels=32, blocks=4, centre_features=True, normalise_scene=True, threshold=0.02)
+    net = small_net(32, 4, centre=True, normalise=True, threshold=0.02)
     batch = plant(1, 14, seed=5, dtype=torch.float32).batch()
     assert batch.match3d is not None
     optimiser = torch.optim.Adam(net.parameters(), lr=2e-3)
     losses = []
     for _ in range(50):
-        loss = correspondence_loss(net(batch, poses=False).assignment, batch.match3d).mean()
+        loss = correspondence_loss(net.match(batch).assignment, batch.match3d).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -45,10 +45,10 @@ def test_has_the_parameters_of_the_released_network() -> None:
 
 def test_gives_an_assignment_and_all_poses() -> None:
     batch = different_sizes(12, 20, dtype=torch.float32)
-    prediction = BPnPNet(**SMALL).eval()(batch)
+    prediction = (net := small_net()).eval()(batch)
     assert prediction.assignment.shape == (2, 25, 20)
     assert prediction.assignment_stats.converged.all()
-    assert tuple(prediction.poses) == BPnPNet.estimates == ("ransac", "pnp", "refined")
+    assert tuple(prediction.poses) == net.estimates == ("ransac", "pnp", "refined")
     for pose in prediction.poses.values():
         assert (pose.rotation.shape, pose.translation.shape) == ((2, 3, 3), (2, 3))
         assert pose.rotation.dtype == torch.float32
@@ -58,45 +58,38 @@ def test_gives_an_assignment_and_all_poses() -> None:
 
 def test_only_evaluation_refines_and_only_if_asked() -> None:
     batch = different_sizes(12, 20, dtype=torch.float32)
-    assert tuple(BPnPNet(**SMALL).train()(batch).poses) == ("ransac", "pnp")
-    without = BPnPNet(refine=False, **SMALL).eval()
+    assert tuple(small_net().train()(batch).poses) == ("ransac", "pnp")
+    without = small_net(refine=False).eval()
     assert tuple(without(batch).poses) == without.estimates == ("ransac", "pnp")
 
 
 def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     batch = different_sizes(30, dtype=torch.float32)
     torch.manual_seed(0)
-    net = BPnPNet(**SMALL).eval()
+    net = small_net().eval()
     crowd = net(batch).poses["refined"].stats.iterations
-    net.pose_stage.hypotheses = 0
+    net.refinement.hypotheses = 0
     alone = net(batch).poses["refined"].stats.iterations
     assert int(alone) <= 2 * (1 + DEFAULT.shaking.copies) < int(crowd)
     with pytest.raises(ValueError, match="expected a number of `hypotheses`, got -1"):
-        BPnPNet(**SMALL, hypotheses=-1)
-
-
-def test_a_checkpoint_from_before_the_hypotheses_has_the_default(tmp_path: Path) -> None:
-    net = BPnPNet(**SMALL)
-    settings = {key: value for key, value in net.settings.items() if key != "hypotheses"}
-    state = {f"solver.{key}": value for key, value in net.state_dict().items()}
-    torch.save({"solver": {"class": "BPnPNet", "settings": settings}, "state_dict": state}, tmp_path / "old.ckpt")
-    assert BPnPNet.from_checkpoint(tmp_path / "old.ckpt").pose_stage.hypotheses == net.pose_stage.hypotheses
+        Refinement(hypotheses=-1)
 
 
 def test_without_poses_none_is_solved() -> None:
     batch = different_sizes(8, dtype=torch.float32)
-    net = BPnPNet(**SMALL)
-    del net.pose_stage
-    prediction = net(batch, poses=False)
+    net = small_net()
+    del net.ransac, net.pnp, net.refinement
+    prediction = net.match(batch)
     assert prediction.poses == {}
     assert prediction.assignment is not None
 
 
 def test_the_cost_is_the_distance_between_unit_features() -> None:
-    net = BPnPNet(**SMALL, image_scale=2.0).eval().double()
+    net = small_net(scale=2.0).eval().double()
     batch = different_sizes(9)
-    z2d = net.features2d(2 * batch.points2d, batch.mask2d)
-    z3d = net.features3d(net.align(batch.points3d, batch.mask3d), batch.mask3d)
+    z2d = PointFeatures.forward(net.features2d, 2 * batch.points2d, batch.mask2d)
+    aligned = net.features3d.align(batch.points3d, batch.mask3d)
+    z3d = PointFeatures.forward(net.features3d, aligned, batch.mask3d)
     torch.testing.assert_close(net.cost(batch), torch.cdist(z2d, z3d), atol=1e-7, rtol=0)
 
 
@@ -113,9 +106,9 @@ def test_pairwise_distance_and_its_gradient_near_zero() -> None:
     assert same.grad.isfinite().all()
 
 
-@pytest.mark.parametrize("options", [{}, {"batch_norm": True}, {"centre_features": True, "normalise_scene": True}])
+@pytest.mark.parametrize("options", [{}, {"batch_norm": True}, {"centre": True, "normalise": True}])
 def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any]) -> None:
-    net = BPnPNet(**SMALL, **options).double().eval()
+    net = small_net(**options).double().eval()
     sizes = (8, 30, 3, 17)
     with torch.no_grad():
         together = net(different_sizes(*sizes))
@@ -133,30 +126,30 @@ def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any
 
 
 def test_points_in_another_order_are_assigned_in_that_order() -> None:
-    net = BPnPNet(**SMALL).double().eval()
+    net = small_net().double().eval()
     planted = plant(2, 15)
     batch = planted.batch()
     rows, columns = torch.randperm(15), torch.randperm(15)
     shuffled = Batch.from_arrays(planted.points2d[:, rows], planted.points3d[:, columns])
     with torch.no_grad():
-        expected = net(batch, poses=False).assignment[:, rows][:, :, columns]
-        assert (net(shuffled, poses=False).assignment - expected).abs().max() < 1e-12
+        expected = net.match(batch).assignment[:, rows][:, :, columns]
+        assert (net.match(shuffled).assignment - expected).abs().max() < 1e-12
 
 
 def test_a_normalised_scene_has_no_unit_and_no_origin() -> None:
-    net = BPnPNet(**SMALL, normalise_scene=True).double().eval()
+    net = small_net(normalise=True).double().eval()
     planted = plant(2, 15)
     moved = Batch.from_arrays(planted.points2d, 40 * planted.points3d - 300)
     with torch.no_grad():
-        expected = net(planted.batch(), poses=False).assignment
-        assert (net(moved, poses=False).assignment - expected).abs().max() < 1e-11
+        expected = net.match(planted.batch()).assignment
+        assert (net.match(moved).assignment - expected).abs().max() < 1e-11
 
 
 def test_points_in_float64_enter_a_float32_network() -> None:
     planted = plant(1, 12)
     batch = Batch.from_arrays(planted.points2d[0].numpy(), planted.points3d[0].numpy())
     assert batch.points2d.dtype == torch.float64
-    net = BPnPNet(**SMALL).eval()
+    net = small_net().eval()
     with torch.no_grad():
         found, expected = net(batch), net(batch.to(torch.float32))
     torch.testing.assert_close(found.assignment, expected.assignment)
@@ -175,7 +168,7 @@ def test_learns_one_pair_by_heart(overfitted: tuple[BPnPNet, Batch, list[float]]
 
 
 def first_layers(net: BPnPNet) -> list[Tensor]:
-    weights = (net.features2d.enter.weight, net.features3d.enter.weight, net.align.linears[0].weight)
+    weights = (net.features2d.enter.weight, net.features3d.enter.weight, net.features3d.align.linears[0].weight)
     return [w.grad for w in weights if w.grad is not None]
 
 
@@ -230,39 +223,9 @@ def test_a_set_of_three_points_spoils_no_neighbour(overfitted: tuple[BPnPNet, Ba
     assert all(g.norm() > 0 for g in first_layers(net))
 
 
-def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
-    net = BPnPNet(**SMALL, learn_mu=True, batch_norm=True, normalise_scene=True)
-    state = {f"solver.{name}": value for name, value in net.state_dict().items()}
-    solver = {"class": "BPnPNet", "settings": net.settings}
-    torch.save({"solver": solver, "state_dict": {**state, "other.weight": torch.ones(1)}}, tmp_path / "net.ckpt")
-    again = BPnPNet.from_checkpoint(tmp_path / "net.ckpt")
-    assert again.settings == net.settings
-    assert not again.training
-    batch = different_sizes(10, dtype=torch.float32)
-    with torch.no_grad():
-        assert torch.equal(again(batch, poses=False).assignment, net.eval()(batch, poses=False).assignment)
-
-
-@pytest.mark.parametrize("content", [{"solver": {"class": "Hungarian"}, "state_dict": {}}, {"state_dict": {}}, [1]])
-def test_says_that_a_checkpoint_holds_another_solver(tmp_path: Path, content: Any) -> None:
-    torch.save(content, tmp_path / "other.ckpt")
-    with pytest.raises(ValueError, match=r"expected a checkpoint.*other\.ckpt"):
-        BPnPNet.from_checkpoint(tmp_path / "other.ckpt")
-
-
-def test_says_that_a_file_is_no_checkpoint_and_runs_no_code(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"expected a checkpoint, got no file at .*none\.ckpt"):
-        BPnPNet.from_checkpoint(tmp_path / "none.ckpt")
-    (tmp_path / "text.ckpt").write_text("epoch,loss\n1,0.5\n")
-    torch.save({"state_dict": {}, "solver": Path()}, tmp_path / "code.ckpt")
-    for name in ("text.ckpt", "code.ckpt"):
-        with pytest.raises(ValueError, match=f"expected a checkpoint.*{name}"):
-            BPnPNet.from_checkpoint(tmp_path / name)
-
-
 def test_autocast_reaches_the_nets_and_not_the_layers() -> None:
     torch.manual_seed(0)
-    net = BPnPNet(channels=16, blocks=2)
+    net = small_net()
     batch = Batch.from_arrays(torch.rand(2, 30, 2), torch.rand(2, 30, 3))
     with torch.autocast("cpu", dtype=torch.bfloat16):
         assert net.features2d.enter(batch.points2d).dtype == torch.bfloat16

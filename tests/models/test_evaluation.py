@@ -1,17 +1,21 @@
-from functools import partial
-from typing import Any
-
 import pytest
 import torch
 from planted import Planted, padded, plant
+from small_data import small_net
 from torch import Tensor, nn
 
 from bpnp import BPnPNet, Prediction
 from bpnp.geometry import transform
-from bpnp.layers import sinkhorn
+from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP, sinkhorn
 from bpnp.metrics import rotation_error
-from bpnp.models.evaluation import FEATURES, LIMIT, cost_under_pose, widths
-from bpnp.models.pose_head import PoseStage
+from bpnp.models.evaluation import (
+    FARTHEST,
+    FEATURE_WEIGHT,
+    cost_under_pose,
+    match_again,
+    round_widths,
+)
+from bpnp.models.pose_head import pnp_pose
 from bpnp.types import Pose, SolveStats
 
 MU = 0.1
@@ -21,28 +25,17 @@ def stats(size: int) -> SolveStats:
     return SolveStats(torch.ones(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
 
 
-class Given(nn.Module):
-    """In the place of RANSAC: a pose that is given."""
-
-    def __init__(self, rotation: Tensor, translation: Tensor) -> None:
-        super().__init__()
-        self.pose = rotation, translation, stats(len(rotation))
-
-    def forward(self, *_: Any) -> tuple[Tensor, Tensor, SolveStats]:
-        return self.pose
-
-
 def solved(scene: Planted, start: tuple[Tensor, Tensor], cost: Tensor, rounds: int) -> Prediction:
-    """The pose stage's answer to an assignment of this cost, when RANSAC finds `start`."""
+    """The answer of some rounds to an assignment of this cost, when RANSAC finds `start`."""
     batch = scene.batch()
-    stage = PoseStage(refine=False).eval()
-    stage.ransac = Given(*start)  # type: ignore[assignment]
-
-    def rematch(pose: Pose, *, width: float) -> Prediction:
-        return Prediction(*sinkhorn(cost_under_pose(cost, batch, pose, width=width, mu=MU), mu=MU, tolerance=1e-12))
-
-    again = [partial(rematch, width=width) for width in widths(rounds, 0.003)]
-    return stage(Prediction(*sinkhorn(cost, mu=MU)), batch, again)
+    first = Pose(*start, stats(len(batch)))
+    assignment, _ = sinkhorn(cost, mu=MU)
+    prediction = Prediction(
+        assignment, poses={"ransac": first, "pnp": pnp_pose(WeightedPnP(), assignment, batch, first)}
+    )
+    widths = round_widths(rounds, RansacPnP(threshold=0.003))
+    transport = Sinkhorn(mu=MU, tolerance=1e-12)
+    return match_again(prediction, cost, batch, transport=transport, pnp=WeightedPnP(), widths=widths)
 
 
 def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
@@ -53,7 +46,9 @@ def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
     for rounds in (0, 8):
         prediction = solved(scene, scene.near(0.03), cost, rounds)
         errors.append(rotation_error(prediction.poses["pnp"].rotation, scene.rotation))
-        masses.append((prediction.assignment * (scene.permutation() > 0)).sum((1, 2)))
+        assignment = prediction.assignment if prediction.rematched is None else prediction.rematched
+        masses.append((assignment * (scene.permutation() > 0)).sum((1, 2)))
+        assert torch.equal(prediction.assignment, sinkhorn(cost, mu=MU)[0])
     assert errors[0].min() > 5
     assert errors[1].max() < 0.3
     assert masses[0].max() < 0.01
@@ -71,13 +66,15 @@ def test_the_cost_is_a_gaussian_of_the_angle_with_a_floor() -> None:
     for i in range(5):
         for j in range(5):
             chord = float((scene.bearings[0, i] - directions[0, j]).norm())
-            expected = FEATURES * cost[0, i, j] + MU * min(chord**2 / (2 * 0.05**2), LIMIT)
+            expected = FEATURE_WEIGHT * cost[0, i, j] + MU * min(chord**2 / (2 * 0.05**2), FARTHEST)
             assert float(found[0, i, j]) == pytest.approx(float(expected), rel=1e-9)
 
 
 def test_widths_fall_to_the_last() -> None:
-    assert widths(3, 0.01) == pytest.approx([0.05, 0.05 / 5**0.5, 0.01])
-    assert widths(0, 0.01) == []
+    assert round_widths(3, RansacPnP(threshold=0.01)) == pytest.approx([0.05, 0.05 / 5**0.5, 0.01])
+    assert round_widths(0, nn.Identity()) == []
+    with pytest.raises(ValueError, match="expected a `ransac` with a `threshold`, got Identity; try `rounds` 0"):
+        BPnPNet(ransac=nn.Identity(), rounds=1)
     with pytest.raises(ValueError, match="expected a number of `rounds`, got -1"):
         BPnPNet(rounds=-1)
 
@@ -95,12 +92,11 @@ def test_the_pose_of_a_round_is_differentiable_in_the_cost() -> None:
 
 def test_a_pair_depends_neither_on_its_batch_nor_on_padding_and_training_has_no_rounds() -> None:
     torch.manual_seed(0)
-    net = BPnPNet(channels=16, blocks=2, rounds=3, threshold=0.05, refine=False).double().eval()
+    net = small_net(rounds=3, threshold=0.05, refine=False).double().eval()
     scenes = [plant(1, n, outliers2d=n // 3, seed=n) for n in (12, 20, 15)]
-    joint = net(padded(scenes)).assignment
+    joint = net(padded(scenes)).rematched
     for i, scene in enumerate(scenes):
-        alone = net(padded([scene])).assignment[0]
+        alone = net(padded([scene])).rematched[0]
         torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-4, atol=1e-9)
-        assert (net(padded([scene]), poses=False).assignment[0] - alone).abs().max() > 1e-4
-    net.train()
-    torch.testing.assert_close(net(padded(scenes)).assignment, net(padded(scenes), poses=False).assignment)
+        assert (net.match(padded([scene])).assignment[0] - alone).abs().max() > 1e-4
+    assert net.train()(padded(scenes)).rematched is None

@@ -3,10 +3,10 @@ from collections.abc import Callable
 import pytest
 import torch
 from lightning import LightningModule, Trainer
+from small_data import small_net
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
 from bpnp.models.nets.normalisation import MaskedBatchNorm, context_norm
 from bpnp.training.callbacks import CompileNets
@@ -64,7 +64,7 @@ def test_a_block_is_the_released_block() -> None:
 
 @pytest.mark.parametrize("centre", [True, False])
 def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
-    net = PointFeatures(2, channels=8, blocks=3, centre=centre)
+    net = PointFeatures(2, channels=8, depth=3, centre=centre)
     single, padded, mask = sets(2)
     features = net(padded, mask)
     for i, x in enumerate(single):
@@ -78,7 +78,7 @@ def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
 def build(kind: str) -> tuple[nn.Module, int]:
     if kind == "transform":
         return InputTransform(), 3
-    return PointFeatures(3, channels=16, blocks=4, batch_norm=kind == "batch norm", centre=kind == "centre"), 3
+    return PointFeatures(3, channels=16, depth=4, batch_norm=kind == "batch norm", centre=kind == "centre"), 3
 
 
 @pytest.mark.parametrize("kind", ["plain", "batch norm", "centre", "transform"])
@@ -212,10 +212,10 @@ def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) ->
     compiled = []
     monkeypatch.setattr(nn.Module, "compile", lambda net, backend: compiled.append((net, backend)))
     task = LightningModule()
-    task.solver = net = BPnPNet(channels=8, blocks=2)
+    task.solver = net = small_net(8, 2)
     trainer = Trainer(accelerator="cpu", barebones=True)
     CompileNets(backend="eager").on_fit_start(trainer, task)
-    assert [part is net.features2d or part is net.features3d or part is net.align for part, _ in compiled] == [True] * 3
+    assert [part is net.features2d or part is net.features3d for part, _ in compiled] == [True] * 2
     assert {backend for _, backend in compiled} == {"eager"}
     with pytest.raises(ValueError, match="expected nets of BPnPNet, got"):
         CompileNets(["features4d"]).on_fit_start(trainer, task)

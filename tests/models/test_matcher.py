@@ -4,10 +4,12 @@ from pathlib import Path
 import pytest
 import torch
 from planted import padded, plant
+from small_data import small_net
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.models import Matcher, load_network
+from bpnp.models.composition import described
 from bpnp.models.matcher import robust_frame
 from bpnp.models.nets.attention import Attention, Neighbourhood
 from bpnp.training.losses import matching_likelihood_loss
@@ -15,7 +17,7 @@ from bpnp.training.losses import matching_likelihood_loss
 
 def small(seed: int = 0) -> Matcher:
     torch.manual_seed(seed)
-    return Matcher(channels=16, blocks=2, heads=2, neighbours=3).double().eval()
+    return Matcher(channels=16, depth=2, heads=2, neighbours=3).double().eval()
 
 
 def cluttered(*sizes: int) -> Batch:
@@ -31,7 +33,7 @@ def plan(net: Matcher, batch: Batch) -> Tensor:
 
 def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
     batch = cluttered(9, 21)
-    prediction = small()(batch, poses=False)
+    prediction = small().match(batch)
     total = (batch.count2d + batch.count3d).unsqueeze(-1).double()
     torch.testing.assert_close(prediction.assignment.sum(2) + prediction.unmatched2d, batch.mask2d / total)
     torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
@@ -39,9 +41,9 @@ def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
 
 def test_a_pair_depends_neither_on_its_batch_nor_on_padding() -> None:
     net, batch = small(), cluttered(9, 21, 14)
-    joint = net(batch, poses=False).assignment
+    joint = net.match(batch).assignment
     for i, size in enumerate((9, 21, 14)):
-        alone = net(cluttered(size), poses=False).assignment[0]
+        alone = net.match(cluttered(size)).assignment[0]
         torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-8, atol=1e-14)
         assert not joint[i, alone.shape[0] :].any()
         assert not joint[i, :, alone.shape[1] :].any()
@@ -98,10 +100,10 @@ def test_neighbourhood_of_few_points() -> None:
 def test_learns_the_partners_and_the_clutter_of_one_pair() -> None:
     torch.manual_seed(0)
     batch = plant(1, 12, outliers2d=4, outliers3d=4, seed=3, dtype=torch.float32).batch()
-    net = Matcher(channels=32, blocks=2, heads=2)
+    net = Matcher(channels=32, depth=2, heads=2)
     optimiser = torch.optim.Adam(net.parameters(), lr=3e-3)
     for _ in range(120):
-        loss = matching_likelihood_loss(net(batch, poses=False), batch).mean()
+        loss = matching_likelihood_loss(net.match(batch), batch).mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -125,13 +127,12 @@ def test_says_what_is_wrong_with_its_options() -> None:
 
 def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -> None:
     net, batch = small().float(), cluttered(9).to(torch.float32)
-    for name, solver in (("matcher", net), ("other", BPnPNet(channels=8, blocks=1))):
-        saved = {"class": type(solver).__name__, "settings": solver.settings}
+    for name, solver in (("matcher", net), ("other", small_net(8, 1))):
         state = {f"solver.{key}": value for key, value in solver.state_dict().items()}
-        torch.save({"solver": saved, "state_dict": state}, tmp_path / f"{name}.ckpt")
-    expected = net(batch, poses=False).assignment
+        torch.save({"solver": described(solver), "state_dict": state}, tmp_path / f"{name}.ckpt")
+    expected = net.match(batch).assignment
     for again in (Matcher.from_checkpoint(tmp_path / "matcher.ckpt"), load_network(tmp_path / "matcher.ckpt")):
-        torch.testing.assert_close(again(batch, poses=False).assignment, expected)
+        torch.testing.assert_close(again.match(batch).assignment, expected)
     assert isinstance(load_network(tmp_path / "other.ckpt"), BPnPNet)
     with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
         Matcher.from_checkpoint(tmp_path / "other.ckpt")

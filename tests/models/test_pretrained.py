@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from small_data import small_net
 
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule
 from bpnp.datamodules.outliers import Outliers
 from bpnp.metrics import rotation_error
-from bpnp.models.pretrained import LEARNED, pack, pretrained_names, pretrained_path
+from bpnp.models.composition import described
+from bpnp.models.weights import LEARNED, pack, pretrained_names, pretrained_path
 
 ROOT = Path(__file__).parents[2]
 
@@ -128,9 +130,9 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
 
 
 def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) -> None:
-    net = BPnPNet(channels=16, blocks=2, normalise_scene=True).eval()
+    net = small_net(normalise=True).eval()
     content = {
-        "solver": {"class": "BPnPNet", "settings": net.settings},
+        "solver": described(net),
         "state_dict": {f"solver.{key}": value for key, value in net.state_dict().items()} | {"skipped": torch.zeros(2)},
         "optimizer_states": [torch.zeros(1000)],
     }

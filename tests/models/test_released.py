@@ -135,7 +135,7 @@ def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: b
     reference.double().eval()
     sets = [(p2.double(), p3.double()) for p2, p3 in pairs()]
     batch = Batch.from_arrays([p2 for p2, _ in sets], [p3 for _, p3 in sets])
-    cost, assignment = net.cost(batch), net(batch, poses=False).assignment
+    cost, assignment = net.cost(batch), net.match(batch).assignment
     for i, (p2, p3) in enumerate(sets):
         expected = reference(p2[None], p3[None])[0]
         assert expected.std() > 0.02  # enough for the assignment to depend on it

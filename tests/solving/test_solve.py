@@ -8,8 +8,9 @@ import pytest
 import torch
 from planted import Planted, plant
 from scipy.spatial.transform import Rotation
+from small_data import small_net
 
-from bpnp import BPnPNet, GravityPrior, PosePrior, Solution, solve, solve_many
+from bpnp import GravityPrior, PosePrior, Solution, solve, solve_many
 from bpnp.models import Search
 from bpnp.types import Pose, Prediction, SolveStats
 
@@ -314,10 +315,11 @@ def test_a_net_is_a_solver_and_a_source_of_candidates() -> None:
     planted = plant(1, 60, noise=0.001)
     x, p = planted.points2d[0], planted.points3d[0]
     torch.manual_seed(0)
-    net = BPnPNet(channels=16, blocks=2, hypotheses=0)
+    net = small_net()
+    net.refinement.hypotheses = 0
     assert solve(x, p, solver=net).verdict != "confident"
     assert net.training  # as it came
-    net.pose_stage.hypotheses = 192
+    net.refinement.hypotheses = 192
     lucky = solve(x, p, solver=net)
     assert lucky.verdict != "confident" or degrees(lucky, planted) < 0.2
     solution = solve(x, p, prior=net)

@@ -10,6 +10,7 @@ import torch
 from lightning import Trainer
 from lightning.pytorch.loggers import CSVLogger
 from planted import plant
+from small_data import small_net
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, BPnPNet
@@ -20,7 +21,7 @@ from bpnp.training.task import BlindPnPTask
 
 def collapsed_net() -> BPnPNet:
     """All points of an image get the same feature."""
-    net = BPnPNet(channels=8, blocks=1)
+    net = small_net(8, 1)
     torch.nn.init.zeros_(net.features2d.enter.weight)
     return net
 
@@ -80,9 +81,9 @@ def test_a_planted_collapse_is_reported_once(tmp_path: Path) -> None:
 def test_features_that_differ_are_not_reported(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message=".*collapsed.*")
-        fit(tmp_path, BPnPNet(channels=8, blocks=1), FeatureSpread(patience=1, every=1))
+        fit(tmp_path, small_net(8, 1), FeatureSpread(patience=1, every=1))
         fit(tmp_path, collapsed_net(), FeatureSpread(patience=100))
-    net = BPnPNet(channels=8, blocks=1)
+    net = small_net(8, 1)
     fit(tmp_path, net, FeatureSpread())
     assert not net.features2d._forward_hooks
 
@@ -105,9 +106,9 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 def test_a_resumed_run_goes_on_at_the_rate_of_its_step(tmp_path: Path) -> None:
     schedule = LearningRateSchedule(warmup_steps=39)
-    trainer = fit(tmp_path, BPnPNet(channels=8, blocks=1), schedule)
+    trainer = fit(tmp_path, small_net(8, 1), schedule)
     assert trainer.optimizers[0].param_groups[0]["lr"] == pytest.approx(20 / 40 * 1e-12)
     trainer.save_checkpoint(tmp_path / "half.ckpt")
-    resumed = fit(tmp_path, BPnPNet(channels=8, blocks=1), schedule, epochs=2, resume=str(tmp_path / "half.ckpt"))
+    resumed = fit(tmp_path, small_net(8, 1), schedule, epochs=2, resume=str(tmp_path / "half.ckpt"))
     assert resumed.global_step == 40
     assert resumed.optimizers[0].param_groups[0]["lr"] == pytest.approx(1e-12)

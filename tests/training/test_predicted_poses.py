@@ -19,7 +19,7 @@ class Oracle(nn.Module):
 
     estimates = ("truth",)
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+    def forward(self, batch: Batch) -> Prediction:
         size = len(batch)
         stats = SolveStats(torch.zeros(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
         return Prediction(poses={"truth": Pose(batch.rotation, batch.translation, stats)})

@@ -4,8 +4,9 @@ from dataclasses import replace
 import pytest
 import torch
 from planted import Planted, plant
+from small_data import small_net
 
-from bpnp import Batch, BPnPNet, Pose, Prediction, SolveStats
+from bpnp import Batch, Pose, Prediction, SolveStats
 from bpnp.models import Matcher
 from bpnp.training.losses import matching_likelihood_loss, self_supervised_loss
 from bpnp.training.supervision import matching_losses
@@ -48,9 +49,9 @@ def test_samples_without_a_pose_do_not_dilute_the_mean_of_a_training_step() -> N
     planted = plant(2, 6)
     plan = planted.permutation().roll(1, -1)
     prediction = Prediction(plan, poses={"pnp": posed(planted, [True, False])})
-    task = BlindPnPTask(BPnPNet(channels=8, blocks=1), matching_loss="reprojection")
+    task = BlindPnPTask(small_net(8, 1), matching_loss="reprojection")
     alone = self_supervised_loss(plan, planted.batch(), posed(planted, [True, True]))[0]
-    torch.testing.assert_close(task.losses(prediction, planted.batch(), "val").mean(), alone)
+    torch.testing.assert_close(task.losses(prediction, planted.batch()).total.mean(), alone)
 
 
 def test_learns_from_points_alone() -> None:
@@ -58,11 +59,11 @@ def test_learns_from_points_alone() -> None:
     torch.manual_seed(0)
     planted = plant(1, 10, seed=2, dtype=torch.float32)
     batch = Batch.from_arrays(planted.points2d, planted.points3d)
-    net = BPnPNet(channels=32, blocks=2, centre_features=True, normalise_scene=True, threshold=0.2, refine=False)
+    net = small_net(32, centre=True, normalise=True, threshold=0.2, refine=False)
     task = BlindPnPTask(net, matching_loss="reprojection")
     optimiser, losses = torch.optim.Adam(net.parameters(), lr=1e-3), []
     for _ in range(25):
-        loss = task.losses(net(batch), batch, "val").mean()
+        loss = task.losses(net(batch), batch).total.mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -73,10 +74,10 @@ def test_learns_from_points_alone() -> None:
 def test_the_likelihood_is_what_its_name_says() -> None:
     torch.manual_seed(0)
     batch = plant(2, 9, outliers3d=3, dtype=torch.float32).batch()
-    prediction = Matcher(channels=16, blocks=1, heads=2)(batch, poses=False)
-    losses, trained = matching_losses(prediction, batch, kind="likelihood", angle=None, estimate="pnp")
-    torch.testing.assert_close(losses, matching_likelihood_loss(prediction, batch))
-    assert trained.all()
+    prediction = Matcher(channels=16, depth=1, heads=2).match(batch)
+    losses = matching_losses(prediction, batch, kind="likelihood", angle=None, estimate="pnp")
+    torch.testing.assert_close(losses.total, matching_likelihood_loss(prediction, batch))
+    assert losses.matched.all()
 
 
 def test_says_what_is_missing() -> None:

@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
-from small_data import SMALL_MESHES
+from small_data import SMALL_MESHES, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from bpnp import Batch, BPnPNet, Prediction
+from bpnp import Batch, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
@@ -18,19 +18,24 @@ from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 
 class CountingSolver(nn.Module):
-    """BPnPNet that notes for each call whether poses were wanted, and can be told to answer NaN."""
+    """BPnPNet that notes for each call whether poses were wanted, and can be told to give an assignment of NaN."""
 
     estimates = ("ransac", "pnp")
 
     def __init__(self, broken_calls: tuple[int, ...] = ()) -> None:
         super().__init__()
-        self.net = BPnPNet(channels=16, blocks=2)
+        self.net = small_net()
         self.wanted: list[bool] = []
         self.broken_calls = broken_calls
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+    def forward(self, batch: Batch) -> Prediction:
+        return self.noted(self.net(batch), poses=True)
+
+    def match(self, batch: Batch) -> Prediction:
+        return self.noted(self.net.match(batch), poses=False)
+
+    def noted(self, prediction: Prediction, *, poses: bool) -> Prediction:
         self.wanted.append(poses)
-        prediction = self.net(batch, poses=poses)
         if len(self.wanted) - 1 in self.broken_calls:
             assert prediction.assignment is not None
             return Prediction(prediction.assignment * math.nan, prediction.assignment_stats, prediction.poses)
@@ -111,8 +116,8 @@ def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> N
 
     def gradients(batches: list[Batch], pose_weight: float) -> dict[str, Tensor]:
         torch.manual_seed(3)
-        solver = BPnPNet(channels=16, blocks=2, image_scale=4.0, centre_features=True)
-        solver.align = Untransformed()
+        solver = small_net(scale=4.0, centre=True)
+        solver.features3d.align = Untransformed()
         task = BlindPnPTask(solver, pose_weight=pose_weight)
         trainer(tmp_path, max_steps=1, accumulate_grad_batches=len(batches), limit_val_batches=0,
                 enable_checkpointing=False).fit(task, DataLoader(batches, batch_size=None))  # fmt: skip
@@ -133,11 +138,11 @@ def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
     points2d = [p[:, :2] / (p[:, 2:] + 4.5) for p in points3d]
     pose = [np.eye(3)] * 2, [np.array([0, 0, 4.5])] * 2
     batch = Batch.from_arrays(points2d, points3d, *pose, [np.arange(20), np.arange(3)]).to(torch.float32)
-    task = BlindPnPTask(BPnPNet(channels=16, blocks=2), pose_weight=2.0)
+    task = BlindPnPTask(small_net(), pose_weight=2.0)
     prediction = task.solver(batch)
     solved = prediction.poses["pnp"].stats.converged
     assert not solved[1]
-    losses = task.losses(prediction, batch, "val")
+    losses = task.losses(prediction, batch).total
     expected = correspondence_loss(prediction.assignment, batch.match3d)
     found = prediction.poses["pnp"]
     full = pose_loss(found.rotation, found.translation, batch.rotation, batch.translation)
@@ -147,7 +152,7 @@ def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
 
 def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     module = data(tmp_path, num_points=40, noise_px=0.0)
-    task = BlindPnPTask(BPnPNet(channels=16, blocks=2))
+    task = BlindPnPTask(small_net())
     run = trainer(tmp_path, callbacks=[ResultsWriter()])
     run.test(task, datamodule=module, verbose=False)
     results = read_results(tmp_path / "test")

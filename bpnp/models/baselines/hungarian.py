@@ -5,10 +5,10 @@ from jaxtyping import Float
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor, nn
 
-from bpnp.geometry import bearings
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.types import Batch, Pose, Prediction
+from bpnp.models.pose_head import pnp_pose, ransac_pose
+from bpnp.types import Batch, Prediction
 
 
 class Hungarian(nn.Module):
@@ -34,20 +34,20 @@ class Hungarian(nn.Module):
         self.ransac = RansacPnP(
             backend=ransac_backend,
             pairs_factor=1.0,
-            threshold=self.net.pose_stage.ransac.threshold,
-            max_iterations=self.net.pose_stage.ransac.max_iterations,
+            threshold=getattr(self.net.ransac, "threshold", 0.01),
+            max_iterations=getattr(self.net.ransac, "max_iterations", 1000),
         )
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
+    def forward(self, batch: Batch) -> Prediction:
+        assignment = self.match(batch).assignment
+        assert assignment is not None
+        start = ransac_pose(self.ransac, assignment, batch)
+        return Prediction(assignment, None, {"ransac": start, "pnp": pnp_pose(self.net.pnp, assignment, batch, start)})
+
+    def match(self, batch: Batch) -> Prediction:
+        """The assignment alone."""
         with torch.no_grad():
-            assignment = hungarian(self.net.cost(batch), batch)
-        if not poses:
-            return Prediction(assignment)
-        masks = batch.mask2d, batch.mask3d
-        start = Pose(*self.ransac(assignment, batch.points2d, batch.points3d, *masks))
-        rays = bearings(batch.points2d)
-        final = Pose(*self.net.pose_stage.pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
-        return Prediction(assignment, None, {"ransac": start, "pnp": final})
+            return Prediction(hungarian(self.net.cost(batch), batch))
 
 
 def hungarian(cost: Float[Tensor, "b m n"], batch: Batch) -> Float[Tensor, "b m n"]:

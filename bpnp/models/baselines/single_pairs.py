@@ -59,9 +59,7 @@ class PairSolver(nn.Module):
             raise ValueError(f"expected `time_limit` > 0 seconds, got {time_limit}; try 30, or none for no limit")
         self.time_limit = time_limit
 
-    def forward(self, batch: Batch, *, poses: bool = True) -> Prediction:
-        if not poses:
-            return Prediction()
+    def forward(self, batch: Batch) -> Prediction:
         # The trainer's inference mode would forbid a local optimiser's gradients.
         with torch.inference_mode(False), torch.no_grad():
             found = [self._solve(pair) for pair in _pairs(batch)]

@@ -40,31 +40,80 @@ class ResidualBlock(nn.Module):
 class PointFeatures(nn.Module):
     """A vector of unit length for each point, from its coordinates and the statistics of its set.
 
-    coordinates: 2 or 3. channels, blocks: width and depth of the residual net.
-    batch_norm: after each context norm, as the paper's text has it; the released code has none.
-    centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
-        assignment (ours; off in the paper).
+    Args:
+        coordinates: 2 or 3.
+        channels: width of the residual net.
+        depth: its residual blocks.
+        batch_norm: batch norm after each context norm, as in the paper's text; the released code has none.
+        centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
+            assignment (ours; off in the paper).
     """
 
     def __init__(
-        self,
-        coordinates: int,
-        *,
-        channels: int = 128,
-        blocks: int = 12,
-        batch_norm: bool = False,
-        centre: bool = False,
+        self, coordinates: int, *, channels: int = 128, depth: int = 12, batch_norm: bool = False, centre: bool = False
     ) -> None:
         super().__init__()
+        self.coordinates, self.channels, self.depth = coordinates, channels, depth
+        self.batch_norm, self.centre = batch_norm, centre
         self.enter = nn.Linear(coordinates, channels)
-        self.blocks = nn.ModuleList(ResidualBlock(channels, batch_norm=batch_norm) for _ in range(blocks))
-        self.centre = centre
+        self.blocks = nn.ModuleList(ResidualBlock(channels, batch_norm=batch_norm) for _ in range(depth))
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         z = self.enter(points)
         for block in self.blocks:
             z = block(z, mask)
         return nn.functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
+
+
+class ImageFeatures(PointFeatures):
+    """Features of normalised image points.
+
+    Args:
+        channels, depth, batch_norm, centre: as in `PointFeatures`.
+        scale: factor on the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: int = 128,
+        depth: int = 12,
+        batch_norm: bool = False,
+        centre: bool = False,
+        scale: float = 1.0,
+    ) -> None:
+        super().__init__(2, channels=channels, depth=depth, batch_norm=batch_norm, centre=centre)
+        self.scale = scale
+
+    def forward(self, points: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"]) -> Float[Tensor, "b m c"]:
+        return super().forward(self.scale * points, mask)
+
+
+class SceneFeatures(PointFeatures):
+    """Features of scene points after PointNet's learned transform of the set.
+
+    Args:
+        channels, depth, batch_norm, centre: as in `PointFeatures`.
+        normalise: centre the points and scale them to unit size first, so that the features depend neither on the
+            scene's unit nor on its origin.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: int = 128,
+        depth: int = 12,
+        batch_norm: bool = False,
+        centre: bool = False,
+        normalise: bool = False,
+    ) -> None:
+        super().__init__(3, channels=channels, depth=depth, batch_norm=batch_norm, centre=centre)
+        self.normalise = normalise
+        self.align = InputTransform()
+
+    def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n c"]:
+        points = normalise_points3d(points, mask) if self.normalise else points
+        return super().forward(self.align(points, mask), mask)
 
 
 class InputTransform(nn.Module):

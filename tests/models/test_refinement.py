@@ -1,23 +1,30 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
-from planted import plant
+from planted import Planted, plant
+from small_data import small_net
+from torch import Tensor, nn
 
 from bpnp import Batch, Matcher, Pose, SolveStats
-from bpnp.models.pose_head import PoseStage
-from bpnp.models.support import ALONE, TRUST, WIDTH, log_support
+from bpnp.models import Refinement
+from bpnp.models.evaluation import ALONE, TRUST, WIDTH, log_support, refinement_enabled
 from bpnp.types import Prediction
 
 
-def masks(batch: Batch) -> dict[str, torch.Tensor]:
-    return {"mask2d": batch.mask2d, "mask3d": batch.mask3d}
+def support(
+    plan: Tensor, planted: Planted, rotation: Tensor, translation: Tensor, batch: Batch | None = None
+) -> Tensor:
+    size = len(plan)
+    stats = SolveStats(torch.zeros(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
+    return log_support(Prediction(plan), batch or planted.batch(), Pose(rotation, translation, stats))
 
 
 def test_is_the_sum_over_bearings_written_out() -> None:
     planted = plant(1, 6, outliers2d=2, outliers3d=1)
     plan = planted.diffuse(0.05)
-    found = log_support(plan, planted.bearings, planted.points3d, *planted.pose, **masks(planted.batch()))
+    found = support(plan, planted, *planted.pose)
     rays = planted.bearings[0]
     area = float(((rays - rays.mean(0)) ** 2).sum(1).mean()) * 2 * math.pi
     total = 0.0
@@ -35,30 +42,27 @@ def test_is_the_sum_over_bearings_written_out() -> None:
 def test_speaks_for_the_true_pose_and_against_a_wrong_one_whatever_the_padding() -> None:
     planted = plant(3, 40, outliers2d=20, outliers3d=20)
     plan, batch = planted.diffuse(0.03), planted.batch()
-    right = log_support(plan, planted.bearings, planted.points3d, *planted.pose, **masks(batch))
-    wrong = log_support(plan, planted.bearings, planted.points3d, *planted.near(2.0), **masks(batch))
+    right = support(plan, planted, *planted.pose)
+    wrong = support(plan, planted, *planted.near(2.0))
     assert (right > 0).all()
     assert (wrong < 0).all()
-    pad = torch.nn.functional.pad
-    wide = log_support(
-        pad(plan, (0, 5, 0, 3)),
-        pad(planted.bearings, (0, 0, 0, 3)),
-        pad(planted.points3d, (0, 0, 0, 5)),
-        *planted.pose,
+    pad = nn.functional.pad
+    wide = replace(
+        batch,
+        points2d=pad(batch.points2d, (0, 0, 0, 3)),
+        points3d=pad(batch.points3d, (0, 0, 0, 5)),
         mask2d=pad(batch.mask2d, (0, 3)),
         mask3d=pad(batch.mask3d, (0, 5)),
+        match3d=None,
     )
-    torch.testing.assert_close(wide, right)
+    torch.testing.assert_close(support(pad(plan, (0, 5, 0, 3)), planted, *planted.pose, wide), right)
 
 
 def test_there_is_none_without_a_pose() -> None:
     planted = plant(2, 8)
     rotation = planted.rotation.clone()
     rotation[1] = torch.nan
-    found = log_support(
-        planted.permutation(), planted.bearings, planted.points3d, rotation, planted.translation,
-        **masks(planted.batch()),
-    )  # fmt: skip
+    found = support(planted.permutation(), planted, rotation, planted.translation)
     assert found[0] > 0
     assert found[1] == -math.inf
 
@@ -66,10 +70,10 @@ def test_there_is_none_without_a_pose() -> None:
 def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Annealing is made to end at a wrong pose wherever it starts from proposals; the sure sample keeps its pose."""
     planted = plant(2, 40, noise=1e-4)
-    stage, batch = PoseStage().eval(), planted.batch()
+    refinement, batch = Refinement(), planted.batch()
     wrong, calls = planted.near(2.5), []
 
-    def annealed(rays: torch.Tensor, points3d: torch.Tensor, rotation: torch.Tensor, *rest: torch.Tensor) -> object:
+    def annealed(rays: Tensor, points3d: Tensor, rotation: Tensor, *rest: Tensor) -> object:
         calls.append(rotation.shape[1])
         crowd = rotation.shape[1] > 2
         ends = (torch.stack([planted.rotation[0], wrong[0][1]]), torch.stack([planted.translation[0], wrong[1][1]]))
@@ -79,8 +83,10 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
         shifted = shifted.masked_fill(missing[:, None], torch.nan)
         return turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing)
 
-    monkeypatch.setattr(stage.refine, "forward", annealed)
-    refined: Pose = stage(Prediction(planted.permutation()), batch).poses["refined"]
+    monkeypatch.setattr(refinement.anneal, "forward", annealed)
+    stats = SolveStats(torch.zeros(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
+    own = Pose(*planted.near(0.02), stats)
+    refined = refinement(Prediction(planted.permutation(), poses={"ransac": own, "pnp": own}), batch).poses["refined"]
     assert calls[0] > 2
     assert calls[1] == 2
     torch.testing.assert_close(refined.rotation, planted.rotation)
@@ -91,9 +97,24 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
 
 def test_the_choice_does_not_depend_on_the_batch() -> None:
     torch.manual_seed(0)
-    net = Matcher(channels=16, blocks=1, heads=2).double().eval()
+    net = Matcher(channels=16, depth=1, heads=2).double().eval()
     together = net(plant(3, 12, outliers3d=6).batch()).poses["refined"]
     planted = plant(3, 12, outliers3d=6)
     for i in range(3):
         single = Batch.from_arrays(planted.points2d[i], planted.points3d[i])
         torch.testing.assert_close(net(single).poses["refined"].rotation[0], together.rotation[i], equal_nan=True)
+
+
+def test_refinement_is_off_within_a_block_and_as_it_was_after_an_error() -> None:
+    outer = nn.ModuleList([small_net(), small_net(refine=False)])
+
+    def fail() -> None:
+        with refinement_enabled(outer, False):
+            assert [net.estimates for net in outer] == [("ransac", "pnp")] * 2
+            raise RuntimeError("inside")
+
+    with pytest.raises(RuntimeError, match="inside"):
+        fail()
+    assert [net.refinement.enabled for net in outer] == [True, False]
+    with refinement_enabled(outer, True):
+        assert [net.refinement.enabled for net in outer] == [True, False]

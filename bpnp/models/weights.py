@@ -1,0 +1,154 @@
+"""Checkpoint files, read as data and never as code; the weights of this package; and the networks of both."""
+
+import pickle
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from bpnp.files import written_whole
+from bpnp.layers.assignment import Sinkhorn
+from bpnp.layers.pnp import WeightedPnP
+from bpnp.layers.ransac import RansacPnP
+from bpnp.models.composition import built, class_name, differences
+from bpnp.models.evaluation import Refinement
+from bpnp.models.nets.features import ImageFeatures, PointFeatures, SceneFeatures
+from bpnp.models.older_checkpoints import brought_up_to_date
+
+PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
+WEIGHTS = resources.files("bpnp") / "weights"
+LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
+PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
+PREFIX = "solver."  # of the weights of BlindPnPTask's solver
+
+
+Net = TypeVar("Net", bound="TrainedNet")
+
+
+class TrainedNet(nn.Module):
+    """A network that comes back from its checkpoint, in evaluation mode.
+
+    >>> from bpnp import BPnPNet
+    >>> BPnPNet.from_pretrained("procedural-so3").training
+    False
+    """
+
+    @classmethod
+    def from_checkpoint(cls: type[Net], path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> Net:
+        """The network of a checkpoint that `bpnp fit` wrote.
+
+        parts: classes outside this package that the network is made of; a checkpoint names them, and only those given
+            here are used.
+        Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
+        """
+        net = load_network(path, parts=parts)
+        if not isinstance(net, cls):
+            raise ValueError(f"expected a checkpoint of {cls.__name__}, got {type(net).__name__} in {path}")
+        return net
+
+    @classmethod
+    def from_pretrained(cls: type[Net], name: str) -> Net:
+        """A network with weights of this package; `docs/model-card.md` has the names and what each can do.
+
+        Raises ValueError that lists the names for any other. Nothing is downloaded.
+        """
+        return cls.from_checkpoint(pretrained_path(name))
+
+
+def load_network(path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> TrainedNet:
+    """The network of a checkpoint that `bpnp fit` wrote, whichever it is, in evaluation mode; see `from_checkpoint`."""
+    content = read_checkpoint(path)
+    networks = TrainedNet.__subclasses__()
+    saved = content.get("solver")
+    found = saved.get("class") if isinstance(saved, Mapping) else None
+    names = [class_name(cls) for cls in networks]
+    if found not in names:
+        wanted = " or ".join(names)
+        raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
+    try:
+        net = built(saved, (*networks, *PARTS, *parts))
+        net.load_state_dict(solver_state(content["state_dict"]))
+    except (ValueError, RuntimeError) as error:
+        raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
+    assert isinstance(net, TrainedNet)
+    return net.eval()
+
+
+def load_pretrained(name: str) -> TrainedNet:
+    """The network of weights that come with the package. Raises ValueError that lists the names for any other."""
+    return load_network(pretrained_path(name))
+
+
+def pretrained_names() -> list[str]:
+    """Names that `TrainedNet.from_pretrained` knows."""
+    return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
+
+
+def pretrained_path(name: str) -> Path:
+    """The checkpoint of packaged weights. Raises ValueError that lists the names there are."""
+    if name not in pretrained_names():
+        raise ValueError(
+            f"expected the name of packaged weights, got {name!r}; try {', '.join(pretrained_names()) or 'training'}"
+        )
+    return Path(str(WEIGHTS / f"{name}.ckpt"))
+
+
+def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
+    """Content of a checkpoint that `bpnp fit` wrote, restricted to tensors, numbers and plain containers.
+
+    Raises FileNotFoundError if there is no such file, ValueError naming it if it is truncated, foreign or holds code.
+    """
+    file = Path(path)
+    if not file.is_file():
+        raise FileNotFoundError(f"expected a checkpoint, got no file at {file}; try runs/<name>/checkpoints/last.ckpt")
+    try:
+        content = torch.load(file, map_location=map_location, weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError) as error:
+        reason = str(error).splitlines()[0].split(". ")[0]
+        raise ValueError(
+            f"expected a checkpoint of `bpnp fit`, got a file that cannot be read: {file} ({reason})"
+        ) from error
+    if not isinstance(content, dict) or "state_dict" not in content:
+        raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {file}")
+    return brought_up_to_date(content)
+
+
+def solver_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The weights of the solver among those of a `BlindPnPTask`, by their names in the solver."""
+    return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
+
+
+def check_solver(
+    saved: Mapping[str, Any], state: Mapping[str, Tensor], own: Mapping[str, Any], own_state: Mapping[str, Tensor]
+) -> None:
+    """Raise ValueError, naming what differs, unless a solver's description and the shapes of its weights fit.
+
+    saved, state: of the checkpoint. own, own_state: of the configured solver.
+    """
+    if saved.get("class") != own["class"]:
+        raise ValueError(f"expected a checkpoint of {own['class']}, got one of {saved.get('class', 'another program')}")
+    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, own_state))
+    if shapes != own_shapes:
+        told = ", ".join(differences(saved, own)) or "other weights"
+        raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")
+
+
+def pack(checkpoint: str | Path, out: str | Path) -> None:
+    """A checkpoint of `bpnp fit` with nothing but the net and its settings, in half precision: what the package holds.
+
+    `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any other.
+
+    Weights beyond float16's range are a ValueError.
+    """
+    content = read_checkpoint(checkpoint)
+    state: dict[str, Any] = {}
+    for key, value in content["state_dict"].items():
+        if key.startswith(PREFIX):
+            state[key] = value.half() if value.is_floating_point() else value
+            if not state[key].isfinite().all():
+                raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
+    with written_whole(Path(out)) as temporary:
+        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, temporary)

@@ -1,0 +1,184 @@
+"""Checkpoints: written and read as plain data, of networks made of parts, and of those with one constructor."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from planted import padded, plant
+from small_data import small_net
+from torch import Tensor, nn
+
+from bpnp import Batch, BPnPNet, Matcher
+from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
+from bpnp.models import Refinement, load_network
+from bpnp.models.composition import built, described, differences
+from bpnp.models.nets import ImageFeatures, SceneFeatures
+from bpnp.models.older_checkpoints import brought_up_to_date
+from bpnp.models.weights import PARTS, check_solver
+
+OLD = {  # settings of a checkpoint that was written when BPnPNet had one constructor
+    "channels": 16, "blocks": 2, "batch_norm": True, "centre_features": True, "image_scale": 4.0,
+    "normalise_scene": True, "mu": 0.2, "learn_mu": True, "dustbin": None, "sinkhorn_tolerance": 1e-5,
+    "ransac_backend": "opencv", "ransac_iterations": 500, "threshold": 0.004, "pairs_factor": 16.0,
+    "pnp_method": "lbfgs", "pnp_iterations": 20, "refine": False, "hypotheses": 5, "rounds": 8,
+}  # fmt: skip
+
+
+class Flat(nn.Module):
+    """A user's features: a linear map."""
+
+    def __init__(self, coordinates: int, *, channels: int = 4) -> None:
+        super().__init__()
+        self.coordinates, self.channels = coordinates, channels
+        self.map = nn.Linear(coordinates, channels)
+
+    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
+        return nn.functional.normalize(self.map(points), dim=-1)
+
+
+class Forgetful(nn.Module):
+    """Keeps nothing of its argument."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.map = nn.Linear(size, size)
+
+
+def pair() -> Batch:
+    return padded([plant(1, 10, outliers2d=2, seed=10, dtype=torch.float32)])
+
+
+def save(net: nn.Module, path: Path, **more: Any) -> Path:
+    state = {f"solver.{name}": value for name, value in net.state_dict().items()}
+    torch.save({"solver": described(net), "state_dict": state | more}, path)
+    return path
+
+
+def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
+    net = small_net(transport=Sinkhorn(learn_mu=True), batch_norm=True, normalise=True, rounds=2)
+    again = BPnPNet.from_checkpoint(save(net, tmp_path / "net.ckpt", **{"other.weight": torch.ones(1)}))
+    assert described(again) == described(net)
+    assert not again.training
+    with torch.no_grad():
+        assert torch.equal(again.match(pair()).assignment, net.eval().match(pair()).assignment)
+
+
+def test_a_part_of_the_users_comes_back_only_if_the_user_names_its_class(tmp_path: Path) -> None:
+    net = BPnPNet(Flat(2), Flat(3, channels=4), Sinkhorn(mu=0.3)).eval()
+    file = save(net, tmp_path / "net.ckpt")
+    with pytest.raises(ValueError, match=r"expected a checkpoint of BPnPNet, got .*net.ckpt: .*test_weights.Flat"):
+        BPnPNet.from_checkpoint(file)
+    again = BPnPNet.from_checkpoint(file, parts=[Flat])
+    assert again.transport.mu == 0.3
+    torch.testing.assert_close(again.match(pair()).assignment, net.match(pair()).assignment)
+
+
+@pytest.mark.parametrize("name", ["os.system", "subprocess.Popen", "torch.nn.modules.linear.Linear", "BPnPNet.forward"])
+def test_a_checkpoint_names_no_class_that_is_not_known(name: str, tmp_path: Path) -> None:
+    solver = described(small_net())
+    solver["settings"]["transport"] = {"class": name, "settings": {"command": "true"}}
+    torch.save({"solver": solver, "state_dict": {}}, tmp_path / "evil.ckpt")
+    with pytest.raises(ValueError, match=rf"evil.ckpt: expected a class among .*, got '{name}'"):
+        BPnPNet.from_checkpoint(tmp_path / "evil.ckpt")
+
+
+def test_settings_that_a_class_does_not_have_are_named(tmp_path: Path) -> None:
+    solver = described(small_net())
+    solver["settings"]["transport"]["settings"]["nonsense"] = 3
+    torch.save({"solver": solver, "state_dict": {}}, tmp_path / "net.ckpt")
+    with pytest.raises(ValueError, match=r"net.ckpt: expected settings of Sinkhorn, got .*nonsense"):
+        load_network(tmp_path / "net.ckpt")
+
+
+def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
+    given = [
+        ImageFeatures(channels=8, depth=1, batch_norm=True, centre=True, scale=2.0),
+        SceneFeatures(channels=8, depth=1, normalise=True),
+        Sinkhorn(mu=0.3, learn_mu=True, tolerance=1e-5, max_iterations=7),
+        RansacPnP(backend="opencv", pairs_factor=2.0, threshold=0.1, max_iterations=9, seed=4),
+        WeightedPnP(method="lbfgs", tolerance=1e-8, max_iterations=3),
+        Refinement(hypotheses=3, enabled=False),
+        Matcher(channels=8, depth=1, heads=2, neighbours=0, mu=0.2, tolerance=1e-5, ransac=RansacPnP(threshold=0.2)),
+    ]
+    for module in given:
+        description = described(module)
+        again = built(description, (*PARTS, BPnPNet, Matcher))
+        assert described(again) == description
+        assert type(again) is type(module)
+    assert described(given[2])["settings"]["mu"] == 0.3
+    assert described(given[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
+
+
+def test_a_module_that_forgets_its_arguments_can_be_saved_and_says_so_when_built() -> None:
+    description = described(Forgetful(3))
+    assert description["settings"] is None
+    with pytest.raises(ValueError, match="expected the settings of test_weights.Forgetful, got none; try a class that"):
+        built(description, [Forgetful])
+
+
+def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
+    saved, own = small_net(8, 1, normalise=True), small_net(16, 2)
+    told = r"features2d.channels=8, features2d.depth=1, features3d.channels=8, .*features3d.normalise=True; try"
+    with pytest.raises(ValueError, match=told):
+        check_solver(described(saved), saved.state_dict(), described(own), own.state_dict())
+    check_solver(described(own), own.state_dict(), described(small_net(normalise=True)), own.state_dict())
+    with pytest.raises(ValueError, match="expected a checkpoint of BPnPNet, got one of another program"):
+        check_solver({}, {}, described(own), own.state_dict())
+    assert list(differences(described(Flat(2)), described(Flat(3)))) == ["coordinates=2"]
+
+
+def test_the_options_of_the_older_constructor_are_those_of_the_parts(tmp_path: Path) -> None:
+    shape = {"channels": 16, "depth": 2, "batch_norm": True, "centre": True}
+    net = BPnPNet(
+        ImageFeatures(**shape, scale=4.0),
+        SceneFeatures(**shape, normalise=True),
+        Sinkhorn(mu=0.2, learn_mu=True, tolerance=1e-5),
+        RansacPnP(backend="opencv", max_iterations=500, threshold=0.004, pairs_factor=16.0),
+        WeightedPnP(method="lbfgs", max_iterations=20),
+        refinement=Refinement(hypotheses=5, enabled=False),
+        rounds=8,
+    ).eval()
+    older = {"features3d.align": "align", "transport": "sinkhorn"}
+    state = {}
+    for name, value in net.state_dict().items():
+        old = next((was + name.removeprefix(now) for now, was in older.items() if name.startswith(now)), name)
+        state[f"solver.{old}"] = value
+    assert "solver.sinkhorn.log_mu" in state
+    assert "solver.align.out.weight" in state
+    torch.save({"solver": {"class": "BPnPNet", "settings": OLD}, "state_dict": state}, tmp_path / "old.ckpt")
+    again = BPnPNet.from_checkpoint(tmp_path / "old.ckpt")
+    assert described(again) == described(net)
+    torch.testing.assert_close(again.state_dict(), net.state_dict(), rtol=0, atol=0)
+    # The state of an optimiser goes by the order of the parameters.
+    assert [name for name, _ in again.named_parameters()] == [name for name, _ in net.named_parameters()]
+
+
+def test_older_settings_may_lack_options_and_hold_none_that_never_was() -> None:
+    content: dict[str, Any] = {"solver": {"class": "BPnPNet", "settings": {"channels": 8}}, "state_dict": {}}
+    net = built(brought_up_to_date(content)["solver"], (*PARTS, BPnPNet))
+    assert net.refinement.hypotheses == Refinement().hypotheses
+    assert (net.features2d.channels, net.features3d.channels) == (8, 8)
+    pose = {"class": "Matcher", "settings": {"blocks": 1, "heads": 2, "channels": 8, "pose": {"threshold": 0.004}}}
+    matcher = built(brought_up_to_date({"solver": pose, "state_dict": {}})["solver"], (*PARTS, Matcher))
+    assert (matcher.depth, matcher.ransac.threshold, matcher.ransac.pairs_factor) == (1, 0.004, 1.5)
+    content["solver"]["settings"]["nonsense"] = 1
+    with pytest.raises(ValueError, match="expected options of BPnPNet, got 'nonsense'"):
+        brought_up_to_date(content)
+
+
+@pytest.mark.parametrize("content", [{"solver": {"class": "Hungarian"}, "state_dict": {}}, {"state_dict": {}}, [1]])
+def test_says_that_a_checkpoint_holds_another_solver(tmp_path: Path, content: Any) -> None:
+    torch.save(content, tmp_path / "other.ckpt")
+    with pytest.raises(ValueError, match=r"expected a checkpoint.*other\.ckpt"):
+        BPnPNet.from_checkpoint(tmp_path / "other.ckpt")
+
+
+def test_says_that_a_file_is_no_checkpoint_and_runs_no_code(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"expected a checkpoint, got no file at .*none\.ckpt"):
+        BPnPNet.from_checkpoint(tmp_path / "none.ckpt")
+    (tmp_path / "text.ckpt").write_text("epoch,loss\n1,0.5\n")
+    torch.save({"state_dict": {}, "solver": Path()}, tmp_path / "code.ckpt")
+    for name in ("text.ckpt", "code.ckpt"):
+        with pytest.raises(ValueError, match=f"expected a checkpoint.*{name}"):
+            BPnPNet.from_checkpoint(tmp_path / name)
