@@ -1,0 +1,180 @@
+"""Simulated devices with LEDs, frames of them, and fields of craters: what the few-point search is measured on.
+
+Every device is made from a shape and a seed: LEDs with outward normals at random places on a ring, a headset's shell, a
+drone's frame, or a marker's arms. Units are metres and pixels.
+"""
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+Kind = Literal["ring", "headset", "drone", "marker"]
+FACING_DEG = 78.0  # largest angle between a normal and the line of sight to a LED that is seen
+SIZES = {"ring": 17, "headset": 34, "drone": 8, "marker": 5}
+
+
+@dataclass(frozen=True)
+class Device:
+    """LEDs (n, 3), metres, and their outward unit normals (n, 3)."""
+
+    points3d: Array
+    normals3d: Array
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole or an equidistant fisheye camera: image radius f tan(theta) or f theta, square image."""
+
+    focal: float = 480.0
+    size: int = 800
+    fisheye: bool = False
+
+    def project(self, camera: Array) -> Array:
+        """Pixels (n, 2) of points (n, 3) in the camera frame, NaN where they cannot be seen."""
+        radius = np.linalg.norm(camera[:, :2], axis=-1)
+        theta = np.arctan2(radius, camera[:, 2])
+        if self.fisheye:
+            scale = np.where(radius > 0, self.focal * theta / np.maximum(radius, 1e-12), self.focal / camera[:, 2])
+        else:
+            scale = np.where(camera[:, 2] > 0, self.focal / np.where(camera[:, 2] > 0, camera[:, 2], 1), np.nan)
+        pixels = camera[:, :2] * scale[:, None] + self.size / 2
+        inside = ((pixels >= 0) & (pixels < self.size)).all(-1, keepdims=True)
+        return np.where(inside, pixels, np.nan)
+
+    def bearings(self, pixels: Array) -> Array:
+        """Unit rays (n, 3) of pixels (n, 2)."""
+        centred = (pixels - self.size / 2) / self.focal
+        if not self.fisheye:
+            rays = np.column_stack([centred, np.ones(len(centred))])
+            return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        theta = np.linalg.norm(centred, axis=-1, keepdims=True)
+        return np.column_stack([centred * np.sinc(theta / np.pi), np.cos(theta)])
+
+    @property
+    def model(self) -> tuple[str, list[float]]:
+        """As `bpnp.solve` takes it."""
+        middle = self.size / 2
+        if self.fisheye:
+            return "OPENCV_FISHEYE", [self.focal, self.focal, middle, middle, 0.0, 0.0, 0.0, 0.0]
+        return "PINHOLE", [self.focal, self.focal, middle, middle]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One picture: pixels (m, 2) in random order, the device, camera = R p + t, and which LED each pixel is (-1)."""
+
+    pixels: Array
+    camera: Camera
+    device: Device
+    rotation: Array
+    translation: Array
+    led: NDArray[np.int64]
+
+    @property
+    def bearings(self) -> Array:
+        return self.camera.bearings(self.pixels)
+
+    @property
+    def gravity(self) -> tuple[Array, Array]:
+        """The direction up in the camera and in the device's frame, without noise: the device's z axis."""
+        return self.rotation[:, 2], np.array([0.0, 0.0, 1.0])
+
+
+def device(kind: Kind, seed: int) -> Device:
+    """A random layout of a kind."""
+    rng = np.random.default_rng([seed, list(SIZES).index(kind)])
+    count = SIZES[kind]
+    if kind == "ring":
+        angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+        tilt = np.radians(rng.uniform(-35, 35, count))
+        outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)
+        up = np.array([0.0, 0.0, 1.0])
+        points = 0.045 * outward + rng.uniform(-0.012, 0.012, count)[:, None] * up
+        normals = np.cos(tilt)[:, None] * outward + np.sin(tilt)[:, None] * up
+    elif kind == "headset":
+        normals = _spread_directions(count, rng)
+        points = normals / np.linalg.norm(normals / np.array([0.09, 0.05, 0.06]), axis=-1, keepdims=True)
+        points += rng.normal(0, 0.002, points.shape)
+    elif kind == "drone":
+        arm = np.arange(count) % 4
+        angle = np.pi / 4 + np.pi / 2 * arm + rng.uniform(-0.25, 0.25, count)
+        radius = rng.uniform(0.06, 0.18, count)
+        points = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-0.03, 0.03, count)], -1)
+        normals = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), rng.uniform(-1, 1, count)], -1)
+    else:
+        points = rng.uniform(-0.06, 0.06, (count, 3)) * np.array([1, 1, 0.6])
+        normals = np.tile([0.0, 0.0, 1.0], (count, 1)) + rng.normal(0, 0.25, (count, 3))
+    return Device(points, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+
+def frame(
+    device: Device,
+    rng: np.random.Generator,
+    *,
+    camera: Camera = Camera(),
+    noise: float = 0.2,
+    background: int = 0,
+    missing: float = 0.0,
+    least: int = 4,
+    distance: tuple[float, float] = (0.25, 0.8),
+    off_axis: float = 0.5,
+) -> Frame:
+    """A picture of a device in a random pose, at least `least` of whose LEDs are seen.
+
+    noise: pixels, standard deviation. background: lights that are not the device's, uniform in the picture or, half of
+    them, around the device. missing: share of the LEDs that face the camera and are not detected. distance: metres.
+    off_axis: of the device from the optical axis, share of half the picture.
+    """
+    while True:
+        rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
+        middle = camera.bearings(camera.size / 2 * (1 + off_axis * rng.uniform(-1, 1, (1, 2))))[0]
+        translation = rng.uniform(*distance) * middle
+        led, pixels = seen(device, rotation, translation, camera, rng, noise=noise, missing=missing)
+        if len(led) < least:
+            continue
+        lights = camera.size * rng.random((background, 2))
+        near = rng.random(background) < 0.5
+        spread = 1.5 * np.ptp(pixels, axis=0).max()
+        lights[near] = (pixels.mean(0) + spread * rng.uniform(-1, 1, (background, 2)))[near]
+        lights = np.clip(lights, 0, camera.size - 1)
+        order = rng.permutation(len(led) + background)
+        every = np.concatenate([pixels, lights])[order]
+        return Frame(
+            every, camera, device, rotation, translation, np.concatenate([led, np.full(background, -1)])[order]
+        )
+
+
+def seen(
+    device: Device, rotation: Array, translation: Array, camera: Camera, rng: np.random.Generator, *, noise: float,
+    missing: float,
+) -> tuple[NDArray[np.int64], Array]:  # fmt: skip
+    """The LEDs that are detected and their noisy pixels."""
+    points = device.points3d @ rotation.T + translation
+    sight = -points / np.linalg.norm(points, axis=-1, keepdims=True)
+    facing = (sight * (device.normals3d @ rotation.T)).sum(-1) > np.cos(np.radians(FACING_DEG))
+    pixels = camera.project(points)
+    detected = facing & np.isfinite(pixels).all(-1) & (rng.random(len(points)) >= missing)
+    led = np.flatnonzero(detected)
+    return led, pixels[led] + noise * rng.standard_normal((len(led), 2))
+
+
+def noise_frame(m: int, n: int, rng: np.random.Generator, camera: Camera = Camera()) -> tuple[Array, Array]:
+    """m random pixels and n random scene points that have no pose in common."""
+    return camera.size * rng.random((m, 2)), rng.standard_normal((n, 3))
+
+
+def _spread_directions(count: int, rng: np.random.Generator) -> Array:
+    """Directions of the front three quarters of the sphere, no two very close."""
+    chosen: list[Array] = []
+    while len(chosen) < count:
+        trial = rng.standard_normal((64, 3))
+        trial /= np.linalg.norm(trial, axis=-1, keepdims=True)
+        trial = trial[trial[:, 2] > -0.5]
+        if chosen:
+            trial = trial[np.argsort((trial @ np.array(chosen).T).max(-1))]
+        chosen.append(trial[0])
+    return np.array(chosen)

@@ -1,0 +1,170 @@
+"""What the compiled loops read: a scene's points with the tables of their triples, and an image's points in a grid."""
+
+import functools
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.search.constellation.matching import build_grid
+from bpnp.search.constellation.neighbourhoods import list_triples, orientations, sphere
+from bpnp.search.constellation.triangles import triangle_table
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+DIRECTIONS = sphere(192)
+DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
+OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
+CELLS = 48  # of the grid, a side
+SCENES = 8  # whose tables are remembered
+
+
+class SceneArrays:
+    """Scene points around their centre in units of their extent, and the triples of near points, nearest first.
+
+    arrays: points (n, 3), normals (n, 3) or (0, 3), labels (n,); writable, since the loops are compiled for such.
+    """
+
+    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Labels | None, witnesses: int) -> None:
+        self.centre = points3d.mean(0)
+        local = points3d - self.centre
+        self.size = max(float(np.sqrt((local**2).sum(-1).mean())), 1e-300)
+        points = np.ascontiguousarray(local / self.size)
+        normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
+        labels = np.full(len(points), -1) if labels3d is None else np.array(labels3d, np.int64)
+        self.arrays = points, normals, labels
+        self.order, self.rank = neighbours_of(points, normals)
+        self.witnesses = np.ascontiguousarray(self.order[:, :witnesses])
+        self._tables: tuple[NDArray[Any], ...] | None = None
+        self._within: dict[int, int] = {0: 0, 1: 0}
+
+    def triples(self, near: int) -> tuple[tuple[NDArray[Any], ...], int]:
+        """Tables of the triples (triples, sides, frames, middles, orientations), and how many of them, the first ones,
+        are of a point and two of its `near` nearest."""
+        near = min(near, self.order.shape[1])
+        if near not in self._within:
+            known = max(self._within)
+            found = triples_between(self.order, self.rank, known + 1, near)
+            points, normals, _ = self.arrays
+            sides, frames, middles = (np.empty((len(found), *shape)) for shape in ((3,), (3, 3), (3,)))
+            usable, orientation = np.empty(len(found), np.bool_), np.empty(len(found), np.int64)
+            triangle_table(points, found, sides, frames, middles, usable)
+            orientations(found, frames, normals, DIRECTIONS, usable, orientation)
+            seen = orientation > 0
+            tables = tuple(x[seen] for x in (found, sides, frames, middles, orientation))
+            if self._tables is not None:
+                tables = tuple(np.concatenate(pair) for pair in zip(self._tables, tables, strict=True))
+            self._tables = tables
+            self._within[near] = len(tables[0])
+        assert self._tables is not None
+        return self._tables, self._within[near]
+
+
+class ImageArrays:
+    """Bearings in a frame whose z axis is their mean, stereographic, in a grid.
+
+    turn: R, f in this frame = R f. rays: (m, 4), with one over the radius. arrays: flat (m, 2), gain (m,), labels (m,)
+    and the grid's corner, starts and items (`matching.build_grid`). density: the chance that one scene point falls
+    within one radius of a given image point, if it may be anywhere among them.
+    """
+
+    def __init__(self, bearings: Array, radius: float | Array, labels2d: Labels | None, reach: float) -> None:
+        self.turn = _onto_z(bearings.mean(0))
+        rays = bearings @ self.turn.T
+        inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
+        self.rays = np.ascontiguousarray(np.column_stack([rays, inverse]))
+        flat = np.ascontiguousarray(rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9))
+        gain = np.ascontiguousarray((1 + rays[:, 2]) * inverse)
+        labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
+        self.arrays = (flat, gain, labels, *grid_of(flat, gain, reach))
+        self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
+        self.order, self.rank = neighbours_of(rays, np.empty((0, 3)))
+        self._triples = np.empty((0, 3), np.int64)
+        self._near = 1
+
+    def triples(self, near: int) -> NDArray[np.int64]:
+        """Triples (t, 3) of an image point and two of its `near` nearest, nearest first."""
+        near = min(near, self.order.shape[1])
+        if near > self._near:
+            more = triples_between(self.order, self.rank, self._near + 1, near)
+            self._triples, self._near = np.concatenate([self._triples, more]), near
+        return self._triples
+
+
+def scene_arrays(points3d: Array, normals3d: Array | None, labels3d: Labels | None, witnesses: int) -> SceneArrays:
+    """The arrays of a scene; those of the last few are remembered, for a device is seen in frame after frame."""
+    return _remembered(_packed(points3d), _packed(normals3d), _packed(labels3d), witnesses)
+
+
+@functools.lru_cache(maxsize=SCENES)
+def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None, witnesses: int) -> SceneArrays:
+    return SceneArrays(
+        np.frombuffer(points3d).reshape(-1, 3),
+        None if normals3d is None else np.frombuffer(normals3d).reshape(-1, 3),
+        None if labels3d is None else np.frombuffer(labels3d, np.int64),
+        witnesses,
+    )
+
+
+def _packed(values: NDArray[Any] | None) -> bytes | None:
+    return None if values is None else np.ascontiguousarray(values).tobytes()
+
+
+def neighbours_of(points: Array, normals: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Each point's nearest (n, k), and the rank of each point among another's (n, n), n where it is not one of them.
+
+    Points whose normals no camera can face at once come last. normals: (n, 3) or (0, 3).
+    """
+    n = len(points)
+    rank = np.full((n, n), n)
+    if n > DENSE:
+        order = cKDTree(points).query(points, DENSE)[1]
+        order = np.array([row[row != i][: DENSE - 1] for i, row in enumerate(order)], np.int64)
+    else:
+        distance2 = ((points[:, None] - points[None]) ** 2).sum(-1)
+        if len(normals):
+            distance2 += np.where(normals @ normals.T < OPPOSITE, 1e6 * (distance2.max() + 1e-300), 0.0)
+        np.fill_diagonal(distance2, np.inf)
+        order = np.argsort(distance2, axis=1, kind="stable")[:, :-1]
+    np.put_along_axis(rank, order, np.broadcast_to(np.arange(order.shape[1]), order.shape), axis=1)
+    return np.ascontiguousarray(order, np.int64), rank
+
+
+def triples_between(order: NDArray[np.int64], rank: NDArray[np.int64], first: int, last: int) -> NDArray[np.int64]:
+    """Triples (t, 3) of a point, one of its `first` to `last` nearest, and a nearer one."""
+    most = len(order) * (last * (last - 1) - (first - 1) * max(first - 2, 0)) // 2
+    triples = np.empty((max(most, 1), 3), np.int64)
+    return triples[: list_triples(order, rank, first, last, triples)]
+
+
+def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+    """Corner, starts and items of the grid in which image points are looked up within `reach` radii."""
+    corner, starts = np.empty(3), np.empty(CELLS * CELLS + 1, np.int64)
+    items = np.empty(64 * len(flat), np.int64)
+    count = build_grid(flat, gain, reach, corner, starts, items)
+    if count < 0:
+        items = np.empty(-count, np.int64)
+        build_grid(flat, gain, reach, corner, starts, items)
+    return corner, starts, items
+
+
+def _onto_z(direction: Array) -> Array:
+    """A rotation that takes a direction to the z axis; any if it is zero."""
+    length = float(np.linalg.norm(direction))
+    if length < 1e-9:
+        return np.eye(3)
+    x, y, z = direction / length
+    if z < -0.999999:
+        return np.diag([1.0, -1.0, -1.0])
+    c = 1 / (1 + z)
+    return np.array([[1 - x * x * c, -x * y * c, -x], [-x * y * c, 1 - y * y * c, -y], [x, y, z]])
+
+
+def _area(flat: Array, radius: float) -> float:
+    """Area of the rectangle along the principal axes of the points that holds them, no side below two radii."""
+    centred = flat - flat.mean(0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    sides = np.ptp(centred @ axes, axis=0) + 2 * radius
+    return float(sides.prod())

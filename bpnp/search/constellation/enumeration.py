@@ -1,0 +1,145 @@
+"""Every hypothesis of a block: image triples against scene triples, each a P3P, checked on the points beside it."""
+
+from typing import Any
+
+from bpnp.compilation import compiler
+from bpnp.search.constellation.kept import consider
+from bpnp.search.constellation.matching import WIDEST_MATCHED, nearest, sight
+from bpnp.search.constellation.p3p import p3p_depths
+from bpnp.search.constellation.triangles import pose_of_triangle
+
+compiled = compiler(error_model="numpy", boundscheck=False)
+SKIPPED = 5  # matches of the best pose from which its own triples are not solved again
+
+
+@compiled
+def sweep(
+    first: int, last: int, old_image: int, old_scene: int, new_scene: int, stop: float, budget: int,
+    rays: Any, triples2d: Any, scene_triples: Any, witnesses: Any, need: int,
+    scene: Any, image: Any, reach: float, used: int, density: float, prior: Any, found: Any, work: Any,
+) -> tuple[int, int]:  # fmt: skip
+    """Solve image triples `first` to `last` against scene triples below `new_scene`; those below `old_image` only
+    against scene triples from `old_scene` on.
+
+    Ends after an image triple when the best pose's evidence is `stop` nats, or `budget` hypotheses were solved.
+    scene_triples: triples, sides, frames, middles, orientations of `neighbourhoods`. witnesses: (n, w) near points, of
+    which `need` must be matched within `reach` radii for a pose to be looked at further. found: the kept poses.
+    Returns the next image triple and the number of hypotheses.
+    """
+    triples3d, sides, frames, middles, orientation = scene_triples
+    labels3d, labels2d = scene[2], image[2]
+    depths, axes, pose = work[0], work[1], work[2]
+    best = found[5]
+    solved = 0
+    place = first
+    while place < last and solved < budget and found[1][best[0]] < stop:
+        begin = old_scene if place < old_image else 0
+        for permutation in range(6):
+            turn = permutation % 3
+            i = triples2d[place, turn]
+            j = triples2d[place, (turn + 1) % 3 if permutation < 3 else (turn + 2) % 3]
+            k = triples2d[place, (turn + 2) % 3 if permutation < 3 else (turn + 1) % 3]
+            chord01, chord12, chord20 = _chord(rays, i, j), _chord(rays, j, k), _chord(rays, k, i)
+            side = 1 if _determinant(rays, i, j, k) > 0 else 2
+            for t in range(begin, new_scene):
+                if not orientation[t] & side:
+                    continue
+                a, b, c = triples3d[t, 0], triples3d[t, 1], triples3d[t, 2]
+                if not (
+                    _fits(labels2d[i], labels3d[a])
+                    and _fits(labels2d[j], labels3d[b])
+                    and _fits(labels2d[k], labels3d[c])
+                ):
+                    continue
+                known, pairs = found[3][best[0]], found[2][best[0], 0]
+                if pairs >= SKIPPED and known[i] == a and known[j] == b and known[k] == c:
+                    continue
+                solved += 1
+                for s in range(p3p_depths(chord01, chord12, chord20, sides[t, 0], sides[t, 1], depths)):
+                    if not pose_of_triangle(rays, i, j, k, depths[s], sides[t, 2], frames[t], middles[t], axes, pose):
+                        continue
+                    if not (_faces(pose, scene, rays, a, i, b, j, c, k) and _allowed(pose, prior)):
+                        continue
+                    if witnessed(pose, a, b, c, i, j, k, witnesses, need, reach, scene, image):
+                        consider(pose, rays, scene, image, reach, used, density, prior, found, work)
+        place += 1
+    return place, solved
+
+
+@compiled
+def _fits(one: int, other: int) -> bool:
+    return one < 0 or other < 0 or one == other
+
+
+@compiled
+def _chord(rays: Any, i: int, j: int) -> float:
+    x, y, z = rays[i, 0] - rays[j, 0], rays[i, 1] - rays[j, 1], rays[i, 2] - rays[j, 2]
+    return x * x + y * y + z * z
+
+
+@compiled
+def _determinant(rays: Any, i: int, j: int, k: int) -> float:
+    x = rays[j, 1] * rays[k, 2] - rays[j, 2] * rays[k, 1]
+    y = rays[j, 2] * rays[k, 0] - rays[j, 0] * rays[k, 2]
+    z = rays[j, 0] * rays[k, 1] - rays[j, 1] * rays[k, 0]
+    return rays[i, 0] * x + rays[i, 1] * y + rays[i, 2] * z
+
+
+@compiled
+def _faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int, c: int, k: int) -> bool:
+    """Whether the three points face the camera that sees them along the rays i, j, k."""
+    normals = scene[1]
+    if not len(normals):
+        return True
+    return _cosine(pose, normals, a, rays, i) > WIDEST_MATCHED and (
+        _cosine(pose, normals, b, rays, j) > WIDEST_MATCHED and _cosine(pose, normals, c, rays, k) > WIDEST_MATCHED
+    )
+
+
+@compiled
+def _cosine(pose: Any, normals: Any, a: int, rays: Any, i: int) -> float:
+    x, y, z = normals[a, 0], normals[a, 1], normals[a, 2]
+    nx = pose[0] * x + pose[1] * y + pose[2] * z
+    ny = pose[3] * x + pose[4] * y + pose[5] * z
+    nz = pose[6] * x + pose[7] * y + pose[8] * z
+    return -(nx * rays[i, 0] + ny * rays[i, 1] + nz * rays[i, 2])
+
+
+@compiled
+def _allowed(pose: Any, prior: Any) -> bool:
+    """Whether the rotation takes the directions of the prior to within four standard deviations of where they are."""
+    for k in range(len(prior)):
+        x, y, z = prior[k, 0], prior[k, 1], prior[k, 2]
+        dx = pose[0] * x + pose[1] * y + pose[2] * z - prior[k, 3]
+        dy = pose[3] * x + pose[4] * y + pose[5] * z - prior[k, 4]
+        dz = pose[6] * x + pose[7] * y + pose[8] * z - prior[k, 5]
+        if dx * dx + dy * dy + dz * dz > prior[k, 7]:
+            return False
+    return True
+
+
+@compiled
+def witnessed(
+    pose: Any, a: int, b: int, c: int, i: int, j: int, k: int, witnesses: Any, need: int, reach: float, scene: Any,
+    image: Any,
+) -> bool:  # fmt: skip
+    """Whether `need` of the points near a, other than b and c, are seen near image points other than i, j, k."""
+    points, normals, labels3d = scene
+    flat, gain, labels2d, corner, starts, items = image
+    hits, left = 0, witnesses.shape[1]
+    for w in range(witnesses.shape[1]):
+        if hits + left < need:
+            return False
+        left -= 1
+        p = witnesses[a, w]
+        if p in (b, c):
+            continue
+        u, v, cosine = sight(pose, points, normals, p)
+        if cosine < WIDEST_MATCHED:
+            continue
+        q, _ = nearest(u, v, labels3d[p], reach * reach, flat, gain, labels2d, corner, starts, items)
+        if q >= 0 and q != i and q != j and q != k:
+            hits += 1
+            if hits >= need:
+                return True
+    return hits >= need

@@ -1,0 +1,218 @@
+import itertools
+import math
+import time
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.robust.p3p import p3p
+from bpnp.search.constellation.p3p import p3p_depths
+from bpnp.search.constellation.triangles import pose_of_triangle, triangle_table
+from bpnp.search.few import SETTINGS, enumerate_poses, margin
+
+Array = NDArray[np.float64]
+RADIUS = 2e-3
+NOISE = 4e-4
+
+
+def directions(points: Array) -> Array:
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def planted(
+    rng: np.random.Generator, seen: int, *, hidden: int = 0, background: int = 0, noise: float = NOISE
+) -> tuple[Array, Array, Array, Array, NDArray[np.int64]]:
+    """Bearings, points, pose, and the point of each bearing (-1): points within a ball, 4 to 6 radii away."""
+    points = rng.uniform(-1, 1, (seen + hidden, 3))
+    rotation, translation = Rotation.random(random_state=rng.integers(2**31)).as_matrix(), rng.uniform(-1, 1, 3)
+    translation[2] += 5
+    rays = directions(points[:seen] @ rotation.T + translation) + noise * rng.standard_normal((seen, 3))
+    lights = directions(np.column_stack([rng.uniform(-0.4, 0.4, (background, 2)), np.ones(background)]))
+    order = rng.permutation(seen + background)
+    match = np.concatenate([np.arange(seen), np.full(background, -1)])[order]
+    return directions(np.concatenate([rays, lights]))[order], points, rotation, translation, match
+
+
+def degrees(one: Array, other: Array) -> float:
+    return math.degrees(Rotation.from_matrix(one @ other.T).magnitude())
+
+
+def compiled_p3p(rays: Array, points: Array) -> list[Array]:
+    """Poses (12,) of one triple."""
+    triples = np.array([[0, 1, 2]])
+    sides, frames, middles, usable = np.empty((1, 3)), np.empty((1, 3, 3)), np.empty((1, 3)), np.empty(1, np.bool_)
+    triangle_table(points, triples, sides, frames, middles, usable)
+    if not usable[0]:
+        return []
+    i, j, k = triples[0]
+    chords = [float(((rays[a] - rays[b]) ** 2).sum()) for a, b in ((i, j), (j, k), (k, i))]
+    depths, poses = np.empty((4, 3)), []
+    for s in range(p3p_depths(*chords, sides[0, 0], sides[0, 1], depths)):
+        pose = np.empty(12)
+        pose_of_triangle(rays, i, j, k, depths[s], sides[0, 2], frames[0], middles[0], np.empty((3, 3)), pose)
+        poses.append(pose)
+    return poses
+
+
+def test_compiled_p3p_has_the_poses_of_the_batched_one() -> None:
+    rng = np.random.default_rng(0)
+    rays, points = np.empty((2000, 3, 3)), rng.uniform(-1, 1, (2000, 3, 3))
+    for i in range(2000):
+        rotation = Rotation.random(random_state=i).as_matrix()
+        rays[i] = directions(points[i] @ rotation.T + [0.3, -0.2, 4])
+    batched = p3p(torch.tensor(rays), torch.tensor(points))
+    different = 0
+    for i in range(2000):
+        found = compiled_p3p(rays[i], points[i])
+        theirs = torch.cat([batched.rotation[i].flatten(1), batched.translation[i]], -1)[batched.valid[i]].numpy()
+        if len(found) != len(theirs):
+            different += 1
+            continue
+        for pose in found:
+            assert np.abs(theirs - pose).max(1).min() < 1e-6
+    assert different <= 2
+
+
+@pytest.mark.parametrize("points", [np.zeros((3, 3)), np.outer([0.0, 1, 3], [1.0, 2, 3]), np.eye(3)[[0, 1, 1]]])
+def test_flat_triangles_have_no_pose(points: Array) -> None:
+    assert compiled_p3p(directions(np.random.default_rng(0).normal(0, 0.2, (3, 3)) + [0, 0, 1]), points) == []
+
+
+def test_rays_that_no_pose_explains_have_none() -> None:
+    narrow = directions(np.array([[0.0, 0, 1], [1e-9, 0, 1], [0, 1, 0.2]]))
+    for pose in compiled_p3p(narrow, np.eye(3)):
+        assert np.isfinite(pose).all()
+
+
+@pytest.mark.parametrize(("seen", "hidden", "background"), [(4, 0, 0), (5, 0, 0), (6, 0, 3), (8, 6, 4), (12, 6, 5)])
+def test_planted_poses_are_found(seen: int, hidden: int, background: int) -> None:
+    found = 0
+    for seed in range(10):
+        rays, points, rotation, translation, match = planted(
+            np.random.default_rng(seed), seen, hidden=hidden, background=background
+        )
+        poses = enumerate_poses(rays, points, radius=RADIUS)
+        errors = [degrees(r, rotation) for r in poses.rotation]
+        assert min(errors) < 3
+        found += errors[0] < 3
+        if errors[0] < 3 and seen > 5:
+            assert np.linalg.norm(poses.translation[0] - translation) < 0.3
+            assert (poses.match[0] == match).mean() > 0.85
+    assert found >= (10 if seen > 5 else 4)  # four points and noise leave other poses as good
+
+
+def test_the_order_of_the_points_does_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    rays, points, _, _, _ = planted(rng, 8, hidden=4, background=3)
+    one = enumerate_poses(rays, points, radius=RADIUS)
+    rows, columns = rng.permutation(len(rays)), rng.permutation(len(points))
+    other = enumerate_poses(rays[rows], points[columns], radius=RADIUS)
+    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-6)
+    match = np.where(other.match[0] >= 0, columns[other.match[0]], -1)
+    np.testing.assert_array_equal(match, one.match[0][rows])
+
+
+def test_unit_and_origin_of_the_scene_do_not_matter() -> None:
+    rays, points, _, _, _ = planted(np.random.default_rng(4), 8, hidden=3, background=3)
+    one = enumerate_poses(rays, points, radius=RADIUS)
+    offset = np.array([300.0, -20, 7])
+    other = enumerate_poses(rays, 1000 * points + offset, radius=RADIUS)
+    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-6)
+    centre = 1000 * (-one.rotation[0].T @ one.translation[0]) + offset
+    np.testing.assert_allclose(-other.rotation[0].T @ other.translation[0], centre, atol=0.01)
+
+
+def test_turning_the_camera_turns_the_pose() -> None:
+    rays, points, _, _, _ = planted(np.random.default_rng(5), 8, background=2)
+    turn = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()
+    one, other = (enumerate_poses(f, points, radius=RADIUS) for f in (rays, rays @ turn.T))
+    np.testing.assert_allclose(other.rotation[0], turn @ one.rotation[0], atol=1e-6)
+    np.testing.assert_allclose(other.translation[0], turn @ one.translation[0], atol=1e-5)
+
+
+def brute_force(rays: Array, points: Array, radius: float) -> int:
+    """Most one-to-one matches of any pose that P3P gives for any three pairs."""
+    triples = list(itertools.product(itertools.combinations(range(len(rays)), 3), itertools.permutations(range(5), 3)))
+    rows, columns = (np.array(side) for side in zip(*triples, strict=True))
+    solution = p3p(torch.tensor(rays[rows]), torch.tensor(points[columns]))
+    rotation, translation = solution.rotation[solution.valid].numpy(), solution.translation[solution.valid].numpy()
+    seen = directions(points @ rotation.transpose(0, 2, 1) + translation[:, None])
+    near = np.linalg.norm(rays[:, None] - seen[:, None], axis=-1) < radius
+    return int(near.any(2).sum(1).max())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_small_problems_are_exhausted(seed: int) -> None:
+    """On exact points with one stray, the enumeration matches as many as trying everything does."""
+    rng = np.random.default_rng(seed)
+    rays, points, rotation, _, _ = planted(rng, 5, background=1, noise=0.0)
+    poses = enumerate_poses(rays, points, radius=RADIUS, is_safe=lambda _: False)
+    assert poses.exhausted
+    assert poses.matches_within(1e-6).max() == brute_force(rays, points, 1e-6) == 5
+    assert degrees(poses.rotation[poses.matches_within(1e-6).argmax()], rotation) < 1e-3
+
+
+def test_labels_allow_only_their_own() -> None:
+    rng = np.random.default_rng(7)
+    rays, points, rotation, _, match = planted(rng, 6, hidden=6, background=6)
+    labels3d = rng.integers(0, 4, len(points))
+    labels2d = np.where(match >= 0, labels3d[match], rng.integers(0, 4, len(rays)))
+    labels2d[0] = -1
+    poses = enumerate_poses(rays, points, radius=RADIUS, labels2d=labels2d, labels3d=labels3d)
+    assert degrees(poses.rotation[0], rotation) < 3
+    for chosen in poses.match:
+        pairs = (chosen >= 0) & (labels2d >= 0)
+        np.testing.assert_array_equal(labels2d[pairs], labels3d[chosen[pairs]])
+    assert poses.solved < enumerate_poses(rays, points, radius=RADIUS).solved
+    swapped = enumerate_poses(rays, points, radius=RADIUS, labels2d=np.full(len(rays), 9), labels3d=labels3d)
+    assert not len(swapped.evidence)
+
+
+def test_points_that_face_away_are_not_matched() -> None:
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        points = directions(rng.standard_normal((24, 3)))
+        rotation, translation = Rotation.random(random_state=rng.integers(2**31)).as_matrix(), np.array([0.1, 0, 5.0])
+        camera = points @ rotation.T + translation
+        facing = (camera * (points @ rotation.T)).sum(-1) < -0.2 * np.linalg.norm(camera, axis=-1)
+        rays = directions(camera[facing]) + NOISE * rng.standard_normal((facing.sum(), 3))
+        poses = enumerate_poses(directions(rays), points, radius=RADIUS, normals3d=points)
+        assert degrees(poses.rotation[0], rotation) < 3
+        for r, t, match in zip(poses.rotation, poses.translation, poses.match, strict=True):
+            seen = points[match[match >= 0]]
+            assert (((seen @ r.T + t) * (seen @ r.T)).sum(-1) < 0).all()
+        inside_out = enumerate_poses(directions(rays), points, radius=RADIUS, normals3d=-points)
+        assert all(degrees(r, rotation) > 3 for r in inside_out.rotation)
+
+
+def test_every_twin_of_a_symmetric_constellation_is_a_candidate() -> None:
+    """Four points with a quarter turn and one off their plane: four poses, and nothing sets one apart."""
+    angle = np.arange(4) * math.pi / 2
+    points = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1), [[0, 0, 0.6]]])
+    rotation, translation = Rotation.from_rotvec([0.4, -0.5, 0.2]).as_matrix(), np.array([0.2, 0.1, 5.0])
+    rays = directions(points @ rotation.T + translation)
+    poses = enumerate_poses(rays, points, radius=RADIUS)
+    quarter = Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix()
+    for turns in range(4):
+        twin = rotation @ np.linalg.matrix_power(quarter, turns)
+        assert min(degrees(r, twin) for r in poses.rotation) < 1
+    assert margin(poses) < 1
+
+
+def test_unrelated_points_have_no_margin() -> None:
+    rng = np.random.default_rng(9)
+    for m, n in ((6, 6), (10, 17), (20, 20)):
+        for _ in range(5):
+            rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (m, 2)), np.ones(m)]))
+            assert margin(enumerate_poses(rays, rng.standard_normal((n, 3)), radius=RADIUS)) < math.log(1000)
+
+
+def test_the_deadline_ends_the_enumeration() -> None:
+    rng = np.random.default_rng(10)
+    rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (40, 2)), np.ones(40)]))
+    poses = enumerate_poses(rays, rng.standard_normal((60, 3)), radius=RADIUS, deadline=time.monotonic())
+    assert not poses.exhausted
+    assert poses.solved < SETTINGS.most / 2
