@@ -35,8 +35,8 @@ from bpnp.compilation import compiler
 Array = NDArray[np.float64]
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 
-SHARES = np.array([0.1, 0.3, 0.5, 0.7, 0.9])  # w
-SCALE_STEP = 1.5  # from one s to the next
+SHARES = np.array([0.15, 0.4, 0.75])  # w
+SCALE_STEP = 2.0  # from one s to the next
 COARSEST = 0.5  # largest s, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
