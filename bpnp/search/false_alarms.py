@@ -16,7 +16,7 @@ bound b with a probability of at most 1 / b (Markov). From this follow
 T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2). The three largest
 x_i are left out, whatever their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number
 of image points within 2 s of point i: keypoints that lie together are one observation. The mean over a fixed set of
-(s, w) counts what was looked at. Where gravity is known, two pairs fix the pose; a prior reduces T to the share of the
+(s, w) counts what was looked at. A prior reduces T to the share of the
 poses that it allows.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; L. Moisan, B. Stival, A probabilistic
@@ -31,10 +31,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.compilation import compiler
+from bpnp.search.point_sets import Labels, PointSets, solid_angle
 
 Array = NDArray[np.float64]
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 
+FIXING = 3  # pairs that fix a pose
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 SCALE_STEP = 2.0  # from one s to the next
 COARSEST = 0.5  # largest s, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
@@ -47,42 +49,29 @@ MOST_POINTS = 2000  # image points that are looked at, evenly spread over the gi
 FLOOR = 2e-4  # smallest s in spreads of the bearings: some hundredths of a pixel of an ordinary camera
 
 
-def log10_false_alarms(
-    bearings: Array,
-    points3d: Array,
-    rotation: Array,
-    translation: Array,
-    *,
-    normals3d: Array | None = None,
-    labels2d: NDArray[np.int64] | None = None,
-    labels3d: NDArray[np.int64] | None = None,
-    floor: float | None = None,
-    fixing_pairs: int = 3,
-    log10_share: float = 0.0,
-) -> float:
+def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array) -> float:
     """log10 of the expected number of poses that fit unrelated points as well as (rotation, translation); see above.
 
-    bearings: (m, 3) unit vectors. points3d: (n, 3). normals3d: (n, 3) unit, outward: points that face away are not
-    seen. labels2d (m,), labels3d (n,): only points of one label are partners, -1 of any. floor: smallest scale of the
-    residuals, radians. fixing_pairs: pairs that fix a pose, 3, or 2 where gravity is known. log10_share: log10 of the
-    share of all poses that could have been tried, below 0 with a prior.
+    A pose under which three points or fewer are seen has the log10 of the number of tests: no evidence at all.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (12, 3))
     >>> seen = points + [0, 0, 6]
-    >>> rays = seen / np.linalg.norm(seen, axis=1, keepdims=True)
-    >>> log10_false_alarms(rays, points, np.eye(3), np.array([0.0, 0, 6])) < -10  # the true pose
+    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> log10_false_alarms(sets, np.eye(3), np.array([0.0, 0, 6])) < -10  # the true pose
     True
-    >>> log10_false_alarms(rays, points, np.eye(3), np.array([0.3, 0, 5])) > 0  # another one
+    >>> log10_false_alarms(sets, np.eye(3), np.array([0.3, 0, 5])) > 0  # another one
     True
     """
+    bearings, points3d = sets.bearings, sets.points3d
     m, n = len(bearings), len(points3d)
-    seen = _directions(points3d, rotation, translation, normals3d)
-    if m <= fixing_pairs or int(np.isfinite(seen[:, 0]).sum()) <= fixing_pairs:
-        return _log10_tests(m, n, fixing_pairs) + log10_share
+    tests = max(_log10_tests(sets) + sets.log10_share(rotation, translation), 0.0)
+    seen = _directions(points3d, rotation, translation, sets.normals3d)
+    if m <= FIXING or int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
+        return tests
     view = _View(bearings)
-    floor = max(floor or 0.0, FLOOR * view.spread)
+    floor = max(sets.floor or 0.0, FLOOR * view.spread)
     coarsest = max(COARSEST * math.sqrt(view.solid_angle / m), 2 * floor)
     steps = max(3, 1 + math.ceil(math.log(coarsest / floor) / math.log(SCALE_STEP)))
     scales = np.geomspace(floor, coarsest, steps)
@@ -90,7 +79,7 @@ def log10_false_alarms(
     crowd = cKDTree(bearings).query(bearings[chosen], min(m, MOST_NEIGHBOURS))[0].reshape(len(chosen), -1)
     together = (crowd[:, None] <= TOGETHER * scales[:, None]).sum(-1)
     logs = np.zeros((len(chosen), len(scales), len(SHARES)))
-    for rows, columns in _label_groups(chosen, labels2d, labels3d, n):
+    for rows, columns in _label_groups(chosen, sets.labels2d, sets.labels3d, n):
         used = seen[columns][np.isfinite(seen[columns, 0])]
         near2 = np.full((len(rows), 1), np.inf)
         if len(used):
@@ -99,16 +88,20 @@ def log10_false_alarms(
         part = np.empty((len(rows), *logs.shape[1:]))
         _log_ratios(near2, view.density(bearings[chosen[rows]], used), scales, SHARES, part)
         logs[rows] = part
-    fixing = np.partition(logs, len(chosen) - fixing_pairs, 0)[-fixing_pairs:]
+    fixing = np.partition(logs, len(chosen) - FIXING, 0)[-FIXING:]
     evidence = (logs / together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
     mean = float(np.logaddexp.reduce(evidence.ravel())) - math.log(evidence.size)
-    return _log10_tests(m, n, fixing_pairs) + log10_share - mean / math.log(10)
+    return tests - mean / math.log(10)
 
 
-def _log10_tests(m: int, n: int, pairs: int) -> float:
-    """log10 of 2 (m)_k (n)_k / k!: ordered choices of k pairs, with about two poses each."""
-    choices = [(m - i) * (n - i) / (i + 1) for i in range(pairs)]
-    return math.log10(2 * max(math.prod(max(choice, 1.0) for choice in choices), 1.0))
+def _log10_tests(sets: PointSets) -> float:
+    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three pairs with about two poses each; of labels that agree, if given."""
+    m, n = len(sets.bearings), len(sets.points3d)
+    choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(FIXING))
+    if sets.labels2d is not None and sets.labels3d is not None:
+        groups = _label_groups(np.arange(m), sets.labels2d, sets.labels3d, n)
+        choices = min(choices, float(math.comb(sum(len(rows) * len(columns) for rows, columns in groups), FIXING)))
+    return math.log10(2 * max(choices, 1.0))
 
 
 def _directions(points3d: Array, rotation: Array, translation: Array, normals3d: Array | None) -> Array:
@@ -130,7 +123,7 @@ class _View:
         self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
         variance, axes = np.linalg.eigh(centred.T @ centred / max(len(bearings) - 1, 1))
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
-        self.solid_angle = float(np.clip(4 * self.half_widths.prod(), 1e-24, 4 * math.pi))
+        self.solid_angle = solid_angle(bearings)
 
     def density(self, bearings: Array, directions: Array) -> Array:
         """Directions per steradian around each bearing, smoothed by OUTLINE spreads; at least their mean density."""
@@ -146,8 +139,8 @@ class _View:
 
 
 def _label_groups(
-    chosen: NDArray[np.int64], labels2d: NDArray[np.int64] | None, labels3d: NDArray[np.int64] | None, n: int
-) -> list[tuple[NDArray[np.int64], NDArray[np.int64]]]:
+    chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
+) -> list[tuple[Labels, Labels]]:
     """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
     if labels2d is None or labels3d is None:
         return [(np.arange(len(chosen)), np.arange(n))]

@@ -1,6 +1,7 @@
 """The evidence for a pose: what holds for unrelated points by law, and what a planted pose must show."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.false_alarms import log10_false_alarms
+from bpnp.search.point_sets import PointSets
+from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])
@@ -29,19 +32,21 @@ def scattered(rng: np.random.Generator, count: int, width: float) -> Array:
     return rays_of(np.column_stack([rng.uniform(-width, width, (count, 2)), np.ones(count)]))
 
 
+def evidence(rays: Array, points: Array, rotation: Array, floor: float | None = 2e-4, **known: Any) -> float:
+    return log10_false_alarms(PointSets(rays, points, floor=floor, **known), rotation, SHIFT)
+
+
 @pytest.mark.parametrize(("count", "least"), [(7, -3), (12, -10), (100, -150)])
 def test_a_planted_pose_is_no_coincidence(count: int, least: float) -> None:
     rng = np.random.default_rng(count)
     for _ in range(10):
-        rays, points, rotation = planted(rng, count)
-        assert log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4) < least
+        assert evidence(*planted(rng, count)) < least
 
 
 def test_four_points_prove_nothing() -> None:
     """Three of them fix the pose, and there are 2 * 24 * 24 / 6 ways to choose these: one more is to be expected."""
     rng = np.random.default_rng(0)
-    values = [log10_false_alarms(*planted(rng, 4, 2e-3), SHIFT, floor=1e-3) for _ in range(20)]
-    assert min(values) > -1
+    assert min(evidence(*planted(rng, 4, 2e-3), 1e-3) for _ in range(20)) > -1
 
 
 @pytest.mark.parametrize("count", [5, 20, 200])
@@ -53,8 +58,8 @@ def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
     for _ in range(400):
         seen = scattered(rng, count, 0.4) * rng.uniform(4, 8, (count, 1))
         turn = Rotation.random(random_state=rng).as_matrix()
-        product = log10_tests - log10_false_alarms(scattered(rng, count, 0.25), seen @ turn, turn, np.zeros(3))
-        products.append(product)
+        sets = PointSets(scattered(rng, count, 0.25), seen @ turn)
+        products.append(log10_tests - log10_false_alarms(sets, turn, np.zeros(3)))
     for bound in (0.5, 1, 2):
         assert np.mean(np.array(products) > bound) <= 10**-bound
 
@@ -63,41 +68,42 @@ def test_it_does_not_depend_on_the_frame_or_unit_of_the_scene() -> None:
     rng = np.random.default_rng(1)
     rays, points, rotation = planted(rng, 30)
     turn, shift, scale = Rotation.random(random_state=rng).as_matrix(), np.array([5.0, -3, 2]), 40.0
-    moved = scale * (points @ turn.T + shift)
-    other = rotation @ turn.T
-    value = log10_false_alarms(rays, moved, other, scale * (SHIFT - other @ shift))
-    assert value == pytest.approx(log10_false_alarms(rays, points, rotation, SHIFT), abs=1e-6)
+    sets, other = PointSets(rays, scale * (points @ turn.T + shift)), rotation @ turn.T
+    value = log10_false_alarms(sets, other, scale * (SHIFT - other @ shift))
+    assert value == pytest.approx(evidence(rays, points, rotation, None), abs=1e-6)
 
 
 def test_keypoints_in_one_place_are_one_observation() -> None:
-    rng = np.random.default_rng(2)
-    rays, points, rotation = planted(rng, 10)
-    once = log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4)
-    copies = log10_false_alarms(np.tile(rays, (5, 1)), points, rotation, SHIFT, floor=2e-4)
-    assert copies > once - 1
+    rays, points, rotation = planted(np.random.default_rng(2), 10)
+    assert evidence(np.tile(rays, (5, 1)), points, rotation) > evidence(rays, points, rotation) - 1
 
 
 def test_labels_and_normals_exclude_partners() -> None:
-    rng = np.random.default_rng(3)
-    rays, points, rotation = planted(rng, 12)
-    free = log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4)
-    own = np.arange(12) % 3
-    right = log10_false_alarms(rays, points, rotation, SHIFT, labels2d=own, labels3d=own, floor=2e-4)
-    wrong = log10_false_alarms(rays, points, rotation, SHIFT, labels2d=own, labels3d=(own + 1) % 3, floor=2e-4)
-    assert right < free < 0 < wrong
-    anything = np.full(12, -1)
-    same = log10_false_alarms(rays, points, rotation, SHIFT, labels2d=anything, labels3d=own, floor=2e-4)
-    assert same == pytest.approx(free)
+    rays, points, rotation = planted(np.random.default_rng(3), 12)
+    free, own = evidence(rays, points, rotation), np.arange(12) % 3
+    assert evidence(rays, points, rotation, labels2d=own, labels3d=own) < free < 0
+    assert evidence(rays, points, rotation, labels2d=own, labels3d=(own + 1) % 3) > 0
+    anything = evidence(rays, points, rotation, labels2d=np.full(12, -1), labels3d=own)
+    assert anything == pytest.approx(free)
     away = rays_of(points @ rotation.T + SHIFT) @ rotation
-    facing = log10_false_alarms(rays, points, rotation, SHIFT, normals3d=-away, floor=2e-4)
-    assert facing == pytest.approx(free)
-    assert log10_false_alarms(rays, points, rotation, SHIFT, normals3d=away, floor=2e-4) > 0
+    assert evidence(rays, points, rotation, normals3d=-away) == pytest.approx(free)
+    assert evidence(rays, points, rotation, normals3d=away) > 0
 
 
-def test_less_that_is_tried_leaves_less_to_chance() -> None:
-    rng = np.random.default_rng(4)
-    rays, points, rotation = planted(rng, 6)
-    free = log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4)
-    assert log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4, log10_share=-2.0) == pytest.approx(free - 2)
-    assert log10_false_alarms(rays, points, rotation, SHIFT, floor=2e-4, fixing_pairs=2) < free - 1
-    assert log10_false_alarms(rays, points, rotation, SHIFT, floor=5e-3) > free + 1
+def test_a_prior_leaves_less_to_chance_where_the_pose_agrees_with_it() -> None:
+    rays, points, rotation = planted(np.random.default_rng(4), 6)
+    free, up = evidence(rays, points, rotation), np.array([0.0, 0, 1])
+    right = GravityPrior(rotation @ up, up, sigma_deg=2.0)
+    # All directions within 4 degrees of one are (1 - cos 4 deg) / 2 of the sphere.
+    assert evidence(rays, points, rotation, prior=right) == pytest.approx(free - 2.914, abs=1e-3)
+    wrong = GravityPrior(-rotation @ up, up, sigma_deg=2.0)
+    assert evidence(rays, points, rotation, prior=wrong) == pytest.approx(free)
+    near = PosePrior(rotation, SHIFT, 1.0, 0.06)
+    assert evidence(rays, points, rotation, prior=near) < free - 3.5  # one test is left of 4,800
+    far = PosePrior(rotation, SHIFT, 180.0, 1e6)
+    assert evidence(rays, points, rotation, prior=far) == pytest.approx(free)
+
+
+def test_residuals_below_the_floor_count_as_the_floor() -> None:
+    rays, points, rotation = planted(np.random.default_rng(5), 6, 0.0)
+    assert evidence(rays, points, rotation, 5e-3) > evidence(rays, points, rotation, 1e-4) + 3

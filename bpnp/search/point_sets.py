@@ -1,0 +1,80 @@
+"""What is known of one pair before it is solved: the two point sets, and how much of all poses a prior leaves."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.starts import GravityPrior, Prior
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
+LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
+
+
+@dataclass(frozen=True, eq=False)
+class PointSets:
+    """One pair.
+
+    bearings: (m, 3) unit vectors. points3d: (n, 3). normals3d: (n, 3) outward unit normals; a point that faces away is
+    not seen. labels2d (m,), labels3d (n,): only points of one label can be partners, -1 fits any.
+    floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
+    prior: what is known of the pose.
+    """
+
+    bearings: Array
+    points3d: Array
+    normals3d: Array | None = None
+    labels2d: Labels | None = None
+    labels3d: Labels | None = None
+    floor: float | None = None
+    prior: Prior | None = None
+
+    def log10_share(self, rotation: Array, translation: Array) -> float:
+        """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
+
+        Of poses that fit pairs of these points: their rotations fill SO(3) evenly, the directions to the middle of the
+        scene fill the view, and the logarithms of its distance a factor of 30.
+        """
+        if self.prior is None:
+            return 0.0
+        if isinstance(self.prior, GravityPrior):
+            up = rotation @ (np.asarray(self.prior.up_scene) / np.linalg.norm(self.prior.up_scene))
+            off = _angle(up, np.asarray(self.prior.up_camera))
+            return math.log10(_cap(max(off, math.radians(SIGMAS * self.prior.sigma_deg))))
+        known = np.asarray(self.prior.rotation, np.float64)
+        cosine = (float((rotation * known).sum()) - 1) / 2
+        off = max(math.acos(min(max(cosine, -1.0), 1.0)), math.radians(SIGMAS * self.prior.rotation_sigma_deg))
+        share = _ball(off)
+        if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
+            middle = np.median(self.points3d, 0)
+            expected = known @ middle + np.asarray(self.prior.translation)
+            distance = max(float(np.linalg.norm(expected)), 1e-12)
+            shift = float(np.linalg.norm(rotation @ middle + translation - expected))
+            relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
+            share *= min(1.0, math.pi * relative**2 / solid_angle(self.bearings)) * min(1.0, 2 * relative / LOG_DEPTHS)
+        return math.log10(share)
+
+
+def solid_angle(bearings: Array) -> float:
+    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most."""
+    centred = bearings - bearings.mean(0)
+    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - 1, 1))[1:]
+    return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
+
+
+def _angle(a: Array, b: Array) -> float:
+    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
+
+
+def _cap(angle: float) -> float:
+    """Share of all directions within an angle, radians."""
+    return max((1 - math.cos(min(angle, math.pi))) / 2, 1e-12)
+
+
+def _ball(angle: float) -> float:
+    """Share of all rotations within an angle, radians."""
+    angle = min(angle, math.pi)
+    return max((angle - math.sin(angle)) / math.pi, 1e-15)
