@@ -20,8 +20,7 @@ from bpnp.models.baselines.branch_and_bound.gopac import maximise_inliers
 from bpnp.models.baselines.branch_and_bound.gosma import align_mixtures, polish
 from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, log_z, lower_bound, overlap, squared_norm
 from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
-from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_near
-from bpnp.models.baselines.single_pairs import Clock
+from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
 
 
 def normal(*shape: int) -> Tensor:
@@ -184,7 +183,7 @@ def test_no_rotation_of_a_box_has_more_inliers_than_its_bound() -> None:
     for directions in torch.nn.functional.normalize(points, dim=-1):
         rays, reach = torch.nn.functional.normalize(normal(10, 3), dim=-1), 0.05 + 0.2 * uniform(12)
         domain = whole(normal(3), 0.4, torch.zeros(3).double(), 0.0)
-        found = best_rotation(rays, directions, reach, domain, floor=0, clock=Clock(None), smallest=0.02)
+        found = best_rotation(rays, directions, reach, domain, floor=0, smallest=0.02)
         turns = domain.turn + 0.4 * (2 * uniform(400, 3) - 1)
         cosine = (rays @ roma.rotvec_to_rotmat(turns)) @ directions.mT
         counts = (cosine >= reach.cos()).any(-1).sum(-1)
@@ -204,7 +203,7 @@ def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms
     assert found.rotation is not None
     assert found.inliers == found.bound
     assert found.inliers >= 7
-    assert count_near(rays, points, found.rotation, found.place, 0.01) == found.inliers
+    assert count_inliers(rays, points, found.rotation, found.place, 0.01) == found.inliers
     steps = torch.linspace(-1, 1, 7).double()
     grid = torch.cartesian_prod(steps, steps, steps)
     most = 0

@@ -17,8 +17,7 @@ from bpnp.models.baselines.agreement import agreement
 from bpnp.models.baselines.hungarian import hungarian
 from bpnp.models.baselines.random_ransac import probability_of_true_triple
 from bpnp.models.baselines.single_pairs import PairSolver
-from bpnp.models.baselines.softposit.algorithm import softposit
-from bpnp.models.baselines.softposit.slack_assignment import slack_scalings
+from bpnp.models.baselines.softposit.algorithm import slack_scalings, softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 
 QUICK: dict[str, PairSolver] = {
@@ -149,13 +148,13 @@ def test_blind_ransac_stops_when_it_is_sure_and_converges() -> None:
 
 def test_agreement_counts_as_a_loop_would() -> None:
     problem = plant(2, 15, seed=7, outliers2d=4, outliers3d=6)
-    near = agreement(problem.points2d[0], problem.points3d[0], problem.rotation, problem.translation, threshold=0.02)
+    counts = agreement(problem.points2d[0], problem.points3d[0], problem.rotation, problem.translation, threshold=0.02)
     for i in range(2):
         camera = problem.points3d[0] @ problem.rotation[i].T + problem.translation[i]
         close = torch.cdist(problem.points2d[0], camera[:, :2] / camera[:, 2:]) < 0.02
-        assert int(near.near2d[i]) == int(close.any(1).sum())
-        assert int(near.near3d[i]) == int(close.any(0).sum())
-    assert int(near.pairs[0]) >= 15
+        assert int(counts.partnered2d[i]) == int(close.any(1).sum())
+        assert int(counts.partnered3d[i]) == int(close.any(0).sum())
+    assert int(counts.pairs[0]) >= 15
 
 
 def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:

@@ -1,4 +1,4 @@
-"""How well a pose without known matches explains both point sets."""
+"""How many points of both sides have a partner under a pose, where no matches are known."""
 
 from typing import NamedTuple
 
@@ -8,17 +8,23 @@ from torch import Tensor
 
 from bpnp.geometry import project, transform
 
+CHUNK = 2**22  # distances computed at a time, in float32
+
 
 class Agreement(NamedTuple):
     """Points of each side with a point of the other within the threshold in the image, per pose."""
 
-    near2d: Int[Tensor, " h"]
-    near3d: Int[Tensor, " h"]
+    partnered2d: Int[Tensor, " h"]
+    partnered3d: Int[Tensor, " h"]
+
+    @property
+    def points(self) -> Int[Tensor, " h"]:
+        return self.partnered2d + self.partnered3d
 
     @property
     def pairs(self) -> Int[Tensor, " h"]:
-        """A bound on the one-to-one matches within the threshold."""
-        return torch.minimum(self.near2d, self.near3d)
+        """Upper bound on the number of one-to-one matches within the threshold."""
+        return torch.minimum(self.partnered2d, self.partnered3d)
 
 
 def agreement(
@@ -28,14 +34,12 @@ def agreement(
     translation: Float[Tensor, "h 3"],
     *,
     threshold: float,
-    cells: int = 2**22,
 ) -> Agreement:
-    """Count the points with a partner nearer than `threshold` (normalised image units), for every pose.
+    """Count the points with a partner closer than `threshold` (normalised image units), for every pose.
 
-    A 3D point behind the camera has none; nor has anything under a pose that is NaN. `cells` bounds the number of
-    distances computed at a time, in float32.
+    A 3D point behind the camera has none, and no point has one under a pose that is NaN.
     """
-    part = max(1, cells // (len(points2d) * len(points3d)))
+    part = max(1, CHUNK // (len(points2d) * len(points3d)))
     counts2d, counts3d = [], []
     for turned, shift in zip(rotation.split(part), translation.split(part), strict=True):
         camera = transform(turned, shift, points3d.expand(len(turned), -1, -1))

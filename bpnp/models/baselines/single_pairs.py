@@ -24,27 +24,6 @@ class SinglePair:
     translation: Float[Tensor, "3"] | None = None
 
 
-@dataclass(frozen=True)
-class Found:
-    """A pose camera = R p + t with the numbers of its `SolveStats`; NaN for no pose."""
-
-    rotation: Float[Tensor, "3 3"]
-    translation: Float[Tensor, "3"]
-    iterations: int
-    residual: float
-    converged: bool
-
-
-class Clock:
-    """A limit of time; None for none, so that nothing depends on the machine's speed."""
-
-    def __init__(self, seconds: float | None) -> None:
-        self.end = math.inf if seconds is None else time.monotonic() + seconds
-
-    def over(self) -> bool:
-        return time.monotonic() >= self.end
-
-
 class PairSolver(nn.Module):
     """A solver of single pairs: subclasses implement `solve` and name their one estimate.
 
@@ -65,44 +44,54 @@ class PairSolver(nn.Module):
             found = [self._solve(pair) for pair in _pairs(batch)]
             return Prediction(poses={self.estimates[0]: _collect(found, batch)})
 
-    def solve(self, pair: SinglePair, clock: Clock) -> Found:
+    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+        """The pose of one pair, a batch of one, found before `deadline` on the clock of `time.monotonic`."""
         raise NotImplementedError
 
-    def _solve(self, pair: SinglePair) -> Found:
+    def _solve(self, pair: SinglePair) -> Pose:
         if min(len(pair.points2d), len(pair.points3d)) < MIN_POINTS:
             return no_pose(pair.points3d)
-        return self.solve(pair, Clock(self.time_limit))
+        return self.solve(pair, math.inf if self.time_limit is None else time.monotonic() + self.time_limit)
 
 
-def no_pose(like: Tensor, iterations: int = 0) -> Found:
-    return Found(like.new_full((3, 3), math.nan), like.new_full((3,), math.nan), iterations, math.inf, False)
+def one_pose(
+    rotation: Float[Tensor, "3 3"],
+    translation: Float[Tensor, "3"],
+    iterations: int,
+    residual: float,
+    converged: bool,
+) -> Pose:
+    """A batch of one pose."""
+    stats = SolveStats(torch.tensor([iterations]), rotation.new_tensor([residual]), torch.tensor([converged]))
+    return Pose(rotation.unsqueeze(0), translation.unsqueeze(0), stats.to(rotation.device))
 
 
-def generator_for(seed: int, index: int) -> torch.Generator:
-    """Random numbers of one pair, whatever batch it is in."""
+def no_pose(like: Tensor, iterations: int = 0) -> Pose:
+    return one_pose(like.new_full((3, 3), math.nan), like.new_full((3,), math.nan), iterations, math.inf, False)
+
+
+def over(deadline: float) -> bool:
+    return time.monotonic() >= deadline
+
+
+def pair_seed(seed: int, index: int) -> int:
+    """Seed of one pair's random numbers, whatever batch it is in."""
     mixed = torch.Generator().manual_seed(seed)
-    first = int(torch.randint(2**31, (1,), generator=mixed))
-    return torch.Generator().manual_seed(first * 1_000_003 + index)
+    return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + index
 
 
 def _pairs(batch: Batch) -> Iterator[SinglePair]:
     for i, index in enumerate(batch.index.tolist()):
-        yield SinglePair(
-            batch.points2d[i][batch.mask2d[i]].double().clone(),
-            batch.points3d[i][batch.mask3d[i]].double().clone(),
-            index,
-            None if batch.rotation is None else batch.rotation[i].double().clone(),
-            None if batch.translation is None else batch.translation[i].double().clone(),
-        )
+        pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
+        points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
+        yield SinglePair(points2d.double().clone(), points3d.double().clone(), index, *pose)
 
 
-def _collect(found: list[Found], batch: Batch) -> Pose:
-    device = batch.points3d.device
-    stats = SolveStats(
-        torch.tensor([each.iterations for each in found], device=device),
-        torch.tensor([each.residual for each in found], dtype=batch.points3d.dtype, device=device),
-        torch.tensor([each.converged for each in found], device=device),
+def _collect(found: list[Pose], batch: Batch) -> Pose:
+    stats = zip(*((pose.stats.iterations, pose.stats.residual, pose.stats.converged) for pose in found), strict=True)
+    pose = Pose(
+        torch.cat([pose.rotation for pose in found]),
+        torch.cat([pose.translation for pose in found]),
+        SolveStats(*(torch.cat(values) for values in stats)),
     )
-    rotation = torch.stack([each.rotation for each in found]).to(batch.points3d)
-    translation = torch.stack([each.translation for each in found]).to(batch.points3d)
-    return Pose(rotation, translation, stats)
+    return pose.to(batch.points3d)

@@ -29,6 +29,33 @@ class Boxes(NamedTuple):
         return Boxes(*(values[index] for values in self))
 
 
+def whole_domain(like: Tensor, half: float) -> Boxes:
+    """All rotations, and the camera centres within `half` of the origin along each axis."""
+    zero = like.new_zeros(1, 3)
+    return Boxes(zero, like.new_full((1,), math.pi), zero, like.new_full((1, 3), half))
+
+
+def unit_scene(points3d: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "3"], float]:
+    """The points centred and of root mean square radius 1, with the centre and the radius."""
+    centre = points3d.mean(0)
+    radius = root_mean_square((points3d - centre).norm(dim=-1))
+    return (points3d - centre) / radius, centre, radius
+
+
+def root_mean_square(distances: Float[Tensor, " k"]) -> float:
+    """Root mean square; 1 where it is zero."""
+    value = float(distances.square().mean().sqrt())
+    return value if value > 0 and math.isfinite(value) else 1.0
+
+
+def take_best(boxes: Boxes, order: Float[Tensor, " b"], count: int) -> tuple[Boxes, Boxes, Bool[Tensor, " b"]]:
+    """The `count` boxes of highest `order`, the rest, and which boxes these are."""
+    rest = torch.ones_like(order, dtype=torch.bool)
+    chosen = order.topk(min(count, len(order))).indices
+    rest[chosen] = False
+    return boxes.pick(chosen), boxes.pick(rest), rest
+
+
 def join(parts: list[Boxes]) -> Boxes:
     return Boxes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 

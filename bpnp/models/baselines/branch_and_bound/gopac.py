@@ -9,14 +9,20 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bpnp.checks import check_positive
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
-from bpnp.models.baselines.branch_and_bound.boxes import Boxes, split, translation_uncertainty
-from bpnp.models.baselines.branch_and_bound.gosma import whole_domain
-from bpnp.models.baselines.branch_and_bound.mixtures import spread
-from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_near
-from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair, no_pose
-from bpnp.models.baselines.starts import weak_perspective_distance
+from bpnp.models.baselines.branch_and_bound.boxes import (
+    Boxes,
+    split,
+    translation_uncertainty,
+    unit_scene,
+    whole_domain,
+)  # fmt: skip
+from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
+from bpnp.models.baselines.initial_poses import weak_perspective_distance
+from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
+from bpnp.types import Pose
 
 
 class MostInliers(NamedTuple):
@@ -38,7 +44,7 @@ def maximise_inliers(
     smallest_turn: float = 1e-3,
     smallest_place: float = 1e-3,
     max_boxes: int | None = None,
-    clock: Clock | None = None,
+    deadline: float = math.inf,
 ) -> MostInliers:
     """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
 
@@ -47,13 +53,12 @@ def maximise_inliers(
     for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
     `smallest_place` are not split: where one might hold more than the best pose, the bound stays above the count.
     """
-    clock = clock or Clock(None)
     rotation, place, count, done = None, domain.place[0], 0, 1
     order = itertools.count()
     queue = [(-len(rays), next(order), domain)]
     unresolved = 0
     while queue and -queue[0][0] > count:
-        if clock.over() or (max_boxes is not None and done >= max_boxes):
+        if over(deadline) or (max_boxes is not None and done >= max_boxes):
             break
         _, _, box = heapq.heappop(queue)
         children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
@@ -62,7 +67,7 @@ def maximise_inliers(
             child = children.pick(torch.tensor([k], device=points.device))
             directions = torch.nn.functional.normalize(points - child.place[0], dim=-1)
             reach = torch.full_like(points[:, 0], angle)
-            searching = {"domain": _turns(domain), "smallest": smallest_turn, "clock": clock}
+            searching = {"domain": _turns(domain), "smallest": smallest_turn, "deadline": deadline}
             here = best_rotation(rays, directions, reach, floor=count, **searching)  # type: ignore[arg-type]
             if here.rotation is not None:
                 rotation, place, count = _refined(rays, points, here.rotation, child.place[0], angle)
@@ -84,17 +89,17 @@ def _turns(domain: Boxes) -> Boxes:
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
     """The pose, or what the weighted PnP layer makes of its inliers if it has as many."""
-    count = count_near(rays, points, rotation, place, angle)
+    count = count_inliers(rays, points, rotation, place, angle)
     directions = torch.nn.functional.normalize(points - place, dim=-1)
-    near = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
-    weights = (near / near.sum().clamp_min(1)).unsqueeze(0)
+    inlier = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
+    weights = (inlier / inlier.sum().clamp_min(1)).unsqueeze(0)
     translation = -rotation @ place
     turned, shift, stats = weighted_pnp(
         weights, rays.unsqueeze(0), points.unsqueeze(0), rotation.unsqueeze(0), translation.unsqueeze(0)
     )
     if bool(stats.converged[0]):
         moved = -turned[0].mT @ shift[0]
-        if (refined := count_near(rays, points, turned[0], moved, angle)) >= count:
+        if (refined := count_inliers(rays, points, turned[0], moved, angle)) >= count:
             return turned[0], moved, refined
     return rotation, place, count
 
@@ -127,27 +132,17 @@ class GOPAC(PairSolver):
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
-        if not (angle > 0 and domain > 0):
-            raise ValueError(f"expected `angle` > 0 and `domain` > 0, got {angle} and {domain}")
+        check_positive(angle=angle, domain=domain)
         self.angle, self.domain, self.max_boxes = angle, domain, max_boxes
         self.smallest = {"smallest_turn": smallest_turn, "smallest_place": smallest_place}
 
-    def solve(self, pair: SinglePair, clock: Clock) -> Found:
-        centre = pair.points3d.mean(0)
-        radius = spread((pair.points3d - centre).norm(dim=-1))
-        points = (pair.points3d - centre) / radius
-        half = self.domain * weak_perspective_distance(pair.points2d, points)
-        found = maximise_inliers(
-            bearings(pair.points2d),
-            points,
-            whole_domain(points, half),
-            angle=self.angle,
-            max_boxes=self.max_boxes,
-            clock=clock,
-            **self.smallest,
-        )
+    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+        points, centre, radius = unit_scene(pair.points3d)
+        domain = whole_domain(points, self.domain * weak_perspective_distance(pair.points2d, points))
+        options = {"angle": self.angle, "max_boxes": self.max_boxes, "deadline": deadline, **self.smallest}
+        found = maximise_inliers(bearings(pair.points2d), points, domain, **options)  # type: ignore[arg-type]
         if found.rotation is None:
             return no_pose(points, found.boxes)
         translation = -found.rotation @ (radius * found.place + centre)
         residual = 1 - found.inliers / len(pair.points2d)
-        return Found(found.rotation, translation, found.boxes, residual, found.inliers >= found.bound)
+        return one_pose(found.rotation, translation, found.boxes, residual, found.inliers >= found.bound)

@@ -8,22 +8,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bpnp.geometry import bearings
+from bpnp.checks import check_positive
+from bpnp.geometry import bearings, retract
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
     distance_range,
     join,
+    root_mean_square,
     rotation_uncertainty,
     split,
+    take_best,
     translation_uncertainty,
-)
+    unit_scene,
+    whole_domain,
+)  # fmt: skip
 from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, lower_bound, squared_norm
-from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture, spread
-from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair
-from bpnp.models.baselines.starts import weak_perspective_distance
+from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
+from bpnp.models.baselines.initial_poses import weak_perspective_distance
+from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, one_pose, over
+from bpnp.types import Pose
 
 POLISH_STEPS = 50
-DESCENTS = 32  # centres of a round that descend
+DESCENTS = 32  # best box centres of an iteration, from which Adam descends
 DESCENT_STEPS = 30
 
 
@@ -48,14 +54,14 @@ def align_mixtures(
     closest: float = 0.0,
     batch: int = 512,
     max_boxes: int | None = None,
-    clock: Clock | None = None,
+    deadline: float = math.inf,
 ) -> Aligned:
     """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
     squared norm.
 
     Best first: the `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the
-    less certain; of every round the best centres descend, and a better pose is polished by L-BFGS. Ends with the
-    certificate, or with the best pose so far after about `max_boxes` boxes or at the clock's limit.
+    less certain; Adam descends from the best centres, and L-BFGS polishes a better pose. Ends with the certificate, or
+    with the best pose so far after about `max_boxes` boxes or at the deadline.
     """
     norm = float(squared_norm(rays))
     pending, bounds = domain, lower_bound(scene, rays, domain)
@@ -63,21 +69,18 @@ def align_mixtures(
     assert place is not None
     done = len(bounds)
     while len(bounds) and float(bounds.min()) < best - gap * norm:
-        if (clock is not None and clock.over()) or (max_boxes is not None and done >= max_boxes):
+        if over(deadline) or (max_boxes is not None and done >= max_boxes):
             break
-        chosen = bounds.topk(min(batch, len(bounds)), largest=False).indices
-        rest = torch.ones_like(bounds, dtype=torch.bool)
-        rest[chosen] = False
-        parents = pending.pick(chosen)
+        parents, others, rest = take_best(pending, -bounds, batch)
         moving = translation_uncertainty(parents, scene.means).amax(-1)
         children = split(parents, rotation_uncertainty(parents) >= moving)
         _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
         children = children.pick(farthest.squeeze(-1) >= closest)
-        children_bounds = torch.maximum(lower_bound(scene, rays, children), bounds[chosen].min())
+        children_bounds = torch.maximum(lower_bound(scene, rays, children), bounds.min())
         done += len(children_bounds)
         allowed = children.pick(children.place.norm(dim=-1) >= closest)
         best, rotation, place = _best_centre(scene, rays, allowed, best, (rotation, place))
-        pending, bounds = join([pending.pick(rest), children]), torch.cat([bounds[rest], children_bounds])
+        pending, bounds = join([others, children]), torch.cat([bounds[rest], children_bounds])
         promising = bounds < best - gap * norm
         # What is left out cannot beat the best by more than the gap.
         pending, bounds = pending.pick(promising), bounds[promising]
@@ -110,52 +113,44 @@ def descend(
     scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "b 3 3"], place: Float[Tensor, "b 3"]
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
     """Adam's steps from several poses, each for itself, from a tenth of a radian down to a thousandth."""
-    reach = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    unit = _unit(scene, place)
     step = torch.zeros(len(place), 6, dtype=place.dtype, device=place.device, requires_grad=True)
     optimiser = torch.optim.Adam([step], lr=0.1)
     schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.01 ** (1 / DESCENT_STEPS))
     with torch.enable_grad():
         for _ in range(DESCENT_STEPS):
             optimiser.zero_grad()
-            turned = roma.rotvec_to_rotmat(step[:, :3]) @ rotation
-            distance(scene, rays, turned, place + reach * step[:, 3:]).sum().backward()
+            distance(scene, rays, *retract(unit * step, rotation, place)).sum().backward()
             optimiser.step()
             schedule.step()
-    found = step.detach()
-    return roma.rotvec_to_rotmat(found[:, :3]) @ rotation, place + reach * found[:, 3:]
+    return retract(unit * step.detach(), rotation, place)
 
 
 def polish(
     scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "3 3"], place: Float[Tensor, "3"]
 ) -> tuple[float, Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """L-BFGS from one pose, and the lower of the two ends."""
-    reach = torch.linalg.vector_norm(scene.means - place, dim=-1).mean()  # so that a step moves and turns alike
-    step = torch.zeros(6, dtype=place.dtype, device=place.device, requires_grad=True)
+    """L-BFGS from one pose; the pose given where it ends no lower."""
+    start, unit = (rotation.unsqueeze(0), place.unsqueeze(0)), _unit(scene, place.unsqueeze(0))
+    step = torch.zeros(1, 6, dtype=place.dtype, device=place.device, requires_grad=True)
     optimiser = torch.optim.LBFGS([step], max_iter=POLISH_STEPS, line_search_fn="strong_wolfe")
-
-    def moved() -> tuple[Tensor, Tensor]:
-        return roma.rotvec_to_rotmat(step[:3]) @ rotation, place + reach * step[3:]
-
-    def value() -> Tensor:
-        turned, shifted = moved()
-        return distance(scene, rays, turned.unsqueeze(0), shifted.unsqueeze(0)).squeeze(0)
 
     def closure() -> Tensor:
         optimiser.zero_grad()
-        loss = value()
+        loss = distance(scene, rays, *retract(unit * step, *start)).squeeze(0)
         loss.backward()
         return loss
 
-    with torch.no_grad():
-        start = float(value())
     with torch.enable_grad():
         optimiser.step(closure)
-    with torch.no_grad():
-        end = float(value())
-        if not end < start:
-            return start, rotation, place
-        turned, shifted = moved()
-        return end, roma.special_procrustes(turned), shifted
+    turned, moved = retract(unit * step.detach(), *start)
+    end, before = float(distance(scene, rays, turned, moved)), float(distance(scene, rays, *start))
+    return (end, roma.special_procrustes(turned[0]), moved[0]) if end < before else (before, rotation, place)
+
+
+def _unit(scene: SceneMixture, place: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6"]:
+    """Units of a step: radians, and the mean distance to the scene's clusters, so that both move the image alike."""
+    away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    return torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
 
 
 class GOSMA(PairSolver):
@@ -167,8 +162,8 @@ class GOSMA(PairSolver):
     need not be that of the points.
 
     Args:
-        spread2d: reach of an image cluster, in root mean square angles of the rays to their mean.
-        spread3d: reach of a scene cluster, in root mean square distances of the points to their mean.
+        cluster2d: largest angle from an image cluster's mean, in root mean square angles of all rays to theirs.
+        cluster3d: largest distance from a scene cluster's mean, in root mean square distances of all points to theirs.
         domain: half side of the cube of camera centres, in weak-perspective distances.
         closest: least distance of the camera centre from the scene's, in weak-perspective distances; 0 for cameras
             among the points.
@@ -183,8 +178,8 @@ class GOSMA(PairSolver):
     def __init__(
         self,
         *,
-        spread2d: float = 0.8,
-        spread3d: float = 0.8,
+        cluster2d: float = 0.8,
+        cluster3d: float = 0.8,
         domain: float = 1.5,
         closest: float = 0.5,
         gap: float = 0.1,
@@ -193,34 +188,20 @@ class GOSMA(PairSolver):
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
-        for name, value in {"spread2d": spread2d, "spread3d": spread3d, "domain": domain, "gap": gap}.items():
-            if not value > 0:
-                raise ValueError(f"expected `{name}` > 0, got {value}")
-        self.spread2d, self.spread3d, self.domain = spread2d, spread3d, domain
+        check_positive(cluster2d=cluster2d, cluster3d=cluster3d, domain=domain, gap=gap)
+        self.cluster2d, self.cluster3d, self.domain = cluster2d, cluster3d, domain
         self.closest, self.gap, self.batch, self.max_boxes = closest, gap, batch, max_boxes
 
-    def solve(self, pair: SinglePair, clock: Clock) -> Found:
-        rays, centre = bearings(pair.points2d), pair.points3d.mean(0)
+    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+        rays = bearings(pair.points2d)
         mean_ray = torch.nn.functional.normalize(rays.sum(0), dim=0)
-        angle = spread(torch.acos((rays @ mean_ray).clamp(-1, 1)))
-        radius = spread((pair.points3d - centre).norm(dim=-1))
-        points = (pair.points3d - centre) / radius
-        distance_away = weak_perspective_distance(pair.points2d, points)
-        aligned = align_mixtures(
-            scene_mixture(points, self.spread3d),
-            ray_mixture(rays, self.spread2d * angle),
-            whole_domain(points, self.domain * distance_away),
-            gap=self.gap,
-            closest=self.closest * distance_away,
-            batch=self.batch,
-            max_boxes=self.max_boxes,
-            clock=clock,
-        )
-        translation = -aligned.rotation @ (radius * aligned.place + centre)
-        return Found(aligned.rotation, translation, aligned.boxes, aligned.value, aligned.certified)
-
-
-def whole_domain(like: Tensor, half: float) -> Boxes:
-    """All rotations, and the camera centres within `half` of the origin along each axis."""
-    zero = like.new_zeros(1, 3)
-    return Boxes(zero, like.new_full((1,), math.pi), zero, like.new_full((1, 3), half))
+        angle = root_mean_square(torch.acos((rays @ mean_ray).clamp(-1, 1)))
+        points, centre, radius = unit_scene(pair.points3d)
+        away = weak_perspective_distance(pair.points2d, points)
+        found = align_mixtures(
+            scene_mixture(points, self.cluster3d), ray_mixture(rays, self.cluster2d * angle),
+            whole_domain(points, self.domain * away), gap=self.gap, closest=self.closest * away, batch=self.batch,
+            max_boxes=self.max_boxes, deadline=deadline,
+        )  # fmt: skip
+        translation = -found.rotation @ (radius * found.place + centre)
+        return one_pose(found.rotation, translation, found.boxes, found.value, found.certified)

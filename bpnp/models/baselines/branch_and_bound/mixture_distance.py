@@ -60,11 +60,11 @@ def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Te
     """
     directions, _ = _seen(scene, boxes.place)
     turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, scene.means)
-    near, far = distance_range(boxes, scene.means)
-    least, largest = (values.square() / scene.variances + 1 for values in (near, far))
+    closest, farthest = distance_range(boxes, scene.means)
+    least, largest = (values.square() / scene.variances + 1 for values in (closest, farthest))
 
     apart = _angle(directions @ directions.mT)
-    wide = (apart + _parting(scene, boxes, near, moving)).clamp_max(math.pi)
+    wide = (apart + _parting(scene, boxes, closest, moving)).clamp_max(math.pi)
     wide = wide * (1 - torch.eye(len(scene.means), dtype=wide.dtype, device=wide.device))
     self_terms = _least_overlap(least, largest, wide.cos())
     angle = _angle(directions @ boxes.rotation.mT @ rays.directions.mT)
@@ -78,15 +78,15 @@ def _seen(scene: SceneMixture, place: Tensor) -> tuple[Tensor, Tensor]:
     return torch.nn.functional.normalize(towards, dim=-1), towards.square().sum(-1) / scene.variances + 1
 
 
-def _parting(scene: SceneMixture, boxes: Boxes, near: Tensor, moving: Tensor) -> Tensor:
+def _parting(scene: SceneMixture, boxes: Boxes, closest: Tensor, moving: Tensor) -> Tensor:
     """How much the angle that two means subtend at the camera centre can grow within a box (b, a, a).
 
-    Each direction turns by its own uncertainty at most. And the angle's gradient has the length |mu - mu'| / (d d')
-    with their distances d, d': the centre's way of half a diagonal changes it by no more than this length's largest.
+    Each direction turns by its own uncertainty at most. The angle's gradient has the length |mu - mu'| / (d d') with
+    the distances d, d' of the means: moving the centre by half a diagonal adds at most that times the largest length.
     """
-    way = boxes.place_half.norm(dim=-1)[:, None, None]
-    gradient = torch.cdist(scene.means, scene.means) / (near.unsqueeze(-1) * near.unsqueeze(-2)).clamp_min(1e-12)
-    return torch.minimum(moving.unsqueeze(-1) + moving.unsqueeze(-2), way * gradient + 1e-7)
+    half_diagonal = boxes.place_half.norm(dim=-1)[:, None, None]
+    gradient = torch.cdist(scene.means, scene.means) / (closest.unsqueeze(-1) * closest.unsqueeze(-2)).clamp_min(1e-12)
+    return torch.minimum(moving.unsqueeze(-1) + moving.unsqueeze(-2), half_diagonal * gradient + 1e-7)
 
 
 def _combine(scene: SceneMixture, rays: RayMixture, self_terms: Tensor, cross_terms: Tensor) -> Tensor:

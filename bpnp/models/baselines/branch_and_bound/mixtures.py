@@ -1,6 +1,5 @@
 """Mixtures that stand for the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -9,7 +8,7 @@ from torch import Tensor
 
 from bpnp.geometry import angle_between
 
-ROUNDS = 300
+ITERATIONS = 300
 
 
 class RayMixture(NamedTuple):
@@ -31,8 +30,8 @@ class SceneMixture(NamedTuple):
 def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
     """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF that fits each.
 
-    The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and no more than that of a cluster with
-    a tenth of the angle as its spread, which single points would exceed.
+    The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and at most that of a cluster with a
+    standard deviation of a tenth of the angle, which single points would exceed.
     """
     labels = _means(rays, angle, spherical=True)
     weights, sums = _totals(rays, labels)
@@ -54,19 +53,20 @@ def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
 
 
 def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
-    """DP-means: Lloyd's rounds, and once they settle a new cluster at the farthest point that is beyond `limit` of all.
+    """DP-means: Lloyd's iterations; when they have converged, a new cluster at the point farthest from all centres, if
+    that is beyond `limit`.
 
     The result does not depend on the order of the points.
     """
     centres = _centre(points.sum(0, keepdim=True), len(points), spherical)
     labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
-    for _ in range(ROUNDS):
+    for _ in range(ITERATIONS):
         nearest, assigned = _distances(points, centres, spherical).min(-1)
         if bool((assigned == labels).all()):
-            far = int(nearest.argmax())
-            if float(nearest[far]) <= limit:
+            outermost = int(nearest.argmax())
+            if float(nearest[outermost]) <= limit:
                 break
-            assigned[far] = len(centres)
+            assigned[outermost] = len(centres)
         labels = assigned.unique(return_inverse=True)[1]
         weights, sums = _totals(points, labels)
         centres = _centre(sums, weights.unsqueeze(-1), spherical)
@@ -87,9 +87,3 @@ def _totals(values: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
     """Number and sum of the values of each label."""
     members = torch.nn.functional.one_hot(labels).to(values.dtype)
     return members.sum(0), members.mT @ values
-
-
-def spread(distances: Float[Tensor, " k"]) -> float:
-    """Root mean square distance; 1 where it is zero."""
-    value = float(distances.square().mean().sqrt())
-    return value if value > 0 and math.isfinite(value) else 1.0

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bpnp.models.baselines.branch_and_bound.boxes import Boxes, join, rotation_uncertainty, split
-from bpnp.models.baselines.single_pairs import Clock
+from bpnp.models.baselines.branch_and_bound.boxes import Boxes, join, rotation_uncertainty, split, take_best
+from bpnp.models.baselines.single_pairs import over
 
-CELLS = 2**22  # angles computed at a time
+CHUNK = 2**22  # angles computed at a time
 ROUNDING = 1e-9  # of a cosine
 
 
@@ -33,29 +33,27 @@ def best_rotation(
     floor: int,
     first: bool = False,
     smallest: float = 1e-3,
-    clock: Clock,
+    deadline: float = math.inf,
 ) -> BestRotation:
     """Most rays f_i with some angle(f_i, R d_j) <= reach_j, over the rotations of a domain.
 
     Only rotations with more than `floor` rays are of interest: boxes that cannot have more are dropped. `first`: stop
-    at the first of these. Boxes of half side under `smallest` (radians) are not split; they, and the boxes left when
-    the clock stops, keep the bound above the count.
+    at the first of these. Boxes of half side below `smallest` (radians) are not split; they, and the boxes left at the
+    deadline, keep the bound above the count.
     """
     pending = domain
     bounds = rays.new_full((len(pending.turn),), len(rays))
     count, rotation, unresolved, done = floor, None, floor, 0
-    part = max(1, CELLS // (8 * len(rays) * len(directions)))
-    while len(bounds) and not clock.over():
-        chosen = bounds.topk(min(part, len(bounds))).indices
-        rest = torch.ones_like(bounds, dtype=torch.bool)
-        rest[chosen] = False
-        children = split(pending.pick(chosen), torch.ones_like(chosen, dtype=torch.bool))
+    part = max(1, CHUNK // (8 * len(rays) * len(directions)))
+    while len(bounds) and not over(deadline):
+        parents, others, rest = take_best(pending, bounds, part)
+        children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
         reached, reachable = _counts(rays, directions, reach, children)
         done += len(reached)
         i = int(reached.argmax())
         if int(reached[i]) > count:
             count, rotation = int(reached[i]), children.rotation[i]
-        pending, bounds = join([pending.pick(rest), children]), torch.cat([bounds[rest], reachable])
+        pending, bounds = join([others, children]), torch.cat([bounds[rest], reachable])
         if first and rotation is not None:
             break
         small = (pending.turn_half < smallest) & (bounds > count)
@@ -75,7 +73,7 @@ def _counts(rays: Tensor, directions: Tensor, reach: Tensor, boxes: Boxes) -> tu
     return exact.any(-1).sum(-1).to(rays), possible.any(-1).sum(-1).to(rays)
 
 
-def count_near(
+def count_inliers(
     rays: Float[Tensor, "m 3"],
     points: Float[Tensor, "n 3"],
     rotation: Float[Tensor, "3 3"],
@@ -84,5 +82,4 @@ def count_near(
 ) -> int:
     """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
     directions = torch.nn.functional.normalize(points - place, dim=-1)
-    near = (rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING
-    return int(near.any(-1).sum())
+    return int(((rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING).any(-1).sum())

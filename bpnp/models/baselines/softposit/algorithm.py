@@ -1,4 +1,4 @@
-"""SoftPOSIT: soft assignment and scaled-orthographic pose in turns (David, DeMenthon, Duraiswami, Samet, IJCV 2004)."""
+"""SoftPOSIT: alternating soft assignment and scaled-orthographic pose (David, DeMenthon et al., IJCV 2004)."""
 
 import math
 from typing import NamedTuple
@@ -7,8 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.models.baselines.single_pairs import Clock
-from bpnp.models.baselines.softposit.slack_assignment import slack_scalings
+from bpnp.models.baselines.single_pairs import over
 
 CHI2_99 = 9.21  # 99 % quantile, two degrees of freedom
 ENOUGH_STEPS = 20
@@ -16,7 +15,7 @@ WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per tra
 
 
 class Annealed(NamedTuple):
-    """A pose for each start; `residual` is the root mean square distance of the matched points, in pixels."""
+    """A pose for each initial one; `residual` is the root mean square distance of the matched points, in pixels."""
 
     rotation: Float[Tensor, "s 3 3"]
     translation: Float[Tensor, "s 3"]
@@ -38,9 +37,9 @@ def softposit(
     beta_final: float = 0.5,
     beta_rate: float = 1.05,
     max_steps: int | None = None,
-    clock: Clock | None = None,
+    deadline: float = math.inf,
 ) -> Annealed:
-    """Anneal every start (R, t) of one pair.
+    """Anneal every initial pose (R, t) of one pair.
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
     and scene point k is d^2_jk = focal^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
@@ -48,8 +47,8 @@ def softposit(
     orthonormal, and multiplies beta by `beta_rate`, from `beta_start` to `beta_final` (1 / pixel^2).
 
     points2d: normalised image coordinates; `focal` turns them into the pixels of the constants. points3d: scene units.
-    A start is accepted if its residual is under sqrt(alpha)/2 after 20 steps or more. Where the points that are matched
-    span no volume the start keeps its last pose and is not accepted.
+    An initial pose is accepted if its residual is below sqrt(alpha)/2 after 20 steps or more. Where the matched points
+    span no volume it keeps its last pose and is not accepted.
     """
     image = points2d.double()
     centre = points3d.double().mean(0)
@@ -63,7 +62,7 @@ def softposit(
     residual = image.new_full((len(turned),), math.inf)
     beta, step = beta_start, 0
     limit = steps if max_steps is None else min(steps, max_steps)
-    while step < limit and not (clock is not None and clock.over()):
+    while step < limit and not over(deadline):
         rows, depth = _scaled_rows(scene, turned, shift)
         kernel = _kernel(image, rows, depth, beta, alpha, focal)
         u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))
@@ -76,6 +75,33 @@ def softposit(
         beta, step = beta * beta_rate, step + 1
     accepted = (residual < math.sqrt(alpha) / 2) & (step >= ENOUGH_STEPS) & ~broken
     return Annealed(turned, shift - turned @ centre, residual, accepted, step, step == limit)
+
+
+def slack_scalings(
+    kernel: Float[Tensor, "s m n"], *, slack: float, tolerance: float = 1e-3, max_iterations: int = 60
+) -> tuple[Float[Tensor, "s m"], Float[Tensor, "s n"]]:
+    """u and v such that u_j K_jk v_k with the slack entries sums to one over every real row and every real column.
+
+    All slack entries start as `slack` and are scaled with their own row or column alone. Where K_jk is the largest of
+    its row and of its column and above the slack, both slacks keep their initial ratio to the entry: a good match is
+    not lost to them. Stops when the row sums of every sample are off by less than `tolerance` in total. The slack row
+    and column have no marginals of their own, so this is not the transport with dustbins of the Sinkhorn layer.
+    """
+    best3d, best2d = kernel.max(2), kernel.max(1)
+    rows = torch.arange(kernel.shape[1], device=kernel.device)
+    kept2d = (best2d.indices.gather(1, best3d.indices) == rows) & (best3d.values > slack)
+    columns = torch.arange(kernel.shape[2], device=kernel.device)
+    kept3d = (best3d.indices.gather(1, best2d.indices) == columns) & (best2d.values > slack)
+    u, v = torch.ones_like(best3d.values), torch.ones_like(best2d.values)
+    total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack
+    for _ in range(max_iterations):
+        u = 1 / total
+        partner = torch.where(kept3d, u.gather(1, best2d.indices), 1)
+        v = 1 / ((kernel.mT @ u.unsqueeze(-1)).squeeze(-1) + slack * partner)
+        total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack * torch.where(kept2d, v.gather(1, best3d.indices), 1)
+        if bool(((u * total - 1).abs().sum(-1) < tolerance).all()):
+            break
+    return u, v
 
 
 def _scaled_rows(scene: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:

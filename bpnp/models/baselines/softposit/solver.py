@@ -1,22 +1,24 @@
-"""SoftPOSIT as a solver of batches, from the paper's starts or from many random ones."""
+"""SoftPOSIT as a solver of batches, from the paper's initial poses or from many random ones."""
 
+from dataclasses import replace
 from typing import Literal
 
 from torch import Tensor
 
 from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import Clock, Found, PairSolver, SinglePair, no_pose
-from bpnp.models.baselines.softposit.algorithm import Annealed, softposit
-from bpnp.models.baselines.starts import anywhere, mean_pose, near_truth
+from bpnp.models.baselines.initial_poses import mean_pose, near_truth, random_poses
+from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
+from bpnp.models.baselines.softposit.algorithm import softposit
+from bpnp.types import Pose
 
 Start = Literal["mean", "near_truth", "random"]
-CELLS = 2**22  # pairs of points of all starts that are annealed together
+CHUNK = 2**22  # pairs of points, times initial poses, that are annealed together
 
 
 class SoftPOSIT(PairSolver):
-    """SoftPOSIT (David et al., IJCV 2004): local, so that its start decides.
+    """SoftPOSIT (David et al., IJCV 2004), a local solver: its result depends on its initial pose.
 
-    Of several starts the pose with the most points near a partner wins, an accepted one before one that is not.
+    Of several poses that under which most points have a partner is returned, an accepted one before one that is not.
     `residual` of the pose is the root mean square distance of the matched points in pixels.
 
     Args:
@@ -63,44 +65,32 @@ class SoftPOSIT(PairSolver):
         self.perturbation = perturbation_deg, perturbation
         self.annealing = {"noise_px": noise_px, "focal": focal, "beta_start": beta_start, "max_steps": max_steps}
 
-    def solve(self, pair: SinglePair, clock: Clock) -> Found:
-        rotation, translation = self._begin(pair)
-        together = max(1, CELLS // (len(pair.points2d) * len(pair.points3d)))
-        best, best_score = no_pose(pair.points3d), -1.0
-        finished = True
+    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+        rotation, translation = self._initial_poses(pair)
+        together = max(1, CHUNK // (len(pair.points2d) * len(pair.points3d)))
+        best, most, finished = no_pose(pair.points3d), -1, True
         for turned, shift in zip(rotation.split(together), translation.split(together), strict=True):
-            if clock.over():
+            if over(deadline):
                 finished = False
                 break
-            annealed = softposit(pair.points2d, pair.points3d, turned, shift, clock=clock, **self.annealing)  # type: ignore[arg-type]
-            finished = finished and annealed.finished
-            score = self._score(pair, annealed)
+            found = softposit(pair.points2d, pair.points3d, turned, shift, deadline=deadline, **self.annealing)  # type: ignore[arg-type]
+            finished = finished and found.finished
+            counts = agreement(
+                pair.points2d, pair.points3d, found.rotation, found.translation, threshold=self.threshold
+            )
+            score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
             i = int(score.argmax())
-            if float(score[i]) > best_score:
-                best_score, best = float(score[i]), _found(annealed, i)
-        return best if finished else _unconverged(best)
+            if int(score[i]) > most:
+                most, residual = int(score[i]), float(found.residual[i])
+                best = one_pose(
+                    found.rotation[i], found.translation[i], found.steps, residual, bool(found.accepted[i])
+                )  # fmt: skip
+        converged = best.stats.converged & finished
+        return replace(best, stats=replace(best.stats, converged=converged))
 
-    def _begin(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
+    def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
         if self.start == "mean":
             return mean_pose(pair, *self.mean)
         if self.start == "near_truth":
             return near_truth(pair, *self.perturbation, self.seed)
-        return anywhere(pair, self.starts, self.seed)
-
-    def _score(self, pair: SinglePair, annealed: Annealed) -> Tensor:
-        near = agreement(
-            pair.points2d, pair.points3d, annealed.rotation, annealed.translation, threshold=self.threshold
-        )  # fmt: skip
-        everything = len(pair.points2d) + len(pair.points3d)
-        return near.near2d + near.near3d + annealed.accepted.double() * (everything + 1)
-
-
-def _found(annealed: Annealed, i: int) -> Found:
-    residual = float(annealed.residual[i])
-    return Found(
-        annealed.rotation[i], annealed.translation[i], annealed.steps, residual, bool(annealed.accepted[i])
-    )  # fmt: skip
-
-
-def _unconverged(found: Found) -> Found:
-    return Found(found.rotation, found.translation, found.iterations, found.residual, False)
+        return random_poses(pair, self.starts, self.seed)
