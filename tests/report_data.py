@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bpnp.report import PairRow, Results, write_results
-from bpnp.report.views import PairView, write_views
+from bpnp.report.samples import PairView, write_views
 
 HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcff"
 

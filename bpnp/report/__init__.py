@@ -1,22 +1,20 @@
 """Results on disk and on screen."""
 
-from bpnp.report.causes import cause_of, cause_shares
 from bpnp.report.commands import report_command, view_command
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
-from bpnp.report.page import write_page
-from bpnp.report.results import PairRow, Results, read_results, summarise, write_results
-from bpnp.report.rows import count_inliers, rows_from
-from bpnp.report.runs import table
+from bpnp.report.folder import read_results, table, write_results
+from bpnp.report.page.write import write_page
+from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
+from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
+from bpnp.report.solutions import view_of
 from bpnp.report.tables import learning_table, recall_table, report, results_table
 from bpnp.report.training_log import TrainingLog, read_training_log
-from bpnp.report.views import PairView, read_views, select_views, view_of, views_from, write_views
 
 __all__ = [
     "PairRow",
     "PairView",
     "Results",
     "TrainingLog",
-    "cause_of",
     "cause_shares",
     "count_inliers",
     "learning_table",

@@ -9,14 +9,12 @@ from pathlib import Path
 from rich.console import Console
 
 from bpnp.report.figures import Lines, plot_pair, recall_curve, save_figure
-from bpnp.report.page import write_page
+from bpnp.report.folder import named_runs
+from bpnp.report.page.write import write_page
 from bpnp.report.photos import PhotoFinder, Photos, box_of
-from bpnp.report.results import read_results
-from bpnp.report.runs import named_runs
-from bpnp.report.sketches import read_sketches
+from bpnp.report.samples import PairView, read_views
 from bpnp.report.solutions import read_solution
 from bpnp.report.tables import report
-from bpnp.report.views import PairView, read_views
 
 
 def report_command(
@@ -100,31 +98,19 @@ def view_command(
 
 
 def chosen_views(folder: Path, wanted: Sequence[str]) -> list[PairView]:
-    """The views of the named pairs, with up to a thousand points if they were kept, else with two dozen; the worst if
-    none is named."""
-    views, sketches = {view.id: view for view in read_views(folder)}, read_sketches(folder)
-    if not views and sketches is None:
-        raise ValueError(f"expected views.npz in {folder}, got none; try `bpnp test` again, which keeps some pairs")
-    if not wanted and views:
+    """The views of the named pairs; the worst if none is named. Raises ValueError for a name of none or of several."""
+    views = {view.id: view for view in read_views(folder)}
+    if not views:
+        raise ValueError(f"expected points.npz in {folder}, got none; try `bpnp test` again, which keeps points")
+    if not wanted:
         return [max(views.values(), key=lambda view: view.error)]
-    rows: dict[str, int] = {}
-    if sketches is not None:
-        ids = {row.index: row.id for row in read_results(folder).rows}
-        rows = {ids[int(index)]: row for row, index in enumerate(sketches.index) if int(index) in ids}
-        if not wanted:
-            wanted = [ids[int(sketches.index[sketches.error.argmax()])]]
     found = []
     for name in wanted:
-        known = list(dict.fromkeys([*views, *rows]))
-        named = [id for id in known if id == name] or [id for id in known if name in id]
+        named = [id for id in views if id == name] or [id for id in views if name in id]
         if len(named) != 1:
-            some = ", ".join((named or known)[:20])
+            some = ", ".join((named or list(views))[:20])
             raise ValueError(f"expected the name of one pair kept in {folder}, got {name!r}; try one of {some}")
-        (id,) = named
-        if id in views:
-            found.append(views[id])
-        elif sketches is not None:
-            found.append(sketches.view(rows[id], id))
+        found.append(views[named[0]])
     return found
 
 

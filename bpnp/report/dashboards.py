@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bpnp.report.causes import CAUSES, cause_shares
 from bpnp.report.figures import plot_pair, recall_curve
-from bpnp.report.results import PairRow, Results, read_results
-from bpnp.report.runs import named_runs
-from bpnp.report.views import PairView, read_views
+from bpnp.report.folder import named_runs, read_results
+from bpnp.report.results import CAUSES, PairRow, Results, cause_shares
+from bpnp.report.samples import FEW, PairView, read_views
 
 CURVES = (
     ("rotation_error_deg", "rotation error, degrees", 20.0),
@@ -183,7 +182,8 @@ def _shares(errors: Sequence[float], limits: Any) -> list[float]:
 
 def _pictures(results: Results, views: Sequence[PairView]) -> dict[str, Any]:
     pictures: dict[str, Any] = {"test/recall": image(recall_curve({"test": results}))}
-    worst = sorted(views, key=lambda view: -view.error)[:MOST_PICTURES]
+    # Pairs with many points: the worst and some others, as a test keeps them.
+    worst = sorted(views, key=lambda view: (len(view.points2d) <= FEW, -view.error))[:MOST_PICTURES]
     if worst:
         pictures["test/worst_pairs"] = [image(plot_pair(view), caption=str(_text(view.id))) for view in worst]
     return pictures

@@ -11,12 +11,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bpnp.files import written_whole
+from bpnp.report.folder import read_runs
+from bpnp.report.page.charts import sorted_errors
 from bpnp.report.palette import DASHES, LIGHT, styles
 from bpnp.report.photos import box_of
-from bpnp.report.results import Results, read_results
-from bpnp.report.runs import named_runs
+from bpnp.report.results import Results
+from bpnp.report.samples import Array, PairView
 from bpnp.report.solutions import Solved, solution_view
-from bpnp.report.views import Array, PairView
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,7 +39,7 @@ def recall_curve(
     from matplotlib.figure import Figure
 
     if not isinstance(runs, Mapping):
-        runs = {name: read_results(path) for name, path in named_runs(runs).items()}
+        runs = read_runs(runs)
     panels = (
         ("rotation_deg", "rotation error, degrees", 20.0),
         ("translation", "translation error, scene units", 1.0),
@@ -49,7 +50,7 @@ def recall_curve(
     shapes = styles({name: list(results.estimates) for name, results in runs.items()})
     for axes, (key, label, limit) in zip(np.ravel(figure.subplots(1, 4, sharey=True)), panels, strict=True):
         for (run, estimate), (colour, dashes) in shapes.items():
-            errors = _sorted_errors(runs[run], estimate, key, joint_translation)
+            errors = sorted_errors(runs[run], estimate, key, joint_translation)
             name = estimate if len(runs) == 1 else f"{run}: {estimate}"
             lines = axes.step(*_curve(errors, limit), where="post", color=LIGHT[colour], label=_text(name))
             if DASHES[dashes]:
@@ -124,16 +125,6 @@ def _text(name: str) -> str:
     """A name as matplotlib shows it letter by letter: no formulas, no bytes of no text, no hidden label."""
     shown = name.encode("utf-8", "replace").decode().replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
-
-
-def _sorted_errors(results: Results, estimate: str, key: str, joint_translation: float) -> Array:
-    """Errors of the pairs that have one, ascending; in the joint curve a pair that is too far away never counts."""
-    errors = results.errors(estimate)
-    if key == "joint":
-        rotation = errors.rotation_deg.where(errors.translation <= joint_translation, np.inf)
-        return np.sort(rotation.numpy())
-    values = getattr(errors, key).numpy()
-    return np.sort(values[~np.isnan(values)])
 
 
 def _curve(errors: Array, limit: float) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bpnp.report.views import Array, PairView
+from bpnp.report.samples import Array, PairView
 
 MARGIN = 0.15  # of the extent of the image points, around them
 MOST_BYTES = 3_000_000  # of all photos of a page

@@ -7,7 +7,7 @@ import numpy as np
 from bpnp.cameras import in_front
 from bpnp.report.palette import LIGHT
 from bpnp.report.photos import MARGIN, Box
-from bpnp.report.views import Array
+from bpnp.report.samples import Array
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from bpnp.report.views import Array, PairView, view_of
+from bpnp.report.samples import Array, PairView
 
 NEEDED = ("points2d", "points3d", "rotation", "translation")
 
@@ -56,6 +56,25 @@ def read_solution(path: Path | str) -> PairView:
         return _view(content, id=_title(path.stem, content.get("verdict"), content.get("inlier_ratio")))
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+
+
+def view_of(
+    points2d: Array, points3d: Array, rotation: Array, translation: Array, *, matches: Array | None = None, id: str = ""
+) -> PairView:
+    """The view of one solved pair: points (m, 2) and (n, 3), pose camera = R p + t.
+
+    matches: (k, 2) indices of a 2D and a 3D point. Raises ValueError if one of them is no point.
+    """
+    assigned = np.full(len(points3d), -1, np.int32)
+    if matches is not None and len(matches):
+        most = np.max(matches, axis=0)
+        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
+            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
+            raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
+        assigned[matches[:, 1]] = matches[:, 0]
+    none = np.full(len(points3d), -1, np.int32)
+    pose = (np.asarray(rotation), np.asarray(translation))
+    return PairView(0, id, np.asarray(points2d), np.asarray(points3d), none, assigned, None, {"solution": pose})
 
 
 def _view(parts: dict[str, Any], *, id: str) -> PairView:

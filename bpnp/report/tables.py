@@ -1,25 +1,24 @@
 """Tables of test results for the terminal: the paper's quartiles, recall at standard points, untrained against trained.
 
-Every table fits in `WIDTH` columns without breaking a number.
+Every table fits in `WIDTH` columns with its names and numbers whole; in narrow terminals it is broken into several.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from rich import box
-from rich.console import Console
+from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, recalls
-from bpnp.report.results import Results, read_results
-from bpnp.report.runs import named_runs
+from bpnp.report.folder import read_results, read_runs
+from bpnp.report.published import Paper, published_rows
+from bpnp.report.results import Results
 
-WIDTH = 100
-Paper = Literal["modelnet40", "megadepth"]
+WIDTH = 80
 Values = Mapping[str, float]
 
 
@@ -31,6 +30,46 @@ class Column:
     key: str
     header: str
     share: bool = False
+
+
+@dataclass(frozen=True)
+class FittedTable:
+    """A table that is broken into several, side by side one below the other, where its columns do not fit.
+
+    headers: of the number columns. groups: rows (name, cells), with a line between groups.
+    """
+
+    title: str
+    headers: Sequence[str]
+    groups: Sequence[Sequence[tuple[Text, Sequence[Text]]]]
+    caption: str = ""
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+        rows = [row for group in self.groups for row in group]
+        name = min(max([9, *(len(label) for label, _ in rows)]), options.max_width // 3)
+        parts: list[list[int]] = [[]]
+        left = options.max_width - name - 2
+        for i, header in enumerate(self.headers):
+            width = 1 + max([*map(len, header.split("\n")), *(len(cells[i]) for _, cells in rows)])
+            if width > left and parts[-1]:
+                parts.append([])
+                left = options.max_width - name - 2
+            parts[-1].append(i)
+            left -= width
+        for number, part in enumerate(parts):
+            title, caption = (text or None for text in (self.title, self.caption))
+            table = Table(
+                title=title if number == 0 else None, caption=caption if part is parts[-1] else None,
+                box=box.SIMPLE_HEAD, padding=0, caption_justify="left", pad_edge=False,
+            )  # fmt: skip
+            table.add_column("", overflow="fold", width=name)
+            for i in part:
+                table.add_column(self.headers[i], justify="right", no_wrap=True)
+            for group in self.groups:
+                for label, cells in group:
+                    table.add_row(label, *(cells[i] for i in part))
+                table.add_section()
+            yield table
 
 
 QUARTILES = tuple(
@@ -63,48 +102,20 @@ RECALL_COLUMNS = (
 )
 
 
-def _published(errors: str, seconds: str, **recall: str) -> dict[str, str]:
-    keys = (column.key for column in QUARTILES)
-    return dict(zip(keys, errors.split(), strict=True)) | {"seconds_mean": seconds} | recall
-
-
-# Campbell, Liu, Gould, ECCV 2020, as printed: tables 1 and 2, and the recalls in its text. R is the RANSAC estimate.
-PAPER: Mapping[Paper, tuple[str, Mapping[str, Mapping[str, str]]]] = {
-    "modelnet40": (
-        "paper, ModelNet40",
-        {
-            "Lc Lp R": _published("3.33 8.09 15.8 0.04 0.08 0.16 0.28 0.52 1.01", "0.1"),
-            "Lc Lp": _published(
-                "4.88 9.66 16.0 0.04 0.08 0.15 0.36 0.61 1.03", "0.1", **{"recall_joint_15deg_0.5": "72"}
-            ),
-        },
-    ),
-    "megadepth": (
-        "paper, MegaDepth",
-        {
-            "Lc Lp R": _published("0.34 1.00 4.88 0.04 0.12 0.53 0.06 0.12 0.74", "0.2", recall_joint_10deg_1="82"),
-            "Lc Lp": _published("1.32 3.31 8.84 0.21 0.46 1.08 0.21 0.53 1.64", "0.2", recall_joint_10deg_1="73"),
-        },
-    ),
-}
-
-
-def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> Table:
+def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> FittedTable:
     """Quartiles, joint recalls, share of pairs with a pose and seconds per pair, a row per run and estimate.
 
     The best number of each column is bold. `paper` adds the published rows of that data set, for orientation only: they
     are of other data and take no part in the comparison.
     """
-    name, estimates = PAPER[paper] if paper is not None else ("", {})
-    published = {f"{name}: {estimate}": shown for estimate, shown in estimates.items()}
     caption = (
         "rot, repr: errors in degrees; trans: in scene units; 15deg 0.5, 10deg 1.0: % of pairs with both rotation and "
         "translation error within; sec: seconds per pair. A pair without a pose counts as 180 deg and inf."
     )
-    return _table(_title("Pose errors", runs), RESULT_COLUMNS, _rows(runs), published, caption)
+    return _table(_title("Pose errors", runs), RESULT_COLUMNS, _rows(runs), published_rows(paper), caption)
 
 
-def recall_table(runs: Mapping[str, Results]) -> Table:
+def recall_table(runs: Mapping[str, Results]) -> FittedTable:
     """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
     caption = "% of pairs with an error up to the number in the head: rot, repr in degrees; trans in scene units."
     return _table(_title("Recall", runs), RECALL_COLUMNS, _rows(runs), {}, caption)
@@ -141,7 +152,7 @@ def report(
     `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
     columns wide. Raises ValueError if a folder cannot be read.
     """
-    runs = {name: read_results(path) for name, path in named_runs(paths).items()}
+    runs = read_runs(paths)
     if console is None:
         console = Console()
         console.width = max(console.width, WIDTH)
@@ -179,7 +190,7 @@ def _rows(runs: Mapping[str, Results]) -> dict[str, Values]:
 
 
 def _title(what: str, runs: Mapping[str, Results]) -> str:
-    sizes = sorted({len({row.index for row in results.rows}) for results in runs.values()})
+    sizes = sorted({results.pairs for results in runs.values()})
     return f"{what}, {' or '.join(map(str, sizes))} pairs"
 
 
@@ -189,26 +200,29 @@ def _table(
     rows: Mapping[str, Values],
     published: Mapping[str, Mapping[str, str]],
     caption: str,
-) -> Table:
-    table = Table(title=title, caption=caption, box=box.SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column("", overflow="fold", min_width=9)
-    for column in columns:
-        table.add_column(column.header, justify="right", no_wrap=True)
-    best = {column.key: _best(column, list(rows.values())) for column in columns}
-    for label, values in rows.items():
-        shown = {column.key: cell(column, values) for column in columns}
-        cells = (Text(text, "bold" if text == best[key] else "") for key, text in shown.items())
-        table.add_row(Text(label), *cells)
-    table.add_section()
-    for label, printed in published.items():
-        table.add_row(Text(label, "dim"), *(Text(printed.get(column.key, "-"), "dim") for column in columns))
-    return table
+) -> FittedTable:
+    best = best_texts(columns, list(rows.values()))
+    shown = {label: {column.key: cell(column, values) for column in columns} for label, values in rows.items()}
+    here = [
+        (Text(label), [Text(text, "bold" if text == best[key] else "") for key, text in cells.items()])
+        for label, cells in shown.items()
+    ]
+    paper = [
+        (Text(label, "dim"), [Text(printed.get(column.key, "-"), "dim") for column in columns])
+        for label, printed in published.items()
+    ]
+    return FittedTable(title, [column.header for column in columns], [here, paper], caption)
 
 
 def cell(column: Column, values: Values) -> str:
     """What a table shows of a column: a share in percent, else `number`."""
     value = values.get(column.key)
     return f"{100 * value:.1f}" if column.share and value is not None else number(value)
+
+
+def best_texts(columns: Sequence[Column], rows: Sequence[Values]) -> dict[str, str | None]:
+    """The best number of each column as it is shown; None where there is nothing to compare."""
+    return {column.key: _best(column, rows) for column in columns}
 
 
 def _best(column: Column, rows: Sequence[Values]) -> str | None:

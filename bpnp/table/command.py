@@ -9,11 +9,11 @@ from rich.console import Console
 from rich.progress import track
 
 from bpnp.report.figures import save_figure
+from bpnp.report.published import Paper
 from bpnp.report.tables import WIDTH
 from bpnp.table.layout import Line, as_csv, as_latex, as_markdown, terminal
 from bpnp.table.methods import SHORT_NAMES, Method, parse_methods
 from bpnp.table.pairs import TestPairs, read_data, with_outlier_ratio
-from bpnp.table.published import Paper
 from bpnp.table.sweep import sweep_figure
 from bpnp.table.work import Block, run
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from bpnp.files import written_whole
-from bpnp.report.results import PairRow, Results, write_results
+from bpnp.report.folder import write_results
+from bpnp.report.results import PairRow, Results
 
 IDENTITY = "method.json"
 

@@ -9,8 +9,8 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
+from bpnp.report.published import NAMES, PUBLISHED, Paper
 from bpnp.report.tables import QUARTILES, RESULT_COLUMNS, Column, cell
-from bpnp.table.published import NAMES, PUBLISHED, Paper
 
 CAPTION = (
     "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of pairs with "

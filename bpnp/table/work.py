@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import nn
 
-from bpnp.report.rows import rows_from
+from bpnp.report.results import rows_from
 from bpnp.table.finished import Finished
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs

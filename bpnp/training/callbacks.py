@@ -12,16 +12,16 @@ import torch
 import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
+from lightning.pytorch.cli import SaveConfigCallback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
 from bpnp.files import written_whole
 from bpnp.models.weights import read_checkpoint
 from bpnp.report import report
-from bpnp.report.results import PairRow, write_results
-from bpnp.report.rows import rows_from
-from bpnp.report.sketches import Sketches, joined, sketches_of, write_sketches
-from bpnp.report.views import PairView, select_views, views_from, write_views
+from bpnp.report.folder import write_results
+from bpnp.report.results import PairRow, rows_from
+from bpnp.report.samples import PairView, select_views, thin, views_from, write_views
 from bpnp.types import Batch, Prediction
 
 
@@ -142,12 +142,12 @@ class ResultsWriter(Callback):
         self.inlier_threshold = inlier_threshold
         self.rows: list[PairRow] = []
         self.losses: dict[int, float] = {}
-        self.views: Sequence[PairView] = ()
-        self.sketches: list[Sketches] = []
+        self.chosen: Sequence[PairView] = ()
+        self.views: list[PairView] = []
         self.poses: dict[tuple[int, str], list[Any]] = {}
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.rows, self.losses, self.views, self.sketches = [], {}, (), []
+        self.rows, self.losses, self.chosen, self.views = [], {}, (), []
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
@@ -157,21 +157,21 @@ class ResultsWriter(Callback):
         )  # fmt: skip
         self.rows += rows
         views = views_from(outputs["prediction"], batch)
-        self.views = select_views([*self.views, *views])
-        self.sketches.append(sketches_of(views))
+        self.chosen = select_views([*self.chosen, *views])
+        self.views += map(thin, views)
         if outputs["losses"] is not None:
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather((self.rows, self.losses, self.views, self.sketches))
+        gathered = _gather((self.rows, self.losses, self.chosen, self.views))
         if trainer.is_global_zero:
             rows = [row for part, _, _, _ in gathered for row in part]
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer, "test")
-            write_results(folder, rows, correspondence_loss=mean, settings={"checkpoint": _checkpoint(trainer)})
-            write_views(folder, select_views([view for _, _, part, _ in gathered for view in part]))
-            write_sketches(folder, joined([sketches for *_, part in gathered for sketches in part]))
+            write_results(folder, rows, correspondence_loss=mean, settings=_settings(trainer))
+            chosen = select_views([view for _, _, part, _ in gathered for view in part])
+            write_views(folder, [*chosen, *(view for *_, part in gathered for view in part)])
             report([folder])
             rank_zero_info(f"results of {len({row.index for row in rows})} pairs in {folder}")
 
@@ -224,8 +224,12 @@ def _write_poses(path: Path, rows: Sequence[Sequence[Any]]) -> None:
         temporary.write_text(table.getvalue(), encoding="utf-8")
 
 
-def _checkpoint(trainer: Trainer) -> str | None:
-    return str(trainer.ckpt_path) if trainer.ckpt_path else None
+def _settings(trainer: Trainer) -> dict[str, Any]:
+    """The checkpoint, and of a test from the command line the data and the solver of its configuration."""
+    saved = next((own.config for own in trainer.callbacks if isinstance(own, SaveConfigCallback)), None)  # type: ignore[attr-defined]
+    config = {} if saved is None else saved.as_dict()
+    settings = {"checkpoint": str(trainer.ckpt_path) if trainer.ckpt_path else None}
+    return settings | {"data": config.get("data"), "solver": config.get("model", {}).get("solver")}
 
 
 def _gather(value: Any) -> list[Any]:

@@ -18,7 +18,7 @@ from torch.utils.hooks import RemovableHandle
 
 from bpnp.report.dashboards import image
 from bpnp.report.figures import plot_pair, save_figure
-from bpnp.report.views import PairView, views_from
+from bpnp.report.samples import PairView, views_from
 from bpnp.types import Batch, Prediction
 
 

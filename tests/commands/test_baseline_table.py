@@ -10,12 +10,12 @@ from small_data import small_net
 
 from bpnp.cli import main
 from bpnp.report import read_results
+from bpnp.report.published import PUBLISHED
 from bpnp.report.results import PairRow
 from bpnp.table.finished import Finished
 from bpnp.table.layout import Line, as_latex, as_markdown
 from bpnp.table.methods import parse_methods
 from bpnp.table.pairs import TestPairs, read_data
-from bpnp.table.published import PUBLISHED
 from bpnp.training.task import BlindPnPTask
 
 RECIPE = """

@@ -9,7 +9,7 @@ from rich.console import Console
 
 from bpnp.report.commands import report_command, view_command
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
-from bpnp.report.views import view_of
+from bpnp.report.solutions import view_of
 
 
 def points_of(axes: object, marker: str) -> np.ndarray:
@@ -91,6 +91,6 @@ def test_commands_write_what_they_say(tmp_path: Path) -> None:
     assert imread(written).std() > 0.05
     with pytest.raises(ValueError, match="got 'nothing'; try one of"):
         view_command([str(tmp_path / "run"), "nothing"], console)
-    (tmp_path / "run" / "test" / "views.npz").unlink()
-    with pytest.raises(ValueError, match=r"expected views.npz in .*run/test, got none"):
+    (tmp_path / "run" / "test" / "points.npz").unlink()
+    with pytest.raises(ValueError, match=r"expected points.npz in .*run/test, got none"):
         view_command([str(tmp_path / "run")], console)

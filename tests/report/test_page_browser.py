@@ -13,13 +13,16 @@ import pytest
 from report_data import HOSTILE, rows, view, write_run
 
 from bpnp.report import Results, write_page, write_results
-from bpnp.report.sketches import sketches_of, write_sketches
+from bpnp.report.palette import DARK, LIGHT
+from bpnp.report.photos import box_of
+from bpnp.report.results import CAUSES
+from bpnp.report.samples import thin, write_views
 from bpnp.report.tables import number
-from bpnp.report.views import write_views
 
 pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
+    "--enable-unsafe-swiftshader",
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
     "--window-size=1280,900",
 )  # fmt: skip
@@ -50,18 +53,31 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, R
     return write_page([folder / name for name in results], folder / "report.html", paper="modelnet40"), results
 
 
+def opened(browser: Any, address: str) -> None:
+    """Opens an address afresh and waits until the page is ready."""
+    from selenium.webdriver.support.wait import WebDriverWait
+
+    browser.get("about:blank")
+    browser.get(address)
+    WebDriverWait(browser, 20).until(lambda b: b.execute_script("return document.documentElement.dataset.ready"))
+
+
+def severe(browser: Any) -> list[str]:
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] == "SEVERE"]
+
+
 @pytest.fixture
 def page(browser: Any, written: tuple[Path, dict[str, Results]]) -> Iterator[Callable[..., Any]]:
-    """Runs a script on the freshly opened page. Afterwards nothing may have been logged or asked of a network."""
+    """Runs a script on the freshly opened page. Afterwards no error is logged, and nothing was asked of a network."""
     address = written[0].as_uri()
     browser.get("about:blank")
     browser.get_log("performance")
-    browser.get(address)
+    opened(browser, address)
     yield browser.execute_script
-    assert browser.get_log("browser") == []
+    assert severe(browser) == []
     messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
-    assert {url.split("#")[0] for url in asked if not url.startswith("data:")} == {address}
+    assert {url.split("#")[0] for url in asked if not url.startswith(("data:", "blob:", "about:"))} == {address}
 
 
 def texts(page: Callable[..., Any], selector: str) -> list[str]:
@@ -74,123 +90,167 @@ def press(page: Callable[..., Any], selector: str) -> None:
     page("document.querySelector(arguments[0]).click()", selector)
 
 
+def choose(page: Callable[..., Any], name: str, value: str) -> None:
+    page(
+        "const e = document.getElementById(arguments[0]);"
+        "if (e.type === 'checkbox') e.checked = Boolean(arguments[1]); else e.value = arguments[1];"
+        "e.dispatchEvent(new Event('input'))",
+        name,
+        value,
+    )
+
+
 def column(results: Results, estimate: str, key: str) -> np.ndarray:
-    return np.array([getattr(row, key) for row in results.rows if row.estimate == estimate])
+    return np.array([getattr(row, key) for row in results.of(estimate)])
+
+
+def floats(cells: list[str]) -> list[float]:
+    return [float(cell) for cell in cells]
 
 
 def test_the_quartiles_are_those_of_the_files(page: Callable[..., Any], written: Any) -> None:
-    shown = page(
+    rows = page(
         "return [...document.querySelectorAll('#quartile-table tbody tr')].map((row) =>"
         "[...row.children].map((cell) => [cell.textContent, cell.title]))"
     )
     estimates = {f"{name}: {key}": v for name, r in written[1].items() for key, v in r.estimates.items()}
-    assert [row[0][0] for row in shown[:4]] == list(estimates)
-    for row in shown[:4]:
+    assert [row[0][0] for row in rows[:4]] == list(estimates)
+    for row in rows[:4]:
         values = estimates[row[0][0]]
         for (text, exact), key in zip(row[1:4], ("rotation_q1_deg", "rotation_q2_deg", "rotation_q3_deg"), strict=True):
             assert text == number(values[key])
             assert float(exact) == values[key]
-    assert [cell[0] for cell in shown[4][:3]] == ["paper, ModelNet40: Lc Lp R", "3.33", "8.09"]
+    assert ["paper, ModelNet40: Lc Lp R", "3.33", "8.09"] in [[cell[0] for cell in row[:3]] for row in rows[4:]]
 
 
 def test_tables_sort_and_the_best_is_bold(page: Callable[..., Any], written: Any) -> None:
     medians = [v["rotation_q2_deg"] for r in written[1].values() for v in r.estimates.values()]
-    press(page, "#quartile-table [data-key='1']")
-    assert texts(page, "#quartile-table tbody tr:not(.paper) td:nth-child(3)") == [number(v) for v in sorted(medians)]
-    assert page("return document.activeElement.dataset.key") == "1"
-    press(page, "#quartile-table [data-key='1']")
-    assert texts(page, "#quartile-table tbody tr:not(.paper) td:nth-child(3)") == [
-        number(value) for value in sorted(medians, reverse=True)
-    ]
+    for order in (sorted(medians), sorted(medians, reverse=True)):
+        press(page, "#quartile-table [data-key='1']")
+        column = "#quartile-table tbody tr:not(.paper) td:nth-child(3)"
+        assert texts(page, column) == [number(value) for value in order]
     assert texts(page, "#quartile-table td.best:nth-child(3)") == [number(min(medians))]
 
 
-def test_recall_curves_end_at_the_share_of_pairs_within(page: Callable[..., Any], written: Any) -> None:
-    press(page, "#log-thresholds")
-    labels = page(
-        "return [...document.querySelectorAll('#recall-charts svg')].map((e) => e.getAttribute('aria-label'))"
-    )
+def test_recall_curves_are_read_out(page: Callable[..., Any], written: Any) -> None:
+    label = page("return document.querySelector('#recall .chart').getAttribute('aria-label')")
     for name, results in written[1].items():
         for estimate in ("ransac", "pnp"):
-            rotation, translation, reprojection = (
-                column(results, estimate, key)
-                for key in ("rotation_error_deg", "translation_error", "reprojection_error_deg")
-            )
-            known = reprojection[~np.isnan(reprojection)]
-            expected = (rotation <= 20, translation <= 1, (rotation <= 20) & (translation <= 0.5), known <= 2)
-            for label, right in zip(labels, expected, strict=True):
-                (share,) = re.findall(re.escape(f"{name}: {estimate} ends at ") + r"([\d.]+)%", label)
-                assert float(share) == pytest.approx(100 * right.mean(), abs=0.051)
+            (share,) = re.findall(re.escape(f"{name}: {estimate} ends at ") + r"([\d.]+)%", label)
+            right = column(results, estimate, "rotation_error_deg") <= 90
+            assert float(share) == pytest.approx(100 * right.mean(), abs=0.051)
 
 
-def test_runs_are_switched_off_and_on(page: Callable[..., Any]) -> None:
-    lines = "#recall-charts figure:first-child path.series"
+def test_runs_are_switched_off_and_on_and_the_address_keeps_it(browser: Any, page: Callable[..., Any]) -> None:
+    page("document.querySelector('#recall').scrollIntoView()")
+    lines = "#recall .chart:first-child .scatterlayer .trace"
+    for _ in range(50):
+        if len(texts(page, lines)) == 4:
+            break
+        browser.execute_async_script("setTimeout(arguments[0], 100)")
     assert len(texts(page, lines)) == 4
     press(page, "#series button:nth-child(2)")
     assert len(texts(page, lines)) == 3
-    assert len(texts(page, "#quartile-table tbody tr:not(.paper)")) == 3
+    assert len(texts(page, "#quartile-table tbody tr:not(.paper):not([hidden])")) == 3
     assert page("return document.querySelector('#series button:nth-child(2)').getAttribute('aria-pressed')") == "false"
-    for i in (1, 3, 4):
-        press(page, f"#series button:nth-child({i})")
-    assert texts(page, lines) == []
-    press(page, "#series button:nth-child(1)")
-    assert len(texts(page, lines)) == 1
+    opened(browser, page("return location.href"))
+    assert page("return document.querySelector('#series button:nth-child(2)').getAttribute('aria-pressed')") == "false"
+    press(page, "#series button:nth-child(2)")
+    assert len(texts(page, "#quartile-table tbody tr:not(.paper):not([hidden])")) == 4
 
 
-def test_the_worst_pairs_come_first_and_filters_narrow_them(page: Callable[..., Any], written: Any) -> None:
-    rotation = column(written[1]["first"], "ransac", "rotation_error_deg")
-    shown = texts(page, "#pair-table tbody td:nth-child(2)")
-    assert shown == [number(value) for value in np.sort(rotation)[::-1][: len(shown)]]
+def test_the_worst_pairs_come_first_and_filters_narrow_them(
+    browser: Any, page: Callable[..., Any], written: Any
+) -> None:
+    results = written[1]["first"]
+    rotation = column(results, "ransac", "rotation_error_deg")
+    first = floats(texts(page, "#pair-table tbody td:nth-child(2)"))
+    assert first == pytest.approx(np.sort(rotation)[::-1][: len(first)].tolist(), rel=0.005)
     press(page, "#pair-table [data-key='reprojection_error_deg']")
     press(page, "#pair-table [data-key='reprojection_error_deg']")
-    reprojection = column(written[1]["first"], "ransac", "reprojection_error_deg")
     for _ in range(3):
         press(page, "#page-on")
-    ordered = np.sort(reprojection)
-    assert texts(page, "#pair-table tbody td:nth-child(5)") == [number(value) for value in ordered[75:].tolist()]
-    page("const e = document.getElementById('pair-cause'); e.value = 2; e.dispatchEvent(new Event('input'))")
-    assert set(texts(page, "#pair-table td.words")) == {"no pose"}
-    without = sum(not row.found for row in written[1]["first"].rows) // 2
-    assert f"{without} pairs" in texts(page, "#pager")[0]
+    ordered = np.sort(column(results, "ransac", "reprojection_error_deg"))
+    last = floats(texts(page, "#pair-table tbody td:nth-child(5)"))
+    assert last == pytest.approx(ordered[75:].tolist(), rel=0.005, nan_ok=True)
+    choose(page, "cause", "1")
+    assert set(texts(page, "#pair-table tbody td.words")) == {" no pose"}
+    without = sum(not row.found for row in results.of("ransac"))
+    assert f"{without} of {COUNT} pairs" in texts(page, "#pager")[0]
+    choose(page, "cause", "")
+    choose(page, "least", "12.5")
+    choose(page, "status", "1")
+    chosen = [r for r in results.of("ransac") if r.rotation_error_deg >= 12.5 and r.found and not r.converged]
+    assert f"{len(chosen)} of {COUNT} pairs" in texts(page, "#pager")[0]
+    opened(browser, page("return location.href"))
+    assert f"{len(chosen)} of {COUNT} pairs" in texts(page, "#pager")[0]
+    assert page("return document.getElementById('least').value") == "12.5"
 
 
 def test_shares_of_causes_are_those_of_the_rows(page: Callable[..., Any], written: Any) -> None:
     row = texts(page, "#cause-table tbody tr:nth-child(2) td")[1:]
-    results = written[1]["first"]
-    found, converged = (column(results, "pnp", key).astype(bool) for key in ("found", "converged"))
-    good = column(results, "pnp", "rotation_error_deg") <= 5
-    fits = column(results, "pnp", "inliers") >= 0.5 * column(results, "pnp", "m")
-    wrong = found & ~good & converged
-    cases = (found & good & converged, found & good & ~converged, ~found, found & ~good & ~converged, wrong & fits)
-    assert row == [f"{100 * case.mean():.1f}%" for case in (*cases, wrong & ~fits)]
+    causes = [r.cause for r in written[1]["first"].of("pnp")]
+    expected = [f"{100 * causes.count(cause) / COUNT:.1f}%" for cause in CAUSES]
+    converged = column(written[1]["first"], "pnp", "converged").mean()
+    assert row == [*expected, f"{100 * converged:.1f}%"]
+
+
+def test_run_against_run_counts_the_better_pairs_and_opens_one(
+    browser: Any, page: Callable[..., Any], written: Any
+) -> None:
+    page("document.querySelector('#versus').scrollIntoView()")
+    browser.execute_async_script("setTimeout(arguments[0], 500)")
+    choose(page, "b", "2")
+    a, b = (column(written[1][name], "ransac", "rotation_error_deg") for name in ("first", "second"))
+    (text,) = texts(page, "#versus-text")
+    shares = re.findall(r"([\d.]+) %", text)
+    assert floats(shares) == pytest.approx([100 * (a < b).mean(), 100 * (a > b).mean()], abs=0.051)
+    points = page("const t = document.getElementById('versus').data[1]; return [t.x, t.y]")
+    np.testing.assert_allclose(points, [a, b], rtol=1e-6)
+    page("document.getElementById('versus').emit('plotly_click', {points: [{customdata: 5}]})")
+    assert texts(page, "#pair-title") == ["scene/0005"]
 
 
 def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., Any], written: Any) -> None:
-    page(
-        "const e = document.getElementById('pair-filter'); e.value = 'SCRIPT'; e.dispatchEvent(new Event('input'));"
-        "document.querySelector('#pair-table button.link').click()"
-    )
+    choose(page, "name", "SCRIPT")
+    press(page, "#pair-table button.link")
     assert page("return document.getElementById('pair').open")
     assert texts(page, "#pair-title") == [HOSTILE]
     assert page("return document.title").startswith("bpnp: ")
     assert texts(page, "b") == []
     rows = [row for results in written[1].values() for row in results.rows if row.index == 0]
-    assert texts(page, "#pair-numbers td:nth-child(2)") == [number(row.rotation_error_deg) for row in rows]
-    assert "ransac" in texts(page, "#image-text")[0]
-    assert "outside" not in texts(page, "#image-text")[0]
-    drawn = "const c = document.getElementById(arguments[0]); return c.getContext('2d')"
-    count = drawn + ".getImageData(0, 0, c.width, c.height).data.filter((v, i) => i % 4 === 3 && v > 0).length"
-    assert page(count, "scene") > 100
-    assert page(count, "image") > 100
-    before = page("return document.getElementById('scene').toDataURL()")
-    page("document.getElementById('scene').dispatchEvent(new KeyboardEvent('keydown', {key: 'ArrowLeft'}))")
-    assert page("return document.getElementById('scene').toDataURL()") != before
-    press(page, "#pair-close")
-    assert not page("return document.getElementById('pair').open")
+    cells = floats(texts(page, "#pair-numbers tbody td:nth-child(2)"))
+    assert cells == pytest.approx([row.rotation_error_deg for row in rows], rel=0.005)
+    # The points in space and in the image are the planted ones, and both runs' cameras are there.
+    planted = view(0, HOSTILE)
+    names, image = page(
+        "return [document.getElementById('scene').data.map((t) => t.name),"
+        "[document.getElementById('image').data[2].x, document.getElementById('image').data[2].y]]"
+    )
+    assert names[2:] == ["true pose", "first: ransac", "second: ransac"]
+    np.testing.assert_allclose(np.transpose(image), planted.points2d, atol=1e-4)
 
 
-def test_other_pairs_open_as_sketches_and_photos_lie_under_the_points(browser: Any, tmp_path: Path) -> None:
-    """Of a page with three estimates; pixels of the photo's red shine through the canvas."""
+def test_a_click_on_a_point_picks_it_in_both_views(page: Callable[..., Any]) -> None:
+    choose(page, "name", "SCRIPT")
+    press(page, "#pair-table button.link")
+    planted = view(0, HOSTILE)
+    click = "document.getElementById(arguments[0]).emit('plotly_click', {points: [{curveNumber: arguments[1],"
+    click += "pointNumber: 7, data: {type: arguments[2]}}]})"
+    marked = "return [document.getElementById('image').data[4].x, document.getElementById('scene').data[1].x.length]"
+    for view_name, curve, kind in (("scene", 0, "scatter3d"), ("image", 2, "scatter")):
+        page(click, view_name, curve, kind)
+        (text,) = texts(page, "#picked")
+        assert text.startswith("3D point 7 at (")
+        assert "2D point 7 at (" in text
+        error = float(text.split("reprojection error ")[1].split(" deg")[0])
+        assert error < 0.01
+        x, spots = page(marked)
+        assert x[0] == pytest.approx(planted.points2d[7, 0], abs=1e-4)
+        assert spots == 1
+
+
+def test_all_pairs_open_and_photos_lie_under_the_points(browser: Any, tmp_path: Path) -> None:
     planted = rows(30, 0, ("ransac", "pnp", "refined"))
     write_results(tmp_path / "test", planted)
     names = {row.index: row.id for row in planted}
@@ -198,70 +258,68 @@ def test_other_pairs_open_as_sketches_and_photos_lie_under_the_points(browser: A
         replace(view(i, names[i]), estimates=dict.fromkeys(("ransac", "pnp", "refined"), view(i, "").pose))
         for i in range(30)
     ]
-    write_views(tmp_path / "test", [views[3]])
-    write_sketches(tmp_path / "test", sketches_of(views))
+    write_views(tmp_path / "test", [views[3], *map(thin, views)])
     red = np.broadcast_to(np.array([255, 0, 0], np.uint8), (30, 40, 3))
     page = write_page([tmp_path], tmp_path / "r.html", photo=lambda id, box: red if id == names[3] else None)
-    browser.get("about:blank")
-    for index, points, lines in ((3, "30 of the image", False), (11, "24 of the image", True)):
-        browser.get(f"{page.as_uri()}#pair={names[index].replace('/', '%2F')}")
-        browser.refresh()
+    for index, points, few in ((3, "30 image points", False), (11, "24 image points", True)):
+        opened(browser, f"{page.as_uri()}#pair={names[index].replace('/', '%2F')}")
         assert points in browser.find_element("id", "image-text").text
-        assert browser.find_element("css selector", "#pair-lines [value=assigned3d]").get_property("disabled") == lines
+        assert browser.find_element("css selector", "#lines [value=assigned3d]").get_property("disabled") == few
         assert len(browser.find_elements("css selector", "#pair-numbers tbody tr")) == 3
-        options = [option.text for option in browser.find_elements("css selector", "#pair-estimate option")]
+        options = [option.text for option in browser.find_elements("css selector", "#pose option")]
         assert options == ["true pose", "ransac", "pnp", "refined"]
-        assert "outside" not in browser.find_element("id", "image-text").text
-        reds = (
-            "const c = document.getElementById('image');"
-            "const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0;"
-            "for (let i = 0; i < d.length; i += 4) n += d[i] > 200 && d[i + 1] < 60; return n"
-        )
-        assert (browser.execute_script(reds) > 1000) == (index == 3)
-        assert browser.find_element("id", "pair-photo").is_displayed() == (index == 3)
-    assert "all of the 30 pairs" in browser.execute_script("return document.getElementById('pair-kept').textContent")
-    shown = browser.execute_script(
-        "return [...document.querySelectorAll('#quartile-table tbody th')].map((e) => e.textContent)"
-    )
-    assert shown == ["ransac", "pnp", "refined"]
-    assert browser.get_log("browser") == []
+        assert "× 0 of" not in browser.find_element("id", "image-text").text
+        images = browser.execute_script("return document.getElementById('image').layout.images")
+        assert len(images) == (not few)
+        assert browser.find_element("id", "photo").is_displayed() != few
+        if images:
+            box = box_of(views[3])
+            assert [images[0][key] for key in ("x", "y")] == pytest.approx([box.left, box.top])
+    assert "all of the 30 pairs" in browser.execute_script("return document.getElementById('kept').textContent")
+    assert severe(browser) == []
 
 
-def test_a_pair_opens_from_the_keyboard_and_from_its_address(browser: Any, page: Callable[..., Any]) -> None:
+def test_a_pair_opens_from_the_keyboard_and_arrows_go_through_the_list(browser: Any, page: Callable[..., Any]) -> None:
     from selenium.webdriver.common.keys import Keys
 
     button = browser.find_element("css selector", "#pair-table tbody tr:nth-child(3) button")
     name = button.text.removeprefix("◉ ")
+    names = [text.removeprefix("◉ ") for text in texts(page, "#pair-table tbody th")]
     button.send_keys(Keys.ENTER)
     assert texts(page, "#pair-title") == [name]
+    for key, place in ((Keys.ARROW_RIGHT, 3), (Keys.ARROW_LEFT, 2), (Keys.ARROW_LEFT, 1)):
+        browser.switch_to.active_element.send_keys(key)
+        assert texts(page, "#pair-title") == [names[place]]
     browser.switch_to.active_element.send_keys(Keys.ESCAPE)
-    assert not page("return document.getElementById('pair').open || location.hash !== ''")
-    assert page("return document.activeElement === arguments[0]", button)
-    page("location.hash = 'pair=scene%2F0042'; location.reload()")
+    browser.execute_async_script("setTimeout(arguments[0], 100)")
+    assert not page("return document.getElementById('pair').open || location.hash.includes('pair=')")
+    opened(browser, page("return location.href.split('#')[0]") + "#pair=scene%2F0042")
     assert texts(page, "#pair-title") == ["scene/0042"]
 
 
 def test_the_pose_loss_is_marked_where_it_joins(page: Callable[..., Any]) -> None:
-    assert texts(page, "#training-charts figure:first-child .mark-text") == [
-        "first: pose loss",
-        "second: pose loss",
-    ]
-    frame, mark = page(
-        "const f = document.querySelector('#training-charts figure');"
-        "return [f.querySelector('.frame').getBBox(), f.querySelector('line.mark').x1.baseVal.value]"
-    )
-    # Step 50 of an axis from 0 to 90.
-    assert (mark - frame["x"]) / frame["width"] == pytest.approx(50 / 90, abs=0.01)
+    layout = page("return JSON.parse(DATA.charts[document.querySelector('#training .chart').dataset.chart]).layout")
+    assert [shape["x0"] for shape in layout["shapes"]] == [50, 50]
+    assert [note["text"] for note in layout["annotations"]] == ["first: pose loss", "second: pose loss"]
 
 
+@pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
-def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], width: int) -> None:
+def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], width: int, scheme: str) -> None:
     metrics = {"width": width, "height": 844, "deviceScaleFactor": 1, "mobile": width < 500}
     browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
+    features = [{"name": "prefers-color-scheme", "value": scheme}]
+    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
     try:
-        browser.refresh()
+        opened(browser, page("return location.href.split('#')[0]"))
+        page("dispatchEvent(new Event('beforeprint'))")
+        press(page, "#pair-table button.link")
+        browser.execute_async_script("setTimeout(arguments[0], 500)")
         assert page("return document.documentElement.scrollWidth") == width
-        widths = page("return [...document.querySelectorAll('.chart')].map((e) => [e.clientWidth, e.getBBox().width])")
-        assert all(drawn <= room for room, drawn in widths)
+        wide = "return [...document.querySelectorAll('.js-plotly-plot .main-svg')].map((e) => [e.clientWidth, "
+        assert all(own <= room for own, room in page(wide + "e.closest('.js-plotly-plot').clientWidth])"))
+        colours = page("return [...new Set(document.querySelector('#recall .chart').data.map((t) => t.line.color))]")
+        assert set(colours) == set((LIGHT if scheme == "light" else DARK)[:4])
     finally:
         browser.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})

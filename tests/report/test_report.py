@@ -20,6 +20,7 @@ from bpnp.report import (
     summarise,
     write_results,
 )
+from bpnp.report.folder import append_rows, finished_rows
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 HOSTILE = [
@@ -177,6 +178,28 @@ def test_a_failed_write_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.
     assert [path.name for path in tmp_path.iterdir()] == ["pairs.csv"]
     with pytest.raises(ValueError, match=r"expected a results folder with summary\.json, got no .*summary\.json"):
         read_results(tmp_path)
+
+
+def test_finished_pairs_are_on_the_disk_before_the_test_ends(tmp_path: Path) -> None:
+    rows = [row(i, estimate, id=HOSTILE[i]) for i in range(3) for estimate in ("ransac", "pnp")]
+    append_rows(tmp_path / "run", rows[:2])
+    append_rows(tmp_path / "run", rows[2:])
+    assert finished_rows(tmp_path / "run") == rows
+    path = tmp_path / "run" / "unfinished.csv"
+    path.write_bytes(path.read_bytes()[:-9])  # killed while it wrote
+    assert finished_rows(tmp_path / "run") == rows[:-1]
+    append_rows(tmp_path / "run", rows[-1:])
+    assert finished_rows(tmp_path / "run") == rows
+    write_results(tmp_path / "run", finished_rows(tmp_path / "run"))
+    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["pairs.csv", "summary.json"]
+    assert finished_rows(tmp_path / "run") == list(read_results(tmp_path / "run").rows)
+
+
+def test_results_as_a_data_frame(tmp_path: Path) -> None:
+    rows = [row(i, rotation_error_deg=float(i)) for i in range(12)]
+    frame = write_results(tmp_path, rows).frame()
+    assert frame.rotation_error_deg.tolist() == [r.rotation_error_deg for r in rows]
+    assert frame[frame.cause == "solved"]["index"].tolist() == list(range(6))
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,8 @@ from bpnp.cli import COMMANDS
 from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.report import plot_pair, view_command, write_page
 from bpnp.report.photos import Box, box_of
+from bpnp.report.samples import write_views
 from bpnp.report.solutions import solution_view
-from bpnp.report.views import write_views
 
 
 @dataclass

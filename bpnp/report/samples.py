@@ -1,10 +1,12 @@
-"""The points of a few pairs of a test, `views.npz`: enough to draw what the cameras see, for the worst and some others.
+"""The points of the pairs of a test, `points.npz`: enough to draw what the cameras see.
 
-A test of ten thousand pairs keeps a few dozen. Which ones does not depend on the order of batches or on processes.
+Of every pair up to `FEW` points a side are kept; of the worst pairs and of some others, up to `MANY`. Which ones does
+not depend on the order of batches or on processes.
 """
 
 import io
-from collections.abc import Iterable
+import json
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -17,9 +19,9 @@ from bpnp.files import written_whole
 from bpnp.metrics import rotation_error
 from bpnp.types import Batch, Prediction
 
-FORMAT = 1
-FILE = "views.npz"
-MOST_POINTS = 1000
+FORMAT = 2
+FILE = "points.npz"
+FEW, MANY = 24, 1000
 
 Array = npt.NDArray[Any]
 
@@ -31,7 +33,8 @@ class PairView:
     points2d: (m, 2). points3d: (n, 3). match3d: (n,) the 2D point that each 3D point truly is, -1 for none.
     assigned3d: (n,) the 2D point to which the solver's assignment gives most of each 3D point, -1 if it has none.
     pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
-    error: rotation error of the first estimate in degrees, by which the worst are chosen.
+    error: rotation error of the first estimate in degrees, by which the worst are chosen. ids2d, ids3d: the places of
+    the points in the pair as it was solved, if only some of them are here; None for all.
     """
 
     index: int
@@ -43,9 +46,16 @@ class PairView:
     pose: tuple[Array, Array] | None = None
     estimates: dict[str, tuple[Array, Array]] = field(default_factory=dict)
     error: float = 180.0
+    ids2d: Array | None = None
+    ids3d: Array | None = None
+
+    def numbers(self) -> tuple[Array, Array]:
+        """`ids2d` and `ids3d`, counted where they are None."""
+        count2d, count3d = np.arange(len(self.points2d)), np.arange(len(self.points3d))
+        return count2d if self.ids2d is None else self.ids2d, count3d if self.ids3d is None else self.ids3d
 
 
-def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MOST_POINTS) -> list[PairView]:
+def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY) -> list[PairView]:
     """The views of a batch. Of larger sets `most_points` are kept on each side, evenly spaced, matched ones first."""
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
@@ -59,42 +69,19 @@ def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MOST_
     errors = _first_errors(prediction, batch)
     views = []
     for i in range(len(batch)):
-        real3d = mask3d[i]
-        match = match3d[i][real3d]
-        keep2d, keep3d = _kept(int(mask2d[i].sum()), match, most_points)
-        views.append(
-            PairView(
-                index=int(batch.index[i]),
-                id=batch.ids[i],
-                points2d=points2d[i][mask2d[i]][keep2d].astype(np.float32),
-                points3d=points3d[i][real3d][keep3d].astype(np.float32),
-                match3d=_renumbered(match[keep3d], keep2d),
-                assigned3d=_renumbered(assigned3d[i][real3d][keep3d], keep2d),
-                pose=None if truth is None else (truth[0][i], truth[1][i]),
-                estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
-                error=errors[i],
-            )
+        view = PairView(
+            index=int(batch.index[i]),
+            id=batch.ids[i],
+            points2d=points2d[i][mask2d[i]].astype(np.float32),
+            points3d=points3d[i][mask3d[i]].astype(np.float32),
+            match3d=match3d[i][mask3d[i]].astype(np.int32),
+            assigned3d=assigned3d[i][mask3d[i]].astype(np.int32),
+            pose=None if truth is None else (truth[0][i], truth[1][i]),
+            estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
+            error=errors[i],
         )
+        views.append(thin(view, most_points))
     return views
-
-
-def view_of(
-    points2d: Array, points3d: Array, rotation: Array, translation: Array, *, matches: Array | None = None, id: str = ""
-) -> PairView:
-    """The view of one solved pair: points (m, 2) and (n, 3), pose camera = R p + t.
-
-    matches: (k, 2) indices of a 2D and a 3D point. Raises ValueError if one of them is no point.
-    """
-    assigned = np.full(len(points3d), -1, np.int32)
-    if matches is not None and len(matches):
-        most = np.max(matches, axis=0)
-        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
-            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
-            raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
-        assigned[matches[:, 1]] = matches[:, 0]
-    none = np.full(len(points3d), -1, np.int32)
-    pose = (np.asarray(rotation), np.asarray(translation))
-    return PairView(0, id, np.asarray(points2d), np.asarray(points3d), none, assigned, None, {"solution": pose})
 
 
 def select_views(views: Iterable[PairView], *, worst: int = 12, others: int = 12) -> tuple[PairView, ...]:
@@ -113,29 +100,50 @@ def select_views(views: Iterable[PairView], *, worst: int = 12, others: int = 12
     return tuple(chosen[index] for index in sorted(chosen))
 
 
-def thin(view: PairView, most: int) -> PairView:
-    """The view with at most `most` points on each side, matched ones first."""
+def thin(view: PairView, most: int = FEW) -> PairView:
+    """The view with at most `most` points on each side, evenly spaced, matched ones first."""
     keep2d, keep3d = _kept(len(view.points2d), view.match3d, most)
+    ids2d, ids3d = view.numbers()
     return replace(
         view,
         points2d=view.points2d[keep2d],
         points3d=view.points3d[keep3d],
         match3d=_renumbered(view.match3d[keep3d], keep2d),
         assigned3d=_renumbered(view.assigned3d[keep3d], keep2d),
+        ids2d=ids2d[keep2d].astype(np.int32),
+        ids3d=ids3d[keep3d].astype(np.int32),
     )
 
 
 def write_views(folder: Path | str, views: Iterable[PairView]) -> None:
-    """Write `views.npz` whole or not at all. Float32, uncompressed, no pickles."""
-    arrays: dict[str, Array] = {"format": np.array(FORMAT)}
-    for number, view in enumerate(views):
-        fields = ("points2d", "points3d", "match3d", "assigned3d", "index", "id", "error")
-        parts: dict[str, Any] = {name: getattr(view, name) for name in fields}
-        if view.pose is not None:
-            parts["pose"] = _stacked(view.pose)
-        for order, (name, pose) in enumerate(view.estimates.items()):
-            parts |= {f"estimate{order}": name, f"estimate{order}.pose": _stacked(pose)}
-        arrays |= {f"{number}.{name}": np.asarray(value) for name, value in parts.items()}
+    """Write `points.npz` whole or not at all: columns with the points of all pairs one after the other, no pickles.
+
+    Of several views of one index the first is kept. Raises ValueError if the views have different estimates.
+    """
+    first: dict[int, PairView] = {}
+    for view in views:
+        first.setdefault(view.index, view)
+    kept = [first[index] for index in sorted(first)]
+    names = list(kept[0].estimates) if kept else []
+    if any(list(view.estimates) != names for view in kept):
+        raise ValueError(f"expected views with the estimates {names}, got others; try a folder for each solver")
+    numbers = [view.numbers() for view in kept]
+    arrays = {
+        "format": np.array(FORMAT),
+        "ids": np.frombuffer(json.dumps([view.id for view in kept]).encode(), np.uint8),
+        "index": np.array([view.index for view in kept], np.int64),
+        "error": np.array([view.error for view in kept], np.float64),
+        "count2d": np.array([len(view.points2d) for view in kept], np.int64),
+        "count3d": np.array([len(view.points3d) for view in kept], np.int64),
+        "points2d": _joined([view.points2d for view in kept], np.float32, 2),
+        "points3d": _joined([view.points3d for view in kept], np.float32, 3),
+        "match3d": _joined([view.match3d for view in kept], np.int32),
+        "assigned3d": _joined([view.assigned3d for view in kept], np.int32),
+        "ids2d": _joined([own for own, _ in numbers], np.int32),
+        "ids3d": _joined([own for _, own in numbers], np.int32),
+        "pose": _stacked([view.pose for view in kept]),
+    }
+    arrays |= {f"estimate.{name}": _stacked([view.estimates[name] for view in kept]) for name in names}
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
     with written_whole(Path(folder) / FILE) as temporary:
@@ -150,36 +158,45 @@ def read_views(folder: Path | str) -> tuple[PairView, ...]:
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
-        found = int(arrays.pop("format"))
+        found = int(arrays["format"])
         if found == FORMAT:
-            numbers = sorted({int(name.split(".")[0]) for name in arrays})
-            return tuple(_view(arrays, f"{number}.") for number in numbers)
-    except (KeyError, ValueError, OSError, EOFError) as error:
-        raise ValueError(f"expected views of a test in {path}, got {error}; try `bpnp test` again") from error
-    raise ValueError(f"expected views of format {FORMAT} in {path}, got {found}; try the bpnp that wrote them")
+            return tuple(_views(arrays))
+    except Exception as error:  # noqa: BLE001 - zipfile, numpy and json each have errors of their own
+        raise ValueError(f"expected points of a test in {path}, got {error}; try `bpnp test` again") from error
+    raise ValueError(f"expected points of format {FORMAT} in {path}, got {found}; try the bpnp that wrote them")
 
 
-def _view(arrays: dict[str, Array], prefix: str) -> PairView:
-    own = {name.removeprefix(prefix): value for name, value in arrays.items() if name.startswith(prefix)}
-    estimates: dict[str, tuple[Array, Array]] = {}
-    while (key := f"estimate{len(estimates)}") in own:
-        estimates[str(own[key])] = _split(own[f"{key}.pose"])
-    return PairView(
-        index=int(own["index"]),
-        id=str(own["id"]),
-        points2d=own["points2d"],
-        points3d=own["points3d"],
-        match3d=own["match3d"],
-        assigned3d=own["assigned3d"],
-        pose=_split(own["pose"]) if "pose" in own else None,
-        estimates=estimates,
-        error=float(own["error"]),
-    )
+def _views(arrays: dict[str, Array]) -> Iterable[PairView]:
+    ids = json.loads(arrays["ids"].tobytes())
+    ends2d, ends3d = arrays["count2d"].cumsum(), arrays["count3d"].cumsum()
+    prefix = "estimate."
+    for i, name in enumerate(ids):
+        own2d = slice(ends2d[i] - arrays["count2d"][i], ends2d[i])
+        own3d = slice(ends3d[i] - arrays["count3d"][i], ends3d[i])
+        truth = arrays["pose"][i]
+        yield PairView(
+            index=int(arrays["index"][i]),
+            id=name,
+            points2d=arrays["points2d"][own2d],
+            points3d=arrays["points3d"][own3d],
+            match3d=arrays["match3d"][own3d],
+            assigned3d=arrays["assigned3d"][own3d],
+            pose=_split(truth) if np.isfinite(truth).all() else None,
+            estimates={key.removeprefix(prefix): _split(a[i]) for key, a in arrays.items() if key.startswith(prefix)},
+            error=float(arrays["error"][i]),
+            ids2d=arrays["ids2d"][own2d],
+            ids3d=arrays["ids3d"][own3d],
+        )
 
 
-def _stacked(pose: tuple[Array, Array]) -> Array:
-    rotation, translation = pose
-    return np.c_[rotation, translation].astype(np.float64)
+def _joined(parts: Sequence[Array], kind: type, *width: int) -> Array:
+    return np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
+
+
+def _stacked(poses: Sequence[tuple[Array, Array] | None]) -> Array:
+    """[R | t] of each pair, (k, 3, 4), NaN for none."""
+    missing = np.full((3, 4), np.nan)
+    return np.array([missing if pose is None else np.c_[pose] for pose in poses], np.float64).reshape(-1, 3, 4)
 
 
 def _split(pose: Array) -> tuple[Array, Array]:

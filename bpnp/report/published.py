@@ -3,18 +3,17 @@
 from collections.abc import Mapping
 from typing import Literal
 
-from bpnp.report.tables import QUARTILES
-
 Paper = Literal["modelnet40", "megadepth"]
 NAMES: Mapping[Paper, str] = {"modelnet40": "ModelNet40", "megadepth": "MegaDepth"}
-RECALL = {"modelnet40": "recall_joint_15deg_0.5", "megadepth": "recall_joint_10deg_1"}
+ERRORS = (("rotation", "_deg"), ("translation", ""), ("reprojection", "_deg"))
+KEYS = (*(f"{error}_q{number}{unit}" for error, unit in ERRORS for number in (1, 2, 3)), "seconds_mean")
+RECALL: Mapping[Paper, str] = {"modelnet40": "recall_joint_15deg_0.5", "megadepth": "recall_joint_10deg_1"}
 
 
 def _rows(paper: Paper, text: str) -> dict[str, dict[str, str]]:
     """A row per line: label | nine quartiles, seconds and, for some, the recall in %."""
-    keys = (*(column.key for column in QUARTILES), "seconds_mean", RECALL[paper])
     lines = (line.split("|") for line in text.strip().splitlines())
-    return {label.strip(): dict(zip(keys, numbers.split(), strict=False)) for label, numbers in lines}
+    return {label.strip(): dict(zip((*KEYS, RECALL[paper]), numbers.split(), strict=False)) for label, numbers in lines}
 
 
 # Campbell, Liu, Gould, ECCV 2020, tables 1 and 2, recalls from the text. R: the RANSAC estimate. SoftPOSIT, RANSAC and
@@ -45,3 +44,8 @@ PUBLISHED: Mapping[Paper, Mapping[str, Mapping[str, str]]] = {
         """,
     ),
 }
+
+
+def published_rows(paper: Paper | None) -> dict[str, Mapping[str, str]]:
+    """The printed rows of a data set by the name that a table gives them; none without a data set."""
+    return {} if paper is None else {f"paper, {NAMES[paper]}: {name}": row for name, row in PUBLISHED[paper].items()}

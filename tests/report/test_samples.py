@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.views import PairView, read_views, select_views, views_from, write_views
+from bpnp.report.samples import FEW, PairView, read_views, select_views, thin, views_from, write_views
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -91,21 +92,48 @@ def test_choosing_in_parts_is_choosing_from_the_whole() -> None:
 def test_views_are_read_as_they_were_written(tmp_path: Path) -> None:
     batch = planted((12, 9), clutter=2)
     views = views_from(answered(batch), batch)
-    unknown = views_from(
-        Prediction(), Batch.from_arrays(np.ones((2, 2)), np.ones((3, 3)), ids=["<é\udcff. "], index=[7])
-    )
-    assert unknown[0].assigned3d.tolist() == [-1] * 3
-    write_views(tmp_path, [*views, *unknown])
-    assert [path.name for path in tmp_path.iterdir()] == ["views.npz"]
+    views = [*views, replace(views[0], index=7, id="<é\udcff. ", pose=None)]
+    write_views(tmp_path, reversed(views))
+    assert [path.name for path in tmp_path.iterdir()] == ["points.npz"]
     read = read_views(tmp_path)
     assert read[2].pose is None
-    assert (read[2].id, read[2].index, read[2].estimates) == ("<é\udcff. ", 7, {})
-    for before, after in zip([*views, *unknown], read, strict=True):
-        for name in ("points2d", "points3d", "match3d", "assigned3d"):
+    assert (read[2].id, read[2].index) == ("<é\udcff. ", 7)
+    for before, after in zip(views, read, strict=True):
+        for name in ("points2d", "points3d", "match3d", "assigned3d", "error"):
             np.testing.assert_array_equal(getattr(before, name), getattr(after, name))
         for name, pose in before.estimates.items():
             np.testing.assert_array_equal(np.c_[pose], np.c_[after.estimates[name]])
     assert read_views(tmp_path / "nowhere") == ()
-    (tmp_path / "views.npz").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"expected views of a test in .*views.npz"):
+    (tmp_path / "points.npz").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"expected points of a test in .*points.npz"):
         read_views(tmp_path)
+    with pytest.raises(ValueError, match=r"expected views with the estimates \['pnp'\], got others"):
+        write_views(tmp_path, [views[0], replace(views[1], estimates={})])
+
+
+def test_without_poses_and_matches_the_points_are_kept(tmp_path: Path) -> None:
+    batch = Batch.from_arrays(np.ones((2, 2)), np.ones((3, 3)), ids=["x"], index=[7])
+    write_views(tmp_path, views_from(Prediction(), batch))
+    (view,) = read_views(tmp_path)
+    assert view.assigned3d.tolist() == view.match3d.tolist() == [-1] * 3
+    assert (view.estimates, view.pose) == ({}, None)
+
+
+def test_a_thinned_pair_knows_the_numbers_of_its_points(tmp_path: Path) -> None:
+    batch = planted((60, 12), clutter=4)
+    whole = views_from(answered(batch), batch)
+    write_views(tmp_path, [thin(whole[0]), whole[1]])
+    few, all_points = read_views(tmp_path)
+    assert len(few.points2d) == len(few.points3d) == FEW
+    ids2d, ids3d = few.numbers()
+    np.testing.assert_array_equal(few.points2d, whole[0].points2d[ids2d])
+    np.testing.assert_array_equal(few.points3d, whole[0].points3d[ids3d])
+    np.testing.assert_array_equal(ids2d[few.match3d], whole[0].match3d[ids3d])
+    assert all_points.numbers()[0].tolist() == list(range(12))
+
+
+def test_of_a_pair_that_is_given_twice_the_first_is_kept(tmp_path: Path) -> None:
+    batch = planted((60,), clutter=4)
+    whole = views_from(answered(batch), batch)
+    write_views(tmp_path, [*whole, *map(thin, whole)])
+    assert [len(view.points2d) for view in read_views(tmp_path)] == [60]
