@@ -177,7 +177,7 @@ def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:
 
 
 def test_every_short_name_can_be_built() -> None:
-    for name in ("softposit", "ransac", "gosma", "gopac", "hungarian", "bpnpnet"):
+    for name in ("softposit", "ransac", "gosma", "gopac", "constellation", "hungarian", "bpnpnet"):
         (method,) = parse_methods([name], time_limit=2.0)
         solver = method.build()
         assert solver.estimates

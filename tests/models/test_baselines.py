@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 
 from bpnp import Batch, BPnPNet
 from bpnp.metrics import rotation_error, translation_error
-from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
+from bpnp.models.baselines import GOPAC, GOSMA, Constellation, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.agreement import agreement
 from bpnp.models.baselines.hungarian import hungarian
 from bpnp.models.baselines.random_ransac import probability_of_true_triple
@@ -25,6 +25,7 @@ QUICK: dict[str, PairSolver] = {
     "random_ransac": RandomRansac(max_hypotheses=512, time_limit=None),
     "gosma": GOSMA(max_boxes=400, batch=64, time_limit=None),
     "gopac": GOPAC(max_boxes=400, time_limit=None, angle=0.02),
+    "constellation": Constellation(neighbours2d=3, neighbours3d=3, time_limit=None),
 }
 each_solver = pytest.mark.parametrize("name", QUICK)
 
@@ -54,7 +55,7 @@ def test_three_points_have_no_pose_and_say_so(name: str) -> None:
 
 @each_solver
 def test_a_limit_of_time_ends_in_an_unconverged_answer(name: str) -> None:
-    solver = {"softposit": SoftPOSIT, "random_ransac": RandomRansac, "gosma": GOSMA, "gopac": GOPAC}[name]
+    solver = type(QUICK[name])
     with torch.inference_mode():
         pose = solver(time_limit=1e-6)(plant(1, 30).batch()).poses[name]
     assert not pose.stats.converged[0]
