@@ -16,7 +16,6 @@ from torch import Tensor
 
 from bpnp.geometry import bearings, rotation_angle
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
-from bpnp.layers.implicit import entropic_plan
 
 MU, MANY = 0.1, 10_000
 FORWARD_CASES: tuple[tuple[Kind, float, float, float, int, str], ...] = (
@@ -141,9 +140,8 @@ def _marginal_error(plan: Tensor) -> str:
 def _sinkhorn_backward(problem: Problem, size: Size, inputs: str, target: str) -> Row:
     """dL/dM of the correspondence loss; the error is the largest of this and of a random dL/dP."""
     cost = problem.cost.requires_grad_()
-    plan = sinkhorn(cost.detach(), mu=MU)[0]
-    marginals = [plan.new_full(plan.shape[:2], 1 / plan.shape[1]) for _ in range(2)]
-    linked = entropic_plan(plan, cost, torch.tensor(MU), *marginals)
+    linked = sinkhorn(cost, mu=MU)[0]
+    plan = linked.detach()
     by_loss = 1 - 2 * torch.eye(plan.shape[1]).expand_as(plan)
 
     def ours(incoming: Tensor = by_loss) -> Tensor:

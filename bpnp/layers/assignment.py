@@ -1,7 +1,7 @@
 """Entropic optimal transport from a cost matrix to a joint probability (paper Eqs. 4 and 8), to convergence.
 
 P = argmin <P, M> + mu sum P (log P - 1)  over P >= 0, P 1 = r, P^T 1 = c.
-`bpnp.layers.transport` finds the optimum, `bpnp.layers.implicit` knows its derivative.
+`bpnp.layers.transport` finds the optimum, `bpnp.layers.adjoint` its gradient, by the theorem in `bpnp.layers.implicit`.
 """
 
 import math
@@ -10,13 +10,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.layers.implicit import entropic_plan
-from bpnp.layers.pacing import waits
+from bpnp.checks import checked_shapes
+from bpnp.layers.adjoint import project, solve_multipliers
+from bpnp.layers.implicit import BackwardStats, entropic_plan, record
 from bpnp.layers.transport import solve_plan
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
 
+@checked_shapes
 @full_precision
 def sinkhorn(
     cost: Float[Tensor, "b m n"],
@@ -29,71 +31,116 @@ def sinkhorn(
     dustbin: float | Tensor | None = None,
     tolerance: float = 1e-6,
     max_iterations: int = 1000,
+    backward_stats: BackwardStats | None = None,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Joint probability of every pair, and per-sample stats.
+    """Joint probability P of every pair: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 8).
 
     cost: M, infinite for a pair that cannot be.
     mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).
     row_marginal, col_marginal: r and c, each summing to one over real points (default uniform); they receive gradients.
     mask2d, mask3d: True at real points; a padded row or column gets no mass.
-    dustbin: cost of leaving a point unmatched, a number or a scalar tensor; None for a full assignment. With it the
-        points share their marginals with one bin on each side in the proportion m : n, points to the other side's bin,
-        and the assignment sums to less than one.
+    dustbin: cost of leaving a point unmatched, a number or a scalar tensor (which receives a gradient); None for a full
+        assignment. With it each side gets one more point, the bin (`dustbin_marginals`), which is left out of the
+        result, so that P sums to less than one.
     tolerance: largest L1 error of the row and of the column sums at which a sample stops.
-    max_iterations: pairs of scalings; on cuda at most 24, all of which are taken (a stop would make the host wait), and
-        in the cost's own precision: sharp plans in float32 may end short of the tolerance there, and say so.
+    max_iterations: pairs of scalings for each sample.
+    backward_stats: counts the samples of backward passes, and those that did not converge. Without it the latter cause
+        a RuntimeWarning.
 
-    Returns the assignment (b, m, n) and stats (residual: that L1 error). Samples stop independently of each other. The
-    gradient is that of the optimum (`bpnp.layers.implicit`); its memory is O(m n), whatever the iterations.
-    Raises ValueError for mu <= 0 or a sample without a real point on either side.
+    Returns P and stats (residual: that L1 error). Samples stop independently of each other. The gradient is that of the
+    optimum (`bpnp.layers.implicit`); it needs O(m n) memory. There is no second derivative.
+    Raises ValueError for mu <= 0, a sample without a real point on either side, shapes that do not fit, an empty axis
+    or integers.
+
+    >>> assignment, stats = sinkhorn(torch.tensor([[[0.0, 1.0], [1.0, 0.2]]]), mu=0.5)
+    >>> assignment
+    tensor([[[0.4291, 0.0709],
+             [0.0709, 0.4291]]])
+    >>> stats.converged
+    tensor([True])
     """
-    mu_tensor = torch.as_tensor(mu, dtype=cost.dtype, device=cost.device)
-    if not bool(mu_tensor > 0):
-        raise ValueError(f"expected `mu` > 0, got {float(mu_tensor)}; try 0.1")
-    b, m, n = cost.shape
-    real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
-    real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
-    if not waits(cost.device) and not bool((real2d.any(-1) & real3d.any(-1)).all()):
-        raise ValueError("expected at least one real point on each side of every sample, got an empty mask")
-    rows = _uniform(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
-    cols = _uniform(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
+    real2d, real3d = _checked(cost, mu, mask2d, mask3d, dustbin)
+    _, m, n = cost.shape
+    rows = uniform_marginal(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
+    cols = uniform_marginal(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
     if dustbin is not None:
-        cost, rows, cols = _with_dustbin(cost, dustbin, rows, cols, real2d, real3d)
-    fixed_mu = mu.detach().to(cost) if isinstance(mu, Tensor) else mu
+        cost = _with_dustbin(cost, torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device))
+        rows, cols = dustbin_marginals(rows, cols, real2d, real3d)
+    exact_mu = torch.as_tensor(mu, dtype=torch.float64, device=cost.device)
     with torch.no_grad():
-        plan, stats = solve_plan(cost, rows, cols, mu=fixed_mu, tolerance=tolerance, max_iterations=max_iterations)
-    plan = entropic_plan(plan, cost, mu, rows, cols)
+        plan, stats = solve_plan(cost, rows, cols, mu=exact_mu, tolerance=tolerance, max_iterations=max_iterations)
+
+    def solve_adjoint(plan: Tensor, gradient: Tensor, factor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        a, b, converged = solve_multipliers(plan, gradient)
+        record(backward_stats, "sinkhorn", converged)
+        return project(plan, gradient, a, b, factor), a, b
+
+    plan = entropic_plan(plan, cost, exact_mu.to(cost.dtype), rows, cols, solve_adjoint)
     return (plan if dustbin is None else plan[:, :m, :n]), stats
 
 
-def _uniform(real: Bool[Tensor, "b k"], dtype: torch.dtype) -> Float[Tensor, "b k"]:
+def uniform_marginal(real: Bool[Tensor, "b k"], dtype: torch.dtype) -> Float[Tensor, "b k"]:
+    """The same share of one for each real point."""
     return real.to(dtype) / real.sum(-1, keepdim=True)
 
 
-def _with_dustbin(
-    cost: Tensor, dustbin: float | Tensor, rows: Tensor, cols: Tensor, real2d: Tensor, real3d: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Append a bin to each side; point marginals scale to m/(m+n) and n/(m+n), the bins take the other side's share."""
-    bin_cost = dustbin.to(cost) if isinstance(dustbin, Tensor) else cost.new_full((), dustbin)
-    m, n = (real.sum(-1, keepdim=True).to(cost.dtype) for real in (real2d, real3d))
+def dustbin_marginals(
+    rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"], real2d: Bool[Tensor, "b m"], real3d: Bool[Tensor, "b n"]
+) -> tuple[Float[Tensor, "b rows"], Float[Tensor, "b cols"]]:
+    """Marginals (b, m + 1), (b, n + 1) of both sides with a bin at the end that has room for the other side's points.
+
+    With m and n real points, those of the image have m / (m + n) of the mass and their bin n / (m + n); in the scene
+    it is the other way round. Uniform marginals thus give each point of either side 1 / (m + n).
+    """
+    m, n = (real.sum(-1, keepdim=True).to(rows.dtype) for real in (real2d, real3d))
     share2d, share3d = m / (m + n), n / (m + n)
+    return torch.cat([rows * share2d, share3d], -1), torch.cat([cols * share3d, share2d], -1)
+
+
+def _with_dustbin(cost: Float[Tensor, "b m n"], bin_cost: Float[Tensor, ""]) -> Float[Tensor, "b rows cols"]:
     cost = torch.cat([cost, bin_cost.expand(*cost.shape[:2], 1)], -1)
-    cost = torch.cat([cost, bin_cost.expand(cost.shape[0], 1, cost.shape[2])], -2)
-    rows = torch.cat([rows * share2d, share3d], -1)
-    cols = torch.cat([cols * share3d, share2d], -1)
-    return cost, rows, cols
+    return torch.cat([cost, bin_cost.expand(cost.shape[0], 1, cost.shape[2])], -2)
+
+
+def _checked(
+    cost: Tensor,
+    mu: float | Tensor,
+    mask2d: Tensor | None,
+    mask3d: Tensor | None,
+    dustbin: float | Tensor | None,
+) -> tuple[Bool[Tensor, "b m"], Bool[Tensor, "b n"]]:
+    """Raise ValueError for arguments that mean nothing; return which points are real."""
+    for name, scalar in (("mu", mu), ("dustbin", dustbin)):
+        if isinstance(scalar, Tensor) and scalar.ndim:
+            raise ValueError(f"expected `{name}` as a number or a scalar tensor, got shape {tuple(scalar.shape)}")
+    if not mu > 0:
+        raise ValueError(f"expected `mu` > 0, got {float(mu)}; try 0.1")
+    b, m, n = cost.shape
+    real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
+    real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
+    for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
+        if mask is not None and not bool(mask.any(-1).all()):
+            raise ValueError(f"expected at least one real point on each side of every sample, got an empty `{name}`")
+    return real2d, real3d
 
 
 class Sinkhorn(nn.Module):
-    """`sinkhorn` with its options as a module; `mu` and `dustbin` may be learned.
+    """`sinkhorn` with its options as a module; `mu` may be learned.
+
+    Its `backward_stats` count the backward passes of the module and those that did not converge: log
+    `backward_stats.unconverged` at the end of an epoch, then call `backward_stats.reset()`.
 
     Args:
         mu: entropy weight of the transport.
         learn_mu: whether mu is learned.
         dustbin: cost of leaving a point unmatched; null for a full assignment.
-        learn_dustbin: whether that cost is learned.
         tolerance: L1 error of the marginals at which the transport stops.
         max_iterations: pairs of scalings, at most.
+
+    >>> layer = Sinkhorn(mu=0.1, learn_mu=True)
+    >>> assignment, stats = layer(torch.rand(2, 5, 6))
+    >>> assignment.shape, [name for name, _ in layer.named_parameters()]
+    (torch.Size([2, 5, 6]), ['log_mu'])
     """
 
     def __init__(
@@ -102,21 +149,18 @@ class Sinkhorn(nn.Module):
         mu: float = 0.1,
         learn_mu: bool = False,
         dustbin: float | None = None,
-        learn_dustbin: bool = False,
         tolerance: float = 1e-6,
         max_iterations: int = 1000,
     ) -> None:
         super().__init__()
         if not mu > 0:
             raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
-        if learn_dustbin and dustbin is None:
-            raise ValueError("expected a `dustbin` cost to learn from, got None; try 1.0")
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu))) if learn_mu else None
         self.mu, self.learn_mu = mu, learn_mu
-        self.dustbin, self.learn_dustbin = dustbin, learn_dustbin
-        self.bin_cost = nn.Parameter(torch.tensor(float(dustbin))) if learn_dustbin and dustbin is not None else None
+        self.dustbin = dustbin
         self.tolerance = tolerance
         self.max_iterations = max_iterations
+        self.backward_stats = BackwardStats()
 
     def forward(
         self,
@@ -129,9 +173,10 @@ class Sinkhorn(nn.Module):
             mu=self.entropy,
             mask2d=mask2d,
             mask3d=mask3d,
-            dustbin=self.dustbin if self.bin_cost is None else self.bin_cost,
+            dustbin=self.dustbin,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            backward_stats=self.backward_stats,
         )
 
     @property

@@ -1,20 +1,77 @@
-"""The derivative of an optimum with respect to its problem (paper Lemmas 1 and 2), apart from how it was found.
+"""The derivative of an optimum with respect to its problem (paper Lemmas 1 and 2), whatever solver found it.
 
-If F(y, x) = 0 defines y(x), then dL/dx = -(dF/dx)^T w with (dF/dy)^T w = dL/dy: one linear solve, one vector-Jacobian
-product, and no memory of the iterations. `at_optimum` is that statement for any small y; `_EntropicPlan` is the same
-for the transport plan, whose (m + n) multipliers leave a closed form.
+If F(y, x) = 0 defines y(x), then dL/dx = -(dF/dx)^T w with (dF/dy)^T w = dL/dy: one linear solve and one
+vector-Jacobian product; the iterations need not be kept. `at_optimum` is this for a small y. `entropic_plan` is the
+closed form for the transport plan. The caller passes the solver of the linear system; `BackwardStats` count how often
+it did not converge.
 """
 
+import functools
+import warnings
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from bpnp.layers.adjoint import solve_multipliers
-from bpnp.layers.fused import projected
+from bpnp.precision import exact_products
+
+
+@dataclass
+class BackwardStats:
+    """Number of samples whose gradient was solved for, and of those whose solver did not converge.
+
+    A sample that did not converge still has a gradient, the last iterate; it is not finite where the sample was not.
+
+    >>> from bpnp.layers import Sinkhorn
+    >>> layer = Sinkhorn(mu=0.1)
+    >>> cost = torch.rand(2, 5, 6, requires_grad=True)
+    >>> layer(cost)[0].square().sum().backward()
+    >>> layer.backward_stats
+    BackwardStats(samples=2, unconverged=0)
+    """
+
+    samples: int = 0
+    unconverged: int = 0
+
+    def reset(self) -> None:
+        self.samples = self.unconverged = 0
+
+
+def record(stats: BackwardStats | None, layer: str, converged: Bool[Tensor, " b"]) -> None:
+    """Count a backward pass in `stats`; without an object to count in, warn of samples that did not converge."""
+    unconverged = int((~converged).sum())
+    if stats is not None:
+        stats.samples += len(converged)
+        stats.unconverged += unconverged
+    elif unconverged:
+        warnings.warn(
+            f"the gradient of {layer} did not converge for {unconverged} of {len(converged)} samples; "
+            "pass `backward_stats` to count such samples instead",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+
+
+def first_derivative(backward: Callable[..., Any]) -> Callable[..., Any]:
+    """Decorator of the `backward` of a Function that has no second derivative; products are exact in it.
+
+    Raises ValueError under `create_graph=True`, whose gradient would lack the graph that was asked for.
+    """
+
+    @functools.wraps(backward)
+    def run(ctx: Any, gradient: Tensor) -> Any:
+        if torch.is_grad_enabled():
+            raise ValueError(
+                "expected a first derivative, got create_graph=True: the layers have no second derivative; "
+                "try create_graph=False"
+            )
+        with exact_products(gradient.device):
+            return backward(ctx, gradient)
+
+    return run
 
 
 def at_optimum(
@@ -23,7 +80,7 @@ def at_optimum(
     """Return `solution` unchanged, with the gradient dL/dx = -(dF/dx)^T w, (dF/dy)^T w = dL/dy.
 
     solution: y with optimality(y, *parameters) = 0.
-    optimality: F, differentiable in the parameters; the invariant that defines y.
+    optimality: F, differentiable in the parameters.
     solve_adjoint: maps dL/dy to w; a sample that has no derivative must map to zero and be flagged by the caller.
     parameters: the x that receive gradients.
     """
@@ -44,7 +101,7 @@ class _AtOptimum(torch.autograd.Function):
         return solution.clone()
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         solution, *parameters = ctx.saved_tensors
         adjoint = ctx.solve_adjoint(gradient)
@@ -59,40 +116,42 @@ class _AtOptimum(torch.autograd.Function):
         return None, None, None, *gradients
 
 
+PlanAdjoint = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
 def entropic_plan(
     plan: Float[Tensor, "b m n"],
     cost: Float[Tensor, "b m n"],
-    mu: float | Tensor,
+    mu: Float[Tensor, ""],
     row_marginal: Float[Tensor, "b m"],
     col_marginal: Float[Tensor, "b n"],
+    solve_adjoint: PlanAdjoint,
 ) -> Float[Tensor, "b m n"]:
     """Return `plan`, the minimiser of <P, cost> + mu P (log P - 1) with the given marginals, with its gradients.
 
     With V = dL/dP and multipliers a, b from [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1]:
-    dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = -sum P.(V - a1^T - 1b^T).log(P)/mu, dL/drow = a, dL/dcol = b
-    (up to the one constant that P cannot tell apart, chosen so that the mean of b, weighted by c, is zero).
+    dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = <dL/dcost, log P>, dL/drow = a, dL/dcol = b
+    (up to one constant added to a and taken from b, chosen so that the mean of b, weighted by c, is zero).
     The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
+
+    solve_adjoint: maps P, V and a factor s () to s P.(V - a1^T - 1b^T), a and b.
     """
-    mu_tensor = mu.to(cost) if isinstance(mu, Tensor) else cost.new_full((), mu)
-    return _EntropicPlan.apply(plan, cost, mu_tensor, row_marginal, col_marginal)
+    return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, solve_adjoint)
 
 
 class _EntropicPlan(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, plan: Tensor, cost: Tensor, mu: Tensor, row_marginal: Tensor, col_marginal: Tensor) -> Tensor:
+    def forward(
+        ctx: Any, plan: Tensor, cost: Tensor, mu: Tensor, rows: Tensor, cols: Tensor, solve_adjoint: PlanAdjoint
+    ) -> Tensor:
         ctx.save_for_backward(plan, mu)
-        return plan.clone() if ctx.needs_input_grad[0] else plan.view_as(plan)
+        ctx.solve_adjoint = solve_adjoint
+        return plan.view_as(plan)
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         plan, mu = ctx.saved_tensors
-        a, b = solve_multipliers(plan, gradient)
-        if plan.device.type == "cpu":
-            grad_cost = projected(plan, gradient, a, b, -1 / float(mu))
-        else:
-            grad_cost = (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan).div_(-mu)
-        grad_mu = None
-        if ctx.needs_input_grad[2]:
-            grad_mu = torch.special.xlogy(grad_cost, plan).sum().reshape(mu.shape)
-        return None, grad_cost, grad_mu, a, b
+        to_cost, a, b = ctx.solve_adjoint(plan, gradient, -1 / mu)
+        to_mu = torch.special.xlogy(to_cost, plan).sum() if ctx.needs_input_grad[2] else None
+        return None, to_cost, to_mu, a, b, None

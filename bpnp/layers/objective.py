@@ -2,7 +2,8 @@
 
 f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)),  g(y) = y / |y|.
 It is linear in the bearings: with q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product the
-cost of an evaluation is O(n), not O(m n). Perturbations act on the left: y = exp([w]x) R p + t + s.
+cost of an evaluation is O(n), not O(m n). A step (w, s) acts on the left: y = exp([w]x) R p + t + s.
+The q_j and p_j are the columns of (b, 3, n) tensors: torch adds up three rows of n numbers faster than n rows of three.
 """
 
 from dataclasses import dataclass
@@ -11,13 +12,11 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
-from bpnp.geometry import transform
-from bpnp.layers.fused import outer_products
-from bpnp.layers.fused_objective import fused_derivatives
+from bpnp.geometry import hat, transform
+from bpnp.layers.implicit import first_derivative
 
-NEAR = 1e-12  # distances below this count as this: a point at the camera centre has no direction
+NEAR = 1e-12  # scene radii; smaller distances are set to this: a point at the camera centre has no direction
 
 
 def dense_objective(
@@ -34,81 +33,96 @@ def dense_objective(
 
 def aggregate(
     assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]
-) -> Float[Tensor, "b n 3"]:  # fmt: skip
-    """q_j = sum_i P_ij f_i: one mean bearing for each 3D point, with its weight as its length."""
+) -> Float[Tensor, "b 3 n"]:  # fmt: skip
+    """q_j = sum_i P_ij f_i: the mean bearing of each 3D point, its length the point's weight."""
     return _Aggregate.apply(assignment, bearings.to(assignment.dtype))
 
 
 class _Aggregate(torch.autograd.Function):
-    """Its gradient in P is most of the layer's: m n numbers, written once."""
+    """F^T P, whose gradients are exact products too."""
 
     @staticmethod
     def forward(ctx: Any, assignment: Tensor, bearings: Tensor) -> Tensor:
         ctx.save_for_backward(assignment, bearings)
-        # As (F^T P)^T: in torch 2.13 on the CPU the product with three columns on the right takes four times as long.
-        return (bearings.mT @ assignment).mT
+        return bearings.mT @ assignment
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         assignment, bearings = ctx.saved_tensors
-        to_assignment = to_bearings = None
-        if ctx.needs_input_grad[0]:
-            on_cpu = gradient.device.type == "cpu"
-            to_assignment = outer_products(bearings, gradient) if on_cpu else bearings @ gradient.mT
-        if ctx.needs_input_grad[1]:
-            to_bearings = (gradient.mT @ assignment.mT).mT
-        return to_assignment, to_bearings
+        to_assignment, to_bearings = ctx.needs_input_grad
+        return (
+            bearings @ gradient if to_assignment else None,
+            assignment @ gradient.mT if to_bearings else None,
+        )
 
 
 @dataclass(frozen=True)
 class Derivatives:
-    """Value (b,), gradient (b, 6) and Hessian (b, 6, 6) of -sum_j q_j . g(R p_j + t) in (w, s) at zero."""
+    """Value, gradient and Hessian of -sum_j q_j . g(R p_j + t) in the step (w, s) at zero."""
 
-    value: Tensor
-    gradient: Tensor
-    hessian: Tensor
-
-
-def pose_gradient(q: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor) -> Float[Tensor, "b 6"]:
-    """Gradient in the left perturbation (w, s): the optimality condition of the layer."""
-    rotated = points3d @ rotation.mT
-    return _gradient(rotated, _point_gradient(q, rotated + translation.unsqueeze(-2)))
+    value: Float[Tensor, " b"]
+    gradient: Float[Tensor, "b 6"]
+    hessian: Float[Tensor, "b 6 6"]
 
 
-def derivatives(q: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor) -> Derivatives:
-    """All three in one pass over the points.
+def pose_gradient(
+    q: Float[Tensor, "b 3 n"],
+    points: Float[Tensor, "b 3 n"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+) -> Float[Tensor, "b 6"]:
+    """Gradient in the step (w, s), differentiable in all arguments: the optimality condition of the layer."""
+    rotated = rotation @ points
+    _, _, h = _point_gradient(q, rotated + translation.unsqueeze(-1))
+    return _gradient(rotated @ h.mT, h)
 
-    With u = y/|y|, d = |y|: h = -(q - (q.u) u)/d is the gradient in y and G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2
-    its Hessian; a rotation also bends the path, which adds sym(Rp h^T) - (Rp . h) I to the rotation block.
+
+def derivatives(
+    q: Float[Tensor, "b 3 n"],
+    points: Float[Tensor, "b 3 n"],
+    rotation: Float[Tensor, "b 3 3"],
+    translation: Float[Tensor, "b 3"],
+) -> Derivatives:
+    """Value, gradient and Hessian together.
+
+    With x = R p, y = x + t, d = |y|, u = y/d, the derivative of a term in y is h = ((q.u) u - q)/d, and its second
+    derivative G = [(q.u)(I - 3 u u^T) + q u^T + u q^T]/d^2. Since dy = D (w, s) with D = [-[x]x, I], the Hessian is
+    sum D^T G D, plus sym(x h^T) - (x.h) I in its rotation block, the second derivative of exp([w]x) x.
+    G is written as (q.u)/d^2 I + v k^T + k v^T with v = u/d, k = (q - 1.5 (q.u) u)/d.
     """
-    followed = torch.is_grad_enabled() and (q.requires_grad or points3d.requires_grad)
-    if q.device.type == "cpu" and not followed:
-        return Derivatives(*fused_derivatives(q, points3d, rotation, translation, NEAR))
-    rotated = points3d @ rotation.mT
-    y = rotated + translation.unsqueeze(-2)
-    d = torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(NEAR)
-    u = y / d
-    qu = (q * u).sum(-1, keepdim=True)
-    h = _point_gradient(q, y)
+    x = rotation @ points
+    y = x + translation.unsqueeze(-1)
+    u, inverse, h = _point_gradient(q, y)
+    along = (q * u).sum(-2, keepdim=True)
+    v = inverse * u
+    k = inverse * q - 1.5 * along * v
+    # D^T v = (x cross v, v), and x cross y = x cross t.
+    dv = torch.cat([hat(translation).mT @ v, v], -2)
+    dk = torch.cat([torch.linalg.cross(x, k, dim=-2), k], -2)
+    low_rank = dv @ dk.mT
+    curvature = along * inverse.square()
+    weighted = curvature * x
+    second, bend = x @ weighted.mT, x @ h.mT
     eye = torch.eye(3, dtype=q.dtype, device=q.device)
-    outer = u.unsqueeze(-1) * (q - 1.5 * qu * u).unsqueeze(-2)
-    g = (qu.unsqueeze(-1) * eye + outer + outer.mT) / d.unsqueeze(-1) ** 2
-    crossed = torch.linalg.cross(rotated.unsqueeze(-1).expand_as(g), g, dim=-2)
-    rotation_block = torch.linalg.cross(rotated.unsqueeze(-2).expand_as(g), crossed, dim=-1).sum(-3)
-    bend = rotated.mT @ h
-    bend = 0.5 * (bend + bend.mT) - bend.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * eye
-    mixed = crossed.sum(-3)
-    top = torch.cat([rotation_block + bend, mixed], -1)
-    bottom = torch.cat([mixed.mT, g.sum(-3)], -1)
-    return Derivatives(-qu.sum((-2, -1)), _gradient(rotated, h), torch.cat([top, bottom], -2))
+    # sum c D^T D = [[c (|x|^2 I - x x^T), c [x]x], [.., c I]]
+    trace = (second - bend).diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    rotation_block = trace * eye - second + 0.5 * (bend + bend.mT)
+    mixed = hat(weighted.sum(-1))
+    top = torch.cat([rotation_block, mixed], -1)
+    bottom = torch.cat([mixed.mT, curvature.sum(-1, keepdim=True) * eye], -1)
+    hessian = low_rank + low_rank.mT + torch.cat([top, bottom], -2)
+    return Derivatives(-along.sum((-2, -1)), _gradient(bend, h), hessian)
 
 
-def _point_gradient(q: Tensor, y: Tensor) -> Tensor:
-    d = torch.linalg.vector_norm(y, dim=-1, keepdim=True).clamp_min(NEAR)
-    u = y / d
-    return ((q * u).sum(-1, keepdim=True) * u - q) / d
+def _point_gradient(q: Tensor, y: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """u = y/d (b, 3, n), 1/d (b, 1, n) with d = |y|, and h = ((q.u) u - q)/d (b, 3, n)."""
+    inverse = y.square().sum(-2, keepdim=True).clamp_min(NEAR**2).rsqrt()
+    u = inverse * y
+    return u, inverse, ((q * u).sum(-2, keepdim=True) * u - q) * inverse
 
 
-def _gradient(rotated: Tensor, h: Tensor) -> Tensor:
-    return torch.cat([torch.linalg.cross(rotated, h, dim=-1).sum(-2), h.sum(-2)], -1)
+def _gradient(outer: Tensor, h: Tensor) -> Float[Tensor, "b 6"]:
+    """(sum x cross h, sum h) of columns x, h with outer = sum x h^T."""
+    twist = outer - outer.mT
+    return torch.stack([twist[:, 1, 2], twist[:, 2, 0], twist[:, 0, 1], *h.sum(-1).unbind(-1)], -1)

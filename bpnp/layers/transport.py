@@ -1,10 +1,10 @@
-"""Forward solver of the entropic transport problem: scalings, Newton steps, and annealing for small mu.
+"""Forward solver of the entropic transport problem: Sinkhorn sweeps, Newton steps, and annealing for small mu.
 
 The plan is P = diag(alpha) K diag(beta), K = exp((u + v - M) / mu) from potentials near the optimum. K is made once,
 and again only if the scalings grow so far that entries which underflowed might matter; in between all work is products
-of K with vectors. Rescaling rows and columns in turn converges linearly, and slowly once points share their probability
-with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of `bpnp.layers.adjoint`,
-by conjugate gradients to no more digits than the step has) is quadratic there.
+of K with vectors. Rescaling rows and columns in turn (a sweep) converges linearly, and slowly once points share their
+probability with neighbours or P is nearly a permutation. Newton's method on the multipliers (the system of
+`bpnp.layers.laplacian`, by conjugate gradients to no more digits than the step has) is quadratic there.
 """
 
 import math
@@ -14,22 +14,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.layers.adjoint import Plan, newton_direction, times
-from bpnp.layers.memory import empty
-from bpnp.layers.pacing import steps, unfinished, waits
-from bpnp.layers.scalings import Scaled, absorb, from_row_minima, sweep
+from bpnp.layers.laplacian import solve_laplacian
+from bpnp.layers.plan import Plan, divide
 from bpnp.types import SolveStats
 
-SWEEPS_BEFORE_NEWTON = 4
-SWEEPS_BEFORE_NEWTON_ON_GPU = 16
-STEPS_IN_FLOAT32 = 28  # a sample that is not done by then is short of digits, not of steps
-STEPS_ON_GPU = 24
-NEWTON_RADIUS = 2.0  # largest first change of a log scaling
-LOOSEST, SAFETY = 0.3, 0.8  # of a Newton step: relative error, and the error to end at per tolerance
-COARSEST = 0.05  # annealing starts at this part of the range of the costs
-COOLING = 4.0
+SWEEPS = 4  # before the first Newton step
 SWEEPS_PER_TEMPERATURE = 5
-CACHE = 2**24  # bytes of K that are worked on together on a CPU: products with it come from the cache
+ITERATIONS_IN_FLOAT32 = 28  # a sample that is not done by then lacks digits, not iterations
+NEWTON_RADIUS = 2.0  # largest first change of a log scaling
+LOOSEST, SAFETY = 0.3, 0.8  # of a Newton step: largest relative error, and the error to end at per tolerance
+COARSEST = 0.05  # annealing starts at this part of the range of the costs
+COOLING = 4.0  # ratio of two temperatures
+LARGEST_LOG_SCALING = 20.0  # twice this is far from where entries of K underflow in float32
 
 
 def solve_plan(
@@ -37,140 +33,166 @@ def solve_plan(
     rows: Float[Tensor, "b m"],
     cols: Float[Tensor, "b n"],
     *,
-    mu: float | Tensor,
+    mu: Float[Tensor, ""],
     tolerance: float,
     max_iterations: int,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
     """Plan with column sums `cols` and row sums `rows` to an L1 error of `tolerance`, sample by sample.
 
-    A point with zero marginal takes no part. Iterations count pairs of scalings; a late one follows a Newton step. A
-    GPU takes at most `STEPS_ON_GPU` and is not waited for.
+    A point with zero marginal takes no part. Iterations count sweeps; a late one follows a Newton step. Samples for
+    which float32 has too few digits are solved again in float64.
     """
-    plan = empty(cost.shape, dtype=cost.dtype, device=cost.device)
-    size = len(cost) if waits(cost.device) else max(1, CACHE // (cost[0].numel() * cost.element_size()))
-    parts = []
-    for start in range(0, len(cost), size):
-        some = slice(start, start + size)
-        parts.append(_solve(cost[some], rows[some], cols[some], plan[some], mu, tolerance, max_iterations))
-    iterations, residual = (torch.cat(values) for values in zip(*parts, strict=True))
-    # Afresh in float64 where float32 has too few digits.
-    left = max_iterations - iterations
+    limit = torch.full((len(cost),), max_iterations, device=cost.device)
+    plan, iterations, residual = _solve(cost, rows, cols, mu, tolerance, limit)
+    left = limit - iterations
     hard = (residual > tolerance) & (left > 0)
-    alike = [] if cost.dtype == torch.float64 or waits(cost.device) else left[hard].unique().tolist()
-    for limit in alike:
-        some = (hard & (left == limit)).nonzero().squeeze(-1)
-        exact, stats = solve_plan(
-            cost[some].double(),
-            rows[some].double(),
-            cols[some].double(),
-            mu=mu.double() if isinstance(mu, Tensor) else mu,
-            tolerance=tolerance,
-            max_iterations=limit,
+    if cost.dtype != torch.float64 and bool(hard.any()):
+        some = hard.nonzero().squeeze(-1)
+        exact_plan, more, exact_residual = _solve(
+            cost[some].double(), rows[some].double(), cols[some].double(), mu, tolerance, left[some]
         )
-        plan[some] = exact.to(plan.dtype)
-        residual[some] = stats.residual.to(residual.dtype)
-        iterations[some] += stats.iterations
+        plan[some], residual[some] = exact_plan.to(plan.dtype), exact_residual.to(residual.dtype)
+        iterations[some] += more
     return plan, SolveStats(iterations, residual, residual <= tolerance)
 
 
 def _solve(
-    cost: Tensor, rows: Tensor, cols: Tensor, plan: Tensor, mu: float | Tensor, tolerance: float, max_iterations: int
-) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
-    """Fill `plan`; iterations and residuals."""
-    temperature = torch.zeros_like(rows[:, 0]) + mu
-    coolings = _coolings_on_gpu(mu) if waits(cost.device) else math.inf
-    state = _anneal(cost, rows, cols, temperature, plan, coolings)
-    iterations = torch.zeros(len(cost), dtype=torch.long, device=cost.device)
-    residual = torch.full_like(temperature, torch.inf)
-    radius = torch.full_like(temperature, NEWTON_RADIUS)
-    # Samples that are not done have all taken the same steps: which ones share the batch does not matter to any.
-    taken, last = 0, steps(max_iterations, cost.device, STEPS_ON_GPU)
-    last = min(STEPS_IN_FLOAT32, last) if plan.dtype == torch.float32 else last
-    first = min(SWEEPS_BEFORE_NEWTON_ON_GPU if waits(cost.device) else SWEEPS_BEFORE_NEWTON, last)
-    active = torch.ones_like(residual, dtype=torch.bool)
-    while taken < last and unfinished(active):
-        if taken:
-            state = absorb(state, cost, temperature, active)
-        some = _worked_on(active)
-        part, sweeps, exact = state.samples(some), 1 if taken else first, active[some]
-        if taken:
-            part, radius[some], exact = _newton(part, rows[some], cols[some], radius[some], active[some], tolerance)
-        part, part_residual, part_sweeps = sweep(part, rows[some], cols[some], active[some], tolerance, sweeps)
-        taken += sweeps
-        state = state.with_scalings(some, part)
-        residual[some] = torch.where(active[some], part_residual, residual[some])
-        iterations[some] += part_sweeps
-        active = active.index_copy(0, some, exact & (part_residual > tolerance))
-    plan.mul_(state.alpha.unsqueeze(-1)).mul_(state.beta.unsqueeze(-2))
-    return iterations, residual
+    cost: Tensor, rows: Tensor, cols: Tensor, mu: Tensor, tolerance: float, limit: Int[Tensor, " b"]
+) -> tuple[Float[Tensor, "b m n"], Int[Tensor, " b"], Float[Tensor, " b"]]:
+    """Plan, iterations and residuals, in the precision of the cost.
+
+    Samples that are active have all taken the same steps: which others share the batch does not matter to any.
+    """
+    temperature = mu.to(cost.dtype).expand(len(cost))
+    u, v, plan = _anneal(cost, rows, cols, temperature)
+    limit = limit.clamp_max(ITERATIONS_IN_FLOAT32) if cost.dtype == torch.float32 else limit
+    plan, sums, residual, iterations = sweep(plan, plan.row_sums(), rows, cols, limit.clamp_max(SWEEPS), tolerance)
+    radius = torch.full_like(residual, NEWTON_RADIUS)
+    live = torch.ones_like(residual, dtype=torch.bool)  # the last Newton step had enough digits
+    while bool((active := live & (residual > tolerance) & (iterations < limit)).any()):
+        u, v, plan, sums = _absorb(u, v, plan, sums, cost, temperature, active)
+        some = active.nonzero().squeeze(-1)
+        goal = rows[some], cols[some]
+        part, part_sums, radius[some], live[some] = _newton(
+            plan.samples(some), sums[some], *goal, radius[some], tolerance
+        )
+        one = torch.ones_like(some)
+        part, part_sums, residual[some], _ = sweep(part, part_sums, *goal, one, tolerance)
+        iterations[some] += 1
+        plan = Plan(plan.kernel, *(
+            old.index_copy(0, some, new) for old, new in ((plan.alpha, part.alpha), (plan.beta, part.beta))
+        ))  # fmt: skip
+        sums = sums.index_copy(0, some, part_sums)
+    return plan.kernel.mul_(plan.alpha.unsqueeze(-1)).mul_(plan.beta.unsqueeze(-2)), iterations, residual
 
 
-def _worked_on(active: Bool[Tensor, " b"]) -> Int[Tensor, " s"]:
-    """The samples that steps are computed for: the active ones, or all where it costs a wait to know them."""
-    if waits(active.device):
-        return torch.arange(len(active), device=active.device)
-    return active.nonzero().squeeze(-1)
+def sweep(
+    plan: Plan, sums: Float[Tensor, "b m"], rows: Tensor, cols: Tensor, count: Int[Tensor, " b"], tolerance: float
+) -> tuple[Plan, Float[Tensor, "b m"], Float[Tensor, " b"], Int[Tensor, " b"]]:
+    """Rescale the rows, then the columns, `count` times; a sample stops at the tolerance. sums: P 1.
+
+    Returns the plan, its row sums, their L1 error (infinite for a sample without sweeps) and the sweeps taken.
+    """
+    residual = torch.full_like(sums[:, 0], torch.inf)
+    taken = torch.zeros_like(count)
+    for k in range(int(count.max())):
+        active = (k < count) & (residual > tolerance)
+        alpha = _rescale(plan.alpha, rows / sums, active)
+        plan = replace(plan, alpha=alpha)
+        plan = replace(plan, beta=_rescale(plan.beta, cols / plan.col_sums(), active))
+        sums = plan.row_sums()
+        residual = torch.where(active, (sums - rows).abs().sum(-1), residual)
+        taken += active
+    return plan, sums, residual, taken
+
+
+def _rescale(scaling: Tensor, factor: Tensor, active: Bool[Tensor, " b"]) -> Tensor:
+    """Padded points, whose factor is 0/0, keep their scaling, and so do samples that have stopped."""
+    return torch.where(active.unsqueeze(-1) & (factor > 0) & factor.isfinite(), scaling * factor, scaling)
 
 
 def _newton(
-    state: Scaled, rows: Tensor, cols: Tensor, radius: Tensor, active: Bool[Tensor, " b"], tolerance: float
-) -> tuple[Scaled, Float[Tensor, " b"], Bool[Tensor, " b"]]:
+    plan: Plan, sums: Tensor, rows: Tensor, cols: Tensor, radius: Float[Tensor, " b"], tolerance: float
+) -> tuple[Plan, Float[Tensor, "b m"], Float[Tensor, " b"], Bool[Tensor, " b"]]:
     """One Newton step inside a trust radius, taken if it does not lower the (concave) dual objective.
 
-    The new radius, and which samples go on: those whose direction the precision can tell.
+    Returns the plan, its row sums, the new radius, and which samples go on: those whose direction the precision can
+    tell. The change (x, y) of the log scalings gives diag(e^x) P diag(e^y) the marginals, to first order; the columns
+    have theirs already.
     """
-    error = (state.row_sums - rows).abs().sum(-1)
+    error = (sums - rows).abs().sum(-1)
     precision = torch.maximum(SAFETY * tolerance / error, error.sqrt().clamp_max(LOOSEST))
-    plan = Plan(state.kernel, state.alpha, state.beta)
-    x, y, solved = newton_direction(plan, state.row_sums, rows, cols, precision)
+    row_error = divide(rows - sums, sums)
+    degree = plan.degree(sums, cols)
+    y, mean, solved = solve_laplacian(plan, sums, cols, degree, -plan.transpose_times(row_error), precision)
+    x = row_error - mean
     size = torch.maximum(x.abs().amax(-1), y.abs().amax(-1))
     shrink = (radius / size.clamp_min(torch.finfo(size.dtype).tiny)).clamp_max(1).unsqueeze(-1)
     x, y = x * shrink, y * shrink
-    alpha, beta = state.alpha * x.exp(), state.beta * y.exp()
-    row_sums = alpha * times(state.kernel, beta)
-    gain = (rows * x).sum(-1) + (cols * y).sum(-1) - (row_sums - state.row_sums).sum(-1)
-    accept = active & (gain >= -16 * torch.finfo(rows.dtype).eps)
-    alpha, beta, row_sums = (
-        torch.where(accept.unsqueeze(-1), new, old)
-        for new, old in ((alpha, state.alpha), (beta, state.beta), (row_sums, state.row_sums))
+    new = Plan(plan.kernel, plan.alpha * x.exp(), plan.beta * y.exp())
+    new_sums = new.row_sums()
+    gain = (rows * x).sum(-1) + (cols * y).sum(-1) - (new_sums - sums).sum(-1)
+    accept = gain >= -16 * torch.finfo(rows.dtype).eps
+    alpha, beta, sums = (
+        torch.where(accept.unsqueeze(-1), changed, kept)
+        for changed, kept in ((new.alpha, plan.alpha), (new.beta, plan.beta), (new_sums, sums))
     )
-    return (
-        replace(state, alpha=alpha, beta=beta, row_sums=row_sums),
-        torch.where(accept, 2 * radius, radius / 4),
-        solved,
-    )
+    goes_on = solved | (rows.dtype == torch.float64)
+    return Plan(plan.kernel, alpha, beta), sums, torch.where(accept, 2 * radius, radius / 4), goes_on
 
 
-def _anneal(
-    cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"], kernel: Tensor, coolings: float
-) -> Scaled:
-    """Potentials from which the plan at `mu` neither over- nor underflows, and K in `kernel`.
+def _anneal(cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"]) -> tuple[Tensor, Tensor, Plan]:
+    """Potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan.
 
     Sweeps at falling temperatures, each sample from its own range of costs down to mu. Each temperature starts with the
     largest entry of every row at one. A point without mass has the potential -inf.
     """
+    kernel = cost.new_empty(cost.shape)
     warm = torch.maximum(COARSEST * _range(cost, rows, cols), mu)
     v = torch.where(cols > 0, 0.0, -math.inf).to(cost.dtype)
-    while coolings > 0 and unfinished(cooling := warm > mu):
-        state = from_row_minima(cost, rows, v, warm, kernel)
-        state, _, _ = sweep(state, rows, cols, cooling, 0.0, SWEEPS_PER_TEMPERATURE)
-        v = v + torch.where(cooling, warm, 0).unsqueeze(-1) * state.beta.log()
+    while bool((cooling := warm > mu).any()):
+        _, plan = _from_row_minima(cost, rows, v, warm, kernel)
+        plan, *_ = sweep(plan, plan.row_sums(), rows, cols, SWEEPS_PER_TEMPERATURE * cooling, 0.0)
+        v = v + torch.where(cooling, warm, 0).unsqueeze(-1) * plan.beta.log()
         warm = torch.maximum(warm / COOLING, mu)
-        coolings -= 1
-    return from_row_minima(cost, rows, v, mu, kernel)
+    u, plan = _from_row_minima(cost, rows, v, mu, kernel)
+    return u, v, plan
 
 
-def _coolings_on_gpu(mu: float | Tensor) -> float:
-    """Temperatures above mu for costs between unit features, in [0, 2]; mu is not read back if it is a tensor."""
-    if isinstance(mu, Tensor):
-        return 2.0
-    return max(0.0, float(math.ceil(math.log(2 * COARSEST / mu, COOLING))))
+def _from_row_minima(
+    cost: Tensor, rows: Tensor, v: Tensor, mu: Float[Tensor, " b"], kernel: Tensor
+) -> tuple[Float[Tensor, "b m"], Plan]:
+    """u for which the largest entry of each row of K is one (-inf in rows without mass), and K, written to `kernel`."""
+    u = torch.sub(cost, v.unsqueeze(-2), out=kernel).amin(-1)
+    u = torch.where(rows > 0, u, -math.inf)
+    return u, Plan.of(kernel.sub_(u.unsqueeze(-1)).div_(-mu[:, None, None]).exp_())
+
+
+def _absorb(
+    u: Tensor, v: Tensor, plan: Plan, sums: Tensor, cost: Tensor, mu: Tensor, active: Bool[Tensor, " b"]
+) -> tuple[Tensor, Tensor, Plan, Tensor]:
+    """Move large scalings of active samples into the potentials and make their K again, in place.
+
+    One sample at a time: K may be nearly all the memory there is.
+    """
+    log_alpha, log_beta = plan.alpha.log(), plan.beta.log()
+    large = active & (torch.maximum(log_alpha.abs().amax(-1), log_beta.abs().amax(-1)) > LARGEST_LOG_SCALING)
+    if not bool(large.any()):
+        return u, v, plan, sums
+    move = torch.where(large, mu, 0).unsqueeze(-1)
+    u, v = u + move * log_alpha, v + move * log_beta
+    for i in large.nonzero().flatten().tolist():
+        kernel = torch.sub(u[i].unsqueeze(-1), cost[i], out=plan.kernel[i])
+        kernel.add_(v[i]).div_(mu[i]).exp_()
+    moved = large.unsqueeze(-1)
+    plan = Plan(plan.kernel, torch.where(moved, 1, plan.alpha), torch.where(moved, 1, plan.beta))
+    return u, v, plan, torch.where(moved, plan.row_sums(), sums)
 
 
 def _range(cost: Tensor, rows: Tensor, cols: Tensor) -> Float[Tensor, " b"]:
     """Difference of the largest and the smallest finite cost between points with mass."""
     highest, lowest = cost.amax(-1), cost.amin(-1)
-    if waits(cost.device) or not bool((cols > 0).all() & highest.isfinite().all()):
+    if not bool((cols > 0).all() & highest.isfinite().all()):
         real = (cols > 0).unsqueeze(-2) & cost.isfinite()
         highest = torch.where(real, cost, -math.inf).amax(-1)
         lowest = torch.where(real, cost, math.inf).amin(-1)

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.layers.assignment import sinkhorn
+from bpnp.layers.assignment import dustbin_marginals, sinkhorn, uniform_marginal
+from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
@@ -71,6 +72,7 @@ class Matcher(TrainedNet):
             raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
         self.mu, self.tolerance = mu, tolerance
+        self.backward_stats = BackwardStats()
         self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
         self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
         around = {"neighbours": neighbours}
@@ -117,14 +119,11 @@ class Matcher(TrainedNet):
         leave2d, leave3d = self.bin_cost + self.leave(z2d), self.bin_cost + self.leave(z3d)
         corner = self.bin_cost.expand(len(batch), 1, 1)
         cost = torch.cat([torch.cat([cost, leave2d], 2), torch.cat([leave3d.mT, corner], 2)], 1)
-        with_bin = nn.functional.pad
-        mask2d, mask3d = with_bin(batch.mask2d, (0, 1), value=True), with_bin(batch.mask3d, (0, 1), value=True)
-        total = (batch.count2d + batch.count3d).unsqueeze(-1).to(cost.dtype)
-        rows = torch.cat([batch.mask2d / total, batch.count3d.unsqueeze(-1) / total], 1)
-        cols = torch.cat([batch.mask3d / total, batch.count2d.unsqueeze(-1) / total], 1)
+        rows, cols = (uniform_marginal(mask, cost.dtype) for mask in (batch.mask2d, batch.mask3d))
+        rows, cols = dustbin_marginals(rows, cols, batch.mask2d, batch.mask3d)
         return sinkhorn(
-            cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, mask2d=mask2d, mask3d=mask3d,
-            tolerance=self.tolerance,
+            cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, tolerance=self.tolerance,
+            backward_stats=self.backward_stats,
         )  # fmt: skip
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:

@@ -1,12 +1,11 @@
 import math
-import sys
 
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from bpnp.layers import Sinkhorn, sinkhorn
+from bpnp.layers import BackwardStats, Sinkhorn, sinkhorn
 
 EXACT = {"tolerance": 1e-13, "max_iterations": 5000}
 
@@ -207,7 +206,7 @@ def test_says_that_a_sample_has_no_points(side: str, given: bool) -> None:
 def test_the_module_passes_its_options_on() -> None:
     cost = random_cost(2, 5, 6).float()
     mask2d, mask3d = torch.arange(5).expand(2, 5) < 4, torch.arange(6).expand(2, 6) < 5
-    layer = Sinkhorn(mu=0.3, learn_mu=True, dustbin=0.4, learn_dustbin=True, tolerance=1e-3, max_iterations=7)
+    layer = Sinkhorn(mu=0.3, learn_mu=True, dustbin=0.4, tolerance=1e-3, max_iterations=7)
     expected, stats = sinkhorn(
         cost, mu=0.3, dustbin=0.4, mask2d=mask2d, mask3d=mask3d, tolerance=1e-3, max_iterations=7
     )  # fmt: skip
@@ -215,9 +214,8 @@ def test_the_module_passes_its_options_on() -> None:
     torch.testing.assert_close(plan, expected)
     assert torch.equal(stats.iterations, layer_stats.iterations)
     plan.amax().backward()
-    assert {name for name, p in layer.named_parameters() if p.grad is not None} == {"log_mu", "bin_cost"}
-    with pytest.raises(ValueError, match="expected a `dustbin` cost to learn from"):
-        Sinkhorn(learn_dustbin=True)
+    assert {name for name, p in layer.named_parameters() if p.grad is not None} == {"log_mu"}
+    assert layer.backward_stats == BackwardStats(samples=2, unconverged=0)
 
 
 @pytest.mark.parametrize("shape", [(3, 1, 7), (3, 7, 1), (3, 1, 1)])
@@ -245,21 +243,23 @@ def test_scalings_beyond_the_range_of_float32_are_absorbed() -> None:
         assert (plan - expected).abs().max() < 1e-5
 
 
-def test_the_parts_that_fit_into_the_cache_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    cost = random_cost(5, 30, 20).float()
-    together, stats = sinkhorn(cost, mu=0.02)
-    monkeypatch.setattr("bpnp.layers.transport.CACHE", 1)
-    alone, alone_stats = sinkhorn(cost, mu=0.02)
-    assert (together - alone).abs().max() < 4 * torch.finfo(torch.float32).eps
-    assert torch.equal(stats.iterations, alone_stats.iterations)
+@pytest.mark.parametrize("mu", [0.1, 0.01])
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_products_in_torch_end_at_the_same_plan_and_gradient(
+    mu: float, dtype: torch.dtype, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a GPU runs, run here: no compiled pass is entered."""
+    cost, weights = random_cost(3, 30, 20).to(dtype), random_cost(3, 30, 20, seed=1).to(dtype)
 
+    def solve() -> tuple[Tensor, Tensor, Tensor]:
+        variable = cost.clone().requires_grad_()
+        plan, stats = sinkhorn(variable, mu=mu)
+        return plan.detach(), torch.autograd.grad((plan * weights).sum(), variable)[0], stats.converged
 
-@pytest.mark.parametrize("mu", [0.1, 0.02])
-def test_without_waiting_for_the_device_the_plan_is_the_same(mu: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    cost = random_cost(3, 30, 20)
-    expected, _ = sinkhorn(cost, mu=mu, **EXACT)
-    for module in ("sinkhorn", "transport", "scalings", "laplacian", "pacing"):
-        monkeypatch.setattr(sys.modules[f"bpnp.layers.{module}"], "waits", lambda _device: True)
-    plan, stats = sinkhorn(cost, mu=mu)
-    assert stats.converged.all()
-    assert (plan - expected).abs().max() < 1e-6
+    expected = solve()
+    monkeypatch.setattr("bpnp.layers.compiled.applies_to", lambda _tensor: False)
+    monkeypatch.setattr("bpnp.layers.compiled.run", lambda *_: pytest.fail("a compiled pass was entered"))
+    plan, gradient, converged = solve()
+    assert converged.all()
+    assert (plan - expected[0]).abs().max() < 2e-6
+    assert (gradient - expected[1]).abs().max() < (1e-4 if dtype == torch.float32 else 1e-5) * expected[1].abs().max()

@@ -1,4 +1,4 @@
-"""Mixture models of the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
+"""Mixtures that stand for the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
 
 from typing import NamedTuple
 

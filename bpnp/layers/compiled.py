@@ -1,7 +1,8 @@
-"""The layers' linear algebra on a CPU: one loop for each sample, that reads the plan once an iteration.
+"""Passes over a transport plan, compiled for the CPU. Elsewhere `plan`, `laplacian` and `adjoint` do them in torch.
 
-`bpnp.layers.adjoint` states the transport's in torch, for other devices. A row of the plan is used for both products
-while it is in the cache, samples run on different cores without waiting for each other, and each stops by itself.
+A row of the plan is used for both products of a conjugate gradient step while it is in the cache, so that a step reads
+the plan once where torch reads it twice; sums of float32 are added up in float64 in short parts. Samples are divided
+among torch's threads; each stops by itself. Loops take contiguous arrays and the range of samples to work on.
 """
 
 from typing import Any
@@ -12,38 +13,33 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.compilation import compiler
-from bpnp.layers.memory import empty
 from bpnp.thread_pool import spread
 
-# Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
+# Sums in any order, as in `bpnp.search.kernels_dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
+
+
+def applies_to(tensor: Tensor) -> bool:
+    """Whether the compiled passes can read this tensor; torch's are used elsewhere."""
+    return tensor.is_cpu
 
 
 def moments(
     plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
-    """Row sums of P, means w of the gradient V over the rows, column sums of P, and P^T (V - w 1^T)."""
+    """P 1, the means w of the gradient V over the rows of P, P^T 1, and P^T (V - w 1^T), in one pass."""
     b, m, n = plan.shape
     rows, means, cols, centred = (plan.new_empty(b, k) for k in (m, m, n, n))
-    run(_moments, plan, gradient, rows, means, cols, centred)
+    run(_moments, (plan, gradient), (rows, means, cols, centred))
     return rows, means, cols, centred
 
 
 def square_product(kernel: Float[Tensor, "b m n"], weight: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
     """sum_i weight_i K_ij^2."""
     total = kernel.new_empty(len(kernel), kernel.shape[2])
-    run(_squares, kernel, weight, total)
+    run(_squares, (kernel, weight), (total,))
     return total
-
-
-def outer_products(
-    left: Float[Tensor, "b m 3"], right: Float[Tensor, "b n 3"]
-) -> Float[Tensor, "b m n"]:  # fmt: skip
-    """left @ right^T in one pass of writing: a product made for many more columns takes twice as long."""
-    result = empty(torch.Size((*left.shape[:2], right.shape[1])), dtype=left.dtype, device=left.device)
-    run(_outer, left, right.mT, result)
-    return result
 
 
 def projected(
@@ -51,11 +47,11 @@ def projected(
     gradient: Float[Tensor, "b m n"],
     a: Float[Tensor, "b m"],
     b: Float[Tensor, "b n"],
-    factor: float,
+    factor: Float[Tensor, " b"],
 ) -> Float[Tensor, "b m n"]:
     """factor P . (V - a 1^T - 1 b^T)."""
-    result = empty(plan.shape, dtype=plan.dtype, device=plan.device)
-    run(_project, plan, gradient, a, b, torch.full_like(plan[:, 0, 0], factor), result)
+    result = plan.new_empty(plan.shape)
+    run(_project, (plan, gradient, a, b, factor), (result,))
     return result
 
 
@@ -65,26 +61,35 @@ def conjugate_gradients(
     sums: tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]],
     degree: Float[Tensor, "b n"],
     rhs: Float[Tensor, "b n"],
-    tolerance: float | Float[Tensor, " b"],
+    tolerance: Float[Tensor, " b"],
     limit: int,
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
-    """x with S x = rhs for P = diag(alpha) K diag(beta), P x / rows, and which samples met the tolerance."""
-    x, mean = torch.zeros_like(rhs), torch.zeros_like(sums[0])
+    """x with S x = rhs for P = diag(alpha) K diag(beta), P x / rows, and which samples met the tolerance.
+
+    S = diag(cols) - P^T diag(1 / rows) P; degree: its diagonal, the preconditioner. The residual is measured in the
+    norm with the weights 1 / cols, relative to the right-hand side.
+    """
+    x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(sums[0].shape)
     solved = torch.zeros(len(rhs), dtype=torch.bool)
-    bound = torch.zeros_like(rhs[:, 0]) + tolerance
-    limits = torch.full_like(solved, limit, dtype=torch.long)
-    run(_solve, kernel, *scalings, *sums, degree, rhs, bound, limits, x, mean, solved)
+    limits = torch.full((len(rhs),), limit)
+    run(_solve, (kernel, *scalings, *sums, degree, rhs, tolerance, limits), (x, mean, solved))
     return x, mean, solved
 
 
-def run(loop: Any, *values: Tensor) -> None:
-    """Call a loop over samples, which stops for no other, on as many threads as torch uses."""
-    arrays = [x.detach().contiguous().numpy() for x in values]
-    spread(lambda first, last: loop(first, last, *arrays), len(values[0]))
+def run(loop: Any, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> None:
+    """Call loop(first, last, *inputs, *outputs) on shares of the samples, in as many threads as torch uses.
+
+    Inputs may have any strides; outputs are written in place and have to be contiguous.
+    """
+    if not all(x.is_contiguous() for x in outputs):
+        raise ValueError(f"expected contiguous outputs, got strides {[x.stride() for x in outputs]}")
+    arrays = [x.detach().contiguous().numpy() for x in (*inputs, *outputs)]
+    spread(lambda first, last: loop(first, last, *arrays), len(outputs[0]))
 
 
 @compiled
 def _moments(start: int, stop: int, plan: Any, gradient: Any, rows: Any, means: Any, cols: Any, centred: Any) -> None:
+    """plan, gradient (b, m, n) -> rows, means (b, m), cols, centred (b, n)."""
     m, n = plan.shape[1:]
     for s in range(start, stop):
         mass, pull = cols[s], centred[s]
@@ -110,6 +115,7 @@ def _moments(start: int, stop: int, plan: Any, gradient: Any, rows: Any, means: 
 
 @compiled
 def _squares(start: int, stop: int, kernel: Any, weight: Any, totals: Any) -> None:
+    """kernel (b, m, n), weight (b, m) -> totals (b, n)."""
     m, n = kernel.shape[1:]
     for s in range(start, stop):
         total = totals[s]
@@ -121,18 +127,8 @@ def _squares(start: int, stop: int, kernel: Any, weight: Any, totals: Any) -> No
 
 
 @compiled
-def _outer(start: int, stop: int, left: Any, right: Any, result: Any) -> None:
-    m, n = result.shape[1:]
-    for s in range(start, stop):
-        x, y, z = right[s, 0], right[s, 1], right[s, 2]
-        for i in range(m):
-            row, a, b, c = result[s, i], left[s, i, 0], left[s, i, 1], left[s, i, 2]
-            for j in range(n):
-                row[j] = a * x[j] + b * y[j] + c * z[j]
-
-
-@compiled
 def _project(start: int, stop: int, plan: Any, gradient: Any, a: Any, b: Any, factor: Any, result: Any) -> None:
+    """plan, gradient (b, m, n), a (b, m), b (b, n), factor (b,) -> result (b, m, n)."""
     m, n = plan.shape[1:]
     for s in range(start, stop):
         column = b[s]
@@ -146,8 +142,9 @@ def _project(start: int, stop: int, plan: Any, gradient: Any, a: Any, b: Any, fa
 def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, total: Any) -> None:
     """y = before . (K x) and total = K^T (after . y), four rows at a time.
 
-    Sums of thousands of terms in float32 lose the digits in which the Laplacian's terms differ: they are kept short,
-    and added up in float64 (`total`).
+    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; part (n,) is scratch memory. Sums of
+    thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are made in the
+    data's precision and added up in float64.
     """
     m, n = kernel.shape
     zero = part.dtype.type(0)
@@ -191,6 +188,7 @@ def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, t
 
 @compiled
 def _flush(part: Any, total: Any) -> None:
+    """Add `part` (n,) to `total` (n,), and set it to zero."""
     for j in range(len(part)):
         total[j] += part[j]
         part[j] = 0
@@ -201,6 +199,8 @@ def _solve(
     start: int, stop: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
     tolerance: Any, limit: Any, x: Any, mean: Any, solved: Any,
 ) -> None:  # fmt: skip
+    """kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance, limit (b,)
+    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start."""
     for s in range(start, stop):
         inverse = np.where(degree[s] > 0, 1 / degree[s], 0).astype(rhs.dtype)
         unit = np.where(cols[s] > 0, 1 / cols[s], 0).astype(rhs.dtype)

@@ -1,0 +1,120 @@
+"""The linear system of the entropic transport plan, which its gradient and its Newton step have in common.
+
+[diag(P1) P; P^T diag(P^T 1)] [a; b] = [x; y] is singular along (1, -1) and consistent when sum x = sum y. Eliminating a
+leaves S b = y - P^T (x / P1) with S = diag(P^T 1) - P^T diag(1 / P1) P, the Laplacian of a graph between columns.
+"""
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+import bpnp.layers.compiled as compiled
+from bpnp.layers.plan import Plan, divide
+
+ITERATIONS = 150  # of conjugate gradients; slower systems are factorised
+BETWEEN_TESTS = 8  # iterations in torch between two tests for the end: a test makes the host wait for a GPU
+RIDGE = 1e-13  # of the factorisation, relative to the diagonal's scale
+FACTORISED = 1e-6  # largest relative residual of a factorised system that counts as solved
+
+
+class Solution(NamedTuple):
+    """b with S b = rhs, weighted mean zero; P b / rows; and which samples met their tolerance."""
+
+    b: Float[Tensor, "b n"]
+    mean: Float[Tensor, "b m"]
+    solved: Bool[Tensor, " b"]
+
+
+def solve_laplacian(
+    plan: Plan,
+    rows: Float[Tensor, "b m"],
+    cols: Float[Tensor, "b n"],
+    degree: Float[Tensor, "b n"],
+    rhs: Float[Tensor, "b n"],
+    tolerance: Float[Tensor, " b"],
+) -> Solution:
+    """Conjugate gradients, preconditioned by the diagonal of S; in float64, what stalls is factorised.
+
+    rows, cols: sums of P, zero at padded points. degree: the diagonal of S. tolerance: of the residual per unit of
+    mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side: in the preconditioner's own norm columns
+    with weak links would outweigh all others.
+    """
+    if compiled.applies_to(rhs):
+        x, mean, solved = compiled.conjugate_gradients(
+            plan.kernel, (plan.alpha, plan.beta), (rows, cols), degree, rhs, tolerance, ITERATIONS
+        )
+    else:
+        x, mean, solved = conjugate_gradients(plan, rows, cols, degree, rhs, tolerance)
+    shift = _mean(x, cols)
+    b, mean = torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0)
+    if rhs.dtype != torch.float64 or bool(solved.all()):
+        return Solution(b, mean, solved)
+    hard = (~solved).nonzero().squeeze(-1)
+    part = Plan(plan.kernel[hard], plan.alpha[hard], plan.beta[hard])
+    exact, exact_solved = _factorised(part.formed(), rows[hard], cols[hard], rhs[hard])
+    exact_mean = divide(part.times(exact), rows[hard])
+    return Solution(
+        b.index_copy(0, hard, exact), mean.index_copy(0, hard, exact_mean), solved.index_copy(0, hard, exact_solved)
+    )
+
+
+def conjugate_gradients(
+    plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"]
+) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
+    """x with S x = rhs, P x / rows, and which samples met the tolerance; each keeps the x at which it did."""
+    inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
+    x, mean, r = torch.zeros_like(rhs), torch.zeros_like(rows), rhs
+    p = inverse * r
+    rz = torch.linalg.vecdot(r, p)
+    target = torch.linalg.vecdot(unit * r, r) * tolerance**2
+    active = rz > 0
+    solved = ~active
+    for k in range(ITERATIONS):
+        if k % BETWEEN_TESTS == 0 and not bool(active.any()):
+            break
+        mean_p = per_row * plan.times(p)
+        sp = cols * p - plan.transpose_times(mean_p)
+        curvature = torch.linalg.vecdot(p, sp)
+        active = active & (curvature > 0)
+        step = torch.where(active, rz / curvature, 0).unsqueeze(-1)
+        x, mean, r = x + step * p, mean + step * mean_p, r - step * sp
+        done = active & (torch.linalg.vecdot(unit * r, r) <= target)
+        solved, active = solved | done, active & ~done
+        z = inverse * r
+        previous, rz = rz, torch.linalg.vecdot(r, z)
+        p = z + divide(rz, previous).unsqueeze(-1) * p
+    return x, mean, solved
+
+
+def _factorised(
+    plan: Float[Tensor, "b m n"], rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"], rhs: Float[Tensor, "b n"]
+) -> tuple[Float[Tensor, "b n"], Bool[Tensor, " b"]]:
+    """b by a Cholesky factorisation of S and one refinement, in float64, and which samples are solved.
+
+    The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
+    almost a permutation.
+    """
+    links = plan.mT @ (plan * divide(torch.ones_like(rows), rows).unsqueeze(-1))
+    links.diagonal(dim1=-2, dim2=-1).zero_()
+    degree = links.sum(-1)
+    # Between groups of columns that hardly share a row, the right-hand side is rounding and S nearly singular. The
+    # ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
+    diagonal = torch.where(cols > 0, RIDGE * cols + degree, 1)
+    factor, _ = torch.linalg.cholesky_ex(torch.diag_embed(diagonal) - links)
+
+    def residual(b: Tensor) -> Tensor:
+        return rhs - degree * b + (links @ b.unsqueeze(-1)).squeeze(-1)
+
+    b = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
+    b = b + torch.cholesky_solve(residual(b).unsqueeze(-1), factor).squeeze(-1)
+    b = torch.where(cols > 0, b - _mean(b, cols), 0)
+    unit = divide(torch.ones_like(cols), cols)
+    left, given = (torch.linalg.vecdot(unit * r, r) for r in (residual(b), rhs))
+    return b, left <= FACTORISED**2 * given
+
+
+def _mean(b: Float[Tensor, "b n"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b 1"]:
+    """Component along the null vector: the mean weighted by `cols`."""
+    return (cols * b).sum(-1, keepdim=True) / cols.sum(-1, keepdim=True)

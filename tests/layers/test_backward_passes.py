@@ -1,0 +1,114 @@
+"""Backward passes that do not converge are counted or warned of; second derivatives are refused."""
+
+import warnings
+
+import pytest
+import torch
+from planted import plant
+from torch import Tensor
+
+from bpnp.layers import BackwardStats, Sinkhorn, sinkhorn, weighted_pnp
+
+SHARED = "bpnp.layers.laplacian"
+
+
+def smooth_cost(n: int, dtype: torch.dtype = torch.float32) -> Tensor:
+    """Distances between points on a line: probability is shared between neighbours, and the system is slow to solve."""
+    place = torch.linspace(0, 4, n, dtype=dtype)
+    return (place[:, None] - place).abs().expand(2, n, n).clone().requires_grad_()
+
+
+@pytest.fixture
+def too_few_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three conjugate gradient steps, and no factorisation that is good enough."""
+    monkeypatch.setattr(f"{SHARED}.ITERATIONS", 3)
+    monkeypatch.setattr(f"{SHARED}.FACTORISED", 0.0)
+    monkeypatch.setattr("bpnp.layers.adjoint.ROUNDING", 0.0)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_every_device_solves_the_gradient_to_its_tolerance(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The float32 gradient of a slow system is that of float64 to five digits, with and without compiled passes."""
+    n, mu = 60, 0.02
+    weights = torch.rand(2, n, n, generator=torch.Generator().manual_seed(0))
+    exact = smooth_cost(n, torch.float64)
+    (sinkhorn(exact, mu=mu, tolerance=1e-13)[0] * weights).sum().backward()
+    if not compiled:
+        monkeypatch.setattr("bpnp.layers.compiled.applies_to", lambda _tensor: False)
+    cost, stats = smooth_cost(n), BackwardStats()
+    (sinkhorn(cost, mu=mu, backward_stats=stats)[0] * weights).sum().backward()
+    assert stats == BackwardStats(samples=2, unconverged=0)
+    assert cost.grad is not None
+    assert exact.grad is not None
+    assert (cost.grad - exact.grad).abs().max() < 5e-5 * exact.grad.abs().max()
+
+
+@pytest.mark.usefixtures("too_few_iterations")
+def test_the_function_counts_in_the_object_that_it_is_given() -> None:
+    first, second = BackwardStats(), BackwardStats()
+    plan = sinkhorn(smooth_cost(60), mu=0.02, backward_stats=first)[0]
+    assert first == BackwardStats()
+    plan.square().sum().backward()
+    assert first == BackwardStats(samples=2, unconverged=2)
+    sinkhorn(torch.rand(3, 1, 4, requires_grad=True), backward_stats=second)[0].square().sum().backward()
+    assert second == BackwardStats(samples=3, unconverged=0)
+    assert first.samples == 2
+
+
+@pytest.mark.usefixtures("too_few_iterations")
+def test_the_module_counts_for_itself_without_a_warning() -> None:
+    layer, other = Sinkhorn(mu=0.02), Sinkhorn(mu=0.02)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(2):
+            layer(smooth_cost(60))[0].square().sum().backward()
+    assert layer.backward_stats == BackwardStats(samples=4, unconverged=4)
+    assert other.backward_stats == BackwardStats()
+    layer.backward_stats.reset()
+    assert layer.backward_stats == BackwardStats()
+
+
+@pytest.mark.usefixtures("too_few_iterations")
+def test_without_an_object_to_count_in_it_warns() -> None:
+    plan = sinkhorn(smooth_cost(60), mu=0.02)[0]
+    with pytest.warns(RuntimeWarning, match="gradient of sinkhorn did not converge for 2 of 2 samples"):
+        plan.square().sum().backward()
+
+
+def test_a_gradient_that_is_not_a_number_is_counted() -> None:
+    stats = BackwardStats()
+    plan = sinkhorn(torch.rand(3, 5, 5, requires_grad=True), backward_stats=stats)[0]
+    weights = torch.ones(3, 5, 5)
+    weights[1, 2, 3] = torch.nan
+    (plan * weights).sum().backward()
+    assert stats == BackwardStats(samples=3, unconverged=1)
+
+
+def test_marginals_with_any_strides_have_a_gradient() -> None:
+    """Transposed marginals make a transposed right-hand side, whose copy must not be solved for in its place."""
+    cost = torch.rand(3, 6, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    rows = torch.softmax(torch.rand(6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1)), 0).T
+    cols = torch.softmax(torch.rand(5, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(2)), 0).T
+
+    def gradient(rows: Tensor, cols: Tensor) -> Tensor:
+        variable = cost.clone().requires_grad_()
+        plan, stats = sinkhorn(variable, mu=0.02, row_marginal=rows, col_marginal=cols, tolerance=1e-12)
+        assert stats.converged.all()
+        assert stats.iterations.max() < 20
+        return torch.autograd.grad(plan.square().sum(), variable)[0]
+
+    expected = gradient(rows.contiguous(), cols.contiguous())
+    assert expected.any()
+    torch.testing.assert_close(gradient(rows, cols), expected, rtol=1e-9, atol=1e-12)
+
+
+@pytest.mark.parametrize("layer", ["sinkhorn", "weighted_pnp"])
+def test_a_second_derivative_is_refused(layer: str) -> None:
+    planted = plant(1, 6)
+    variable = planted.diffuse(0.2).requires_grad_()
+    if layer == "sinkhorn":
+        loss = sinkhorn(variable)[0][0, 0, 0]
+    else:
+        loss = weighted_pnp(variable, planted.bearings, planted.points3d, *planted.near(0.1))[1].sum()
+    with pytest.raises(ValueError, match="expected a first derivative, got create_graph=True"):
+        torch.autograd.grad(loss, variable, create_graph=True)

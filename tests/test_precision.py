@@ -1,0 +1,142 @@
+"""The layers keep their digits whatever precision the user chose for products, and leave that choice as it was."""
+
+import threading
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import torch
+from planted import plant
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from bpnp.layers import sinkhorn, weighted_pnp
+from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.precision import exact_products, full_precision
+
+PRODUCTS = {torch.ops.aten.mm, torch.ops.aten.bmm, torch.ops.aten.addmm, torch.ops.aten.baddbmm}
+
+
+class TensorFloat32(TorchDispatchMode):
+    """Round the factors of float32 products to TF32's 10 bits of mantissa, as such a GPU does at "high"."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.rounded = 0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if function.overloadpacket in PRODUCTS and torch.get_float32_matmul_precision() != "highest":
+            self.rounded += any(isinstance(x, Tensor) and x.dtype == torch.float32 for x in args)
+            args = tuple(self.round(x) if isinstance(x, Tensor) else x for x in args)
+        return function(*args, **(kwargs or {}))
+
+    @staticmethod
+    def round(x: Tensor) -> Tensor:
+        if x.dtype != torch.float32:
+            return x
+        bits = x.contiguous().view(torch.int32)
+        return ((bits + (1 << 12)) & ~((1 << 13) - 1)).view(torch.float32)
+
+
+@pytest.fixture
+def high() -> Iterator[None]:
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision("high")
+    yield
+    torch.set_float32_matmul_precision(before)
+
+
+def features() -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.nn.functional.normalize(torch.randn(2, 40, 64, generator=generator), dim=-1)
+    return a, torch.nn.functional.normalize(a + 0.002 * torch.randn(2, 40, 64, generator=generator), dim=-1)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.usefixtures("high")
+def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    a, b = features()
+    if not compiled:
+        monkeypatch.setattr("bpnp.layers.compiled.applies_to", lambda _tensor: False)
+    planted = plant(2, 40, noise=0.002, dtype=torch.float32)
+    start = planted.near(0.1)
+
+    def results() -> list[Tensor]:
+        cost = pairwise_distance(a, b).requires_grad_()
+        plan, _ = sinkhorn(cost, mu=0.05)
+        rotation, translation, _ = weighted_pnp(plan, planted.bearings, planted.points3d, *start)
+        (gradient,) = torch.autograd.grad(plan.square().sum() + translation.sum(), cost)
+        return [cost.detach(), plan.detach(), rotation.detach(), translation.detach(), gradient]
+
+    expected = results()
+    with TensorFloat32() as emulated:
+        found = results()
+        assert emulated.rounded == 0
+        _ = a @ b.mT
+        assert emulated.rounded == 1
+    for value, exact in zip(found, expected, strict=True):
+        assert (value - exact).abs().max() < 1e-6 * exact.abs().max()
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+@pytest.mark.usefixtures("high")
+def test_the_setting_returns_after_an_error_and_from_nested_blocks() -> None:
+    cpu, seen = torch.device("cpu"), []
+
+    def fail() -> None:
+        with exact_products(cpu):
+            with exact_products(cpu):
+                seen.append(torch.get_float32_matmul_precision())
+            seen.append(torch.get_float32_matmul_precision())
+            raise ArithmeticError
+
+    with pytest.raises(ArithmeticError):
+        fail()
+    assert seen == ["highest", "highest"]
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+@pytest.mark.usefixtures("high")
+def test_overlapping_threads_are_exact_to_their_end_and_restore_the_setting() -> None:
+    inside, release = threading.Event(), threading.Event()
+    seen = []
+
+    def late() -> None:
+        with exact_products(torch.device("cpu")):
+            inside.set()
+            release.wait(20)
+            seen.append(torch.get_float32_matmul_precision())
+
+    thread = threading.Thread(target=late)
+    with exact_products(torch.device("cpu")):
+        thread.start()
+        inside.wait(20)
+    release.set()
+    thread.join()
+    assert seen == ["highest"]
+    assert torch.get_float32_matmul_precision() == "high"
+
+
+def test_a_switch_of_one_backend_is_set_and_restored() -> None:
+    switch = torch.backends.cuda.matmul
+    before = switch.fp32_precision
+    switch.fp32_precision = "tf32"  # torch.get_float32_matmul_precision() raises from now on
+    try:
+        with exact_products(torch.device("cpu")):
+            assert switch.fp32_precision == "ieee"
+        assert switch.fp32_precision == "tf32"
+    finally:
+        switch.fp32_precision = before
+
+
+def test_half_precision_arguments_are_widened_and_autocast_is_off() -> None:
+    @full_precision
+    def product(x: Tensor, *, y: Tensor) -> Tensor:
+        return x @ y
+
+    x = torch.rand(3, 3)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert (x @ x).dtype == torch.bfloat16
+        assert torch.equal(product(x, y=x), product(x, y=x.float()))
+        assert product(x.bfloat16(), y=x).dtype == torch.float32
+        assert (x @ x).dtype == torch.bfloat16
