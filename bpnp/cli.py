@@ -21,7 +21,8 @@ from bpnp.localization import localize_command, solve_command
 from bpnp.report import report_command, view_command
 from bpnp.report.dashboards import wandb_command
 from bpnp.table import table_command
-from bpnp.training.callbacks import ResultsWriter, SafeCheckpointIO
+from bpnp.training.plugins import SafeCheckpointIO
+from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.

@@ -15,7 +15,7 @@ from torch import Tensor
 from bpnp.compilation import compiler
 from bpnp.thread_pool import spread
 
-# Sums in any order, as in `bpnp.search.kernels_dense`, but NaN and infinity keep their meaning: they flag a sample.
+# Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
 

@@ -126,11 +126,8 @@ class RansacPnP(nn.Module):
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.backend = backend
-        self.pairs_factor = pairs_factor
-        self.threshold = threshold
-        self.max_iterations = max_iterations
-        self.seed = seed
+        self.backend, self.pairs_factor, self.threshold = backend, pairs_factor, threshold
+        self.max_iterations, self.seed = max_iterations, seed
 
     def forward(
         self,
@@ -141,14 +138,6 @@ class RansacPnP(nn.Module):
         mask3d: Bool[Tensor, "b n"] | None = None,
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
         return ransac_pnp(
-            assignment,
-            points2d,
-            points3d,
-            mask2d=mask2d,
-            mask3d=mask3d,
-            backend=self.backend,
-            pairs_factor=self.pairs_factor,
-            threshold=self.threshold,
-            max_iterations=self.max_iterations,
-            seed=self.seed,
-        )
+            assignment, points2d, points3d, mask2d=mask2d, mask3d=mask3d, backend=self.backend, seed=self.seed,
+            pairs_factor=self.pairs_factor, threshold=self.threshold, max_iterations=self.max_iterations,
+        )  # fmt: skip

@@ -15,16 +15,22 @@ if TYPE_CHECKING:
         rotation_error,
         translation_error,
     )
-    from bpnp.metrics.per_pair import MeanOverPairs, PoseQuartiles, PoseRecall, RecallThresholds, quartiles, recalls
+    from bpnp.metrics.per_pair import MeanOverPairs
+    from bpnp.metrics.quartiles import PoseQuartiles, pose_quartiles
+    from bpnp.metrics.recall import PoseRecall, RecallThresholds, pose_recalls
 
-ERRORS = ("PoseErrors", "centre_error", "pose_errors", "reprojection_error", "rotation_error", "translation_error")
 __all__ = [
     "MeanOverPairs", "PoseErrors", "PoseQuartiles", "PoseRecall", "RecallThresholds", "centre_error", "pose_errors",
-    "quartiles", "recalls", "reprojection_error", "rotation_error", "translation_error",
+    "pose_quartiles", "pose_recalls", "reprojection_error", "rotation_error", "translation_error",
 ]  # fmt: skip
+PLACES = dict.fromkeys(__all__, "errors") | {
+    "MeanOverPairs": "per_pair",
+    **dict.fromkeys(("PoseQuartiles", "pose_quartiles"), "quartiles"),
+    **dict.fromkeys(("PoseRecall", "RecallThresholds", "pose_recalls"), "recall"),
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in __all__:
+    if name not in PLACES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module("bpnp.metrics.errors" if name in ERRORS else "bpnp.metrics.per_pair"), name)
+    return getattr(importlib.import_module(f"bpnp.metrics.{PLACES[name]}"), name)

@@ -12,7 +12,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from bpnp.geometry import project, transform
-from bpnp.metrics import PoseErrors, RecallThresholds, pose_errors, quartiles, recalls
+from bpnp.metrics import PoseErrors, RecallThresholds, pose_errors, pose_quartiles, pose_recalls
 from bpnp.types import Batch, Pose, Prediction
 
 if TYPE_CHECKING:
@@ -165,7 +165,9 @@ def summarise(rows: Sequence[PairRow], *, thresholds: RecallThresholds | None = 
     for estimate in sorted({row.estimate for row in rows}, key=pipeline_order):
         chosen = [row for row in rows if row.estimate == estimate]
         errors = _errors(chosen)
-        values = {key: float(value) for key, value in (quartiles(errors) | recalls(errors, thresholds)).items()}
+        values = {
+            key: float(value) for key, value in (pose_quartiles(errors) | pose_recalls(errors, thresholds)).items()
+        }
         values["converged"] = sum(row.converged for row in chosen) / len(chosen)
         values["seconds_mean"] = math.fsum(row.seconds for row in chosen) / len(chosen)
         summary[estimate] = values

@@ -13,7 +13,7 @@ from rich.console import Console, ConsoleOptions
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.metrics import RecallThresholds, recalls
+from bpnp.metrics import RecallThresholds, pose_recalls
 from bpnp.report.folder import read_results, read_runs
 from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
@@ -183,7 +183,7 @@ def _rows(runs: Mapping[str, Results]) -> dict[str, Values]:
     rows: dict[str, Values] = {}
     for name, results in runs.items():
         for estimate, values in results.estimates.items():
-            standard = recalls(results.errors(estimate), STANDARD_POINTS)
+            standard = pose_recalls(results.errors(estimate), STANDARD_POINTS)
             label = estimate if len(runs) == 1 else f"{name}: {estimate}"
             rows[label] = values | {key: float(value) for key, value in standard.items()}
     return rows

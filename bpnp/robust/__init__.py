@@ -1,1 +1,1 @@
-"""Poses from proposed pairs of points: P3P, RANSAC, and the RANSAC of other libraries."""
+"""Poses from candidate pairs of points: P3P, RANSAC of this and of other libraries, proposals from an assignment."""

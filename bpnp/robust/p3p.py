@@ -31,7 +31,7 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *,
     bearings: rays in the camera frame, of any length. points3d: scene units, any scale and offset. Computed in float64,
     returned in the type of `points3d`. The four slots have no order, and where two solutions meet both are given.
     Collinear or repeated points, rays that no pose explains, NaN and infinity give `valid` False. Work and shapes do
-    not depend on the data, so nothing waits for the device. Raises nothing.
+    not depend on the data, so nothing waits for the device.
 
     >>> points3d = torch.eye(3)
     >>> camera = points3d + torch.tensor([0.0, 0.0, 5.0])

@@ -10,8 +10,8 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.candidates import Candidates, best_distinct, merged
-from bpnp.search.kernels_dense import descend
-from bpnp.search.kernels_grid import build_grid, descend_sparse
+from bpnp.search.kernels.dense import descend
+from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
 from bpnp.search.settings import ClusterStage, Recipe
 from bpnp.search.starts import Prior, draw_poses
@@ -38,7 +38,7 @@ def run_batch(
 ) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
     settings = scene.settings
-    rotation, translation = draw_poses(scene.bearings, scene.bulk3d, settings.starts, recipe, prior, scene.rng)
+    rotation, translation = draw_poses(scene.spread, scene.bulk3d, settings.starts, recipe, prior, scene.rng)
     starts = Candidates.unscored(rotation, translation, hits=1)
     coarse = anneal_on_clusters(scene, starts, settings.coarse, recipe.first_scale, outliers, deadline)
     return _anneal_further(scene, Candidates.concatenated([coarse, shaken(scene, best)]), outliers, deadline)
@@ -51,7 +51,7 @@ def refine_batch(scene: Scene, starts: Candidates, outliers: float, deadline: De
     # A start that is right already needs no clusters, which would only shake it.
     first_scale = scene.settings.middle.last_scale * scene.spread
     direct = anneal_on_points(scene, starts, first_scale, outliers, deadline, bearings=scene.settings.fine.bearings)
-    return merged([clustered, direct], scene.settings.kept, scene.settings)
+    return merged([clustered, direct], scene)
 
 
 def _anneal_further(scene: Scene, poses: Candidates, outliers: float, deadline: Deadline) -> Candidates:
@@ -78,7 +78,7 @@ def anneal_on_clusters(
 
     done = _in_time(anneal, len(starts), deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
-    return best_distinct(ends, stage.kept, stage.apart_deg, math.inf)
+    return best_distinct(ends, scene, stage.kept, degrees=stage.apart_deg, shift=math.inf)
 
 
 def anneal_on_points(
@@ -91,7 +91,7 @@ def anneal_on_points(
     fine = scene.settings.fine
     rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
-    grid = build_grid(scene.bearings[:bearings], float(scales[-1]))
+    grid = build_grid(scene.offsets[:bearings], float(scales[-1]))
     points, outlier = np.ascontiguousarray(scene.points3d.T), scene.outlier_density(outliers)
     rotation, translation = starts.rotation.copy(), starts.translation.copy()
     result = np.empty((len(starts), 3), np.float32)
@@ -106,7 +106,7 @@ def anneal_on_points(
     ends = replace(
         starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2]
     )
-    return best_distinct(ends[:done], done, scene.settings.same_deg, scene.settings.same_shift)
+    return best_distinct(ends[:done], scene, done)
 
 
 def shaken(scene: Scene, poses: Candidates) -> Candidates:
@@ -121,10 +121,16 @@ def shaken(scene: Scene, poses: Candidates) -> Candidates:
     return Candidates.unscored(turned.astype(np.float32), moved.astype(np.float32))
 
 
-def finish(scene: Scene, poses: Candidates, outliers: float, deadline: Deadline) -> Candidates:
-    """One or more poses, annealed once more on every bearing, the best two with several shares of outliers."""
+def finish(
+    scene: Scene, poses: Candidates, outliers: float, deadline: Deadline, others: tuple[float, ...] | None = None
+) -> Candidates:
+    """One or more poses, annealed once more on every bearing, the best two with several shares of outliers.
+
+    others: these shares beside `outliers`; None for `settings.end_outliers`.
+    """
+    shares = scene.settings.end_outliers if others is None else others
     runs = [(i, outliers) for i in range(len(poses))]
-    runs += [(i, share) for i in range(min(2, len(poses))) for share in scene.settings.end_outliers]
+    runs += [(i, share) for i in range(min(2, len(poses))) for share in shares]
     ends: list[Candidates] = []
     for i, share in runs:
         if deadline.passed():
@@ -133,9 +139,7 @@ def finish(scene: Scene, poses: Candidates, outliers: float, deadline: Deadline)
         pose = poses[i : i + 1]
         first_scale = scene.settings.end_scale * float(pose.scale[0])
         ends.append(anneal_on_points(scene, pose, first_scale, share, deadline, bearings=None))
-    return best_distinct(
-        Candidates.concatenated(ends), scene.settings.kept, scene.settings.same_deg, scene.settings.same_shift
-    )
+    return best_distinct(Candidates.concatenated(ends), scene, scene.settings.kept)
 
 
 def _in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import distinct, same_pose
-from bpnp.search.settings import SearchSettings
+from bpnp.search.scene import Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,25 +54,34 @@ class Candidates:
 
 
 def best_distinct(
-    candidates: Candidates, count: int, degrees: float, shift: float, sources: NDArray[np.int64] | None = None
+    candidates: Candidates,
+    scene: Scene,
+    count: int,
+    *,
+    degrees: float | None = None,
+    shift: float | None = None,
+    sources: NDArray[np.int64] | None = None,
 ) -> Candidates:
-    """The best `count` poses of which no two are closer than `degrees` and `shift`, best first.
+    """The best `count` poses of a scene of which no two are closer than `degrees` and `shift`, best first.
 
-    A pose has the hits of all poses that are the same: the most of each source, and of the sources the sum.
-    sources: (c,) where each candidate is from; one batch that reached a pose twice counts once. None: all are of one.
+    degrees, shift: by default those of the settings. sources: (c,) the batch that each candidate is from, by default
+    the same. A pose has the hits of all poses that are the same: the most of each batch, added up over the batches.
     """
-    kept = distinct(candidates.rotation, candidates.translation, candidates.score, count, degrees, shift)
+    limits = (
+        scene.settings.same_deg if degrees is None else degrees,
+        scene.settings.same_shift if shift is None else shift,
+    )
+    poses = candidates.rotation, candidates.translation * scene.shift_weight
+    kept = distinct(*poses, candidates.score, count, *limits)
     origin = np.zeros(len(candidates), np.int64) if sources is None else sources
     hits = []
     for i in kept.tolist():
-        same = same_pose(candidates.rotation, candidates.translation, i, degrees, shift)
+        same = same_pose(*poses, i, *limits)
         hits.append(sum(int(candidates.hits[same & (origin == source)].max()) for source in np.unique(origin[same])))
     return replace(candidates[kept], hits=np.array(hits, np.int64))
 
 
-def merged(parts: Sequence[Candidates], count: int, settings: SearchSettings) -> Candidates:
-    """The best `count` distinct poses of several batches; a pose has the hits of all batches that found it."""
+def merged(parts: Sequence[Candidates], scene: Scene) -> Candidates:
+    """The best distinct poses of several batches; a pose has the hits of all batches that found it."""
     sources = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return best_distinct(
-        Candidates.concatenated(parts), count, settings.same_deg, settings.same_shift, sources
-    )  # fmt: skip
+    return best_distinct(Candidates.concatenated(parts), scene, scene.settings.kept, sources=sources)

@@ -36,7 +36,8 @@ def search_poses(
 
     bearings: (m, 3) unit vectors of any field of view. points3d: (n, 3), any unit, any origin.
     prior: what is known of the pose. seed: of everything that is random.
-    clutter: share of the points without a partner to expect, from 0 to below 1; None tries several.
+    clutter: share of the points without a partner to expect, from 0 to below 1; it is then the only one
+        that is tried, which saves time at the end. None for that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
         depends on the machine. progress: called after each batch.
 
@@ -59,7 +60,7 @@ def search_poses(
     while batches < settings.max_batches and not (safe or exhausted or end.passed()):
         recipe = settings.recipes[batches % len(settings.recipes)]
         found = run_batch(scene, recipe, known, candidates, share, end)
-        candidates = merged([candidates, found], settings.kept, settings)
+        candidates = merged([candidates, found], scene)
         batches += 1
         if len(candidates):
             stalled = stalled + 1 if candidates.score[0] < best + settings.evidence.better else 0
@@ -68,5 +69,5 @@ def search_poses(
         if progress is not None:
             progress(batches, time.monotonic() - start)
     if len(candidates):
-        candidates = finish(scene, candidates, share, end)
+        candidates = finish(scene, candidates, share, end, None if clutter is None else ())
     return judged(candidates, scene, safe=safe, batches=batches)

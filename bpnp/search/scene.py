@@ -11,15 +11,20 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread, solid_angle
 
+FORWARD = np.array([0.0, 0.0, 1.0])
+SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Scene:
-    """One pair, centred and scaled to unit extent, each side in a random order.
+    """One pair, the points centred and scaled to unit extent, the camera turned to the mean bearing, in random order.
 
-    bearings: (m, 3) unit vectors. points3d: (n, 3). bulk3d: those of them that decide origin and unit; the few points
-    of a reconstruction that lie orders of magnitude away do not. spread: of the bearings, radians for a narrow view.
-    solid_angle: that they fill, steradians. smallest_scale: of the residuals, radians. rng: of all that is random.
+    offsets: (m, 3) of the unit bearings from (0, 0, 1), their mean direction after `frame` (3, 3) has turned the
+    camera: float32 keeps the digits of a narrow view in them. points3d: (n, 3). bulk3d: those of them that decide
+    origin and unit; the few points of a reconstruction that lie orders of magnitude away do not.
+    spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
+    compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
+    smallest_scale: of the residuals, radians. rng: of all that is random.
     """
 
     def __init__(
@@ -31,11 +36,13 @@ class Scene:
         bulk = points3d[in_bulk]
         self.centre = bulk.mean(0)
         self.size = max(float(np.sqrt(((bulk - self.centre) ** 2).sum(-1).mean())), 1e-30)
-        self.bearings = self.rng.permutation(bearings).astype(np.float32)
+        self.frame = _turned_to(bearings.mean(0))
+        self.offsets = self.rng.permutation(bearings @ self.frame.T - FORWARD).astype(np.float32)
         order = self.rng.permutation(len(points3d))
         self.points3d = ((points3d - self.centre) / self.size)[order].astype(np.float32)
         self.bulk3d = self.points3d[in_bulk[order]]
-        self.spread, self.solid_angle = angular_spread(self.bearings), solid_angle(self.bearings)
+        self.spread, self.solid_angle = angular_spread(self.offsets), solid_angle(self.offsets)
+        self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread)
 
@@ -45,27 +52,32 @@ class Scene:
 
     def enter_prior(self, prior: Prior) -> Prior:
         """The prior in this frame."""
-        if isinstance(prior, GravityPrior) or prior.translation is None:
-            return prior
-        _, moved = self.enter(np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64))
-        return prior._replace(translation=moved, translation_sigma=prior.translation_sigma / self.size)
+        if isinstance(prior, GravityPrior):
+            return prior._replace(up_camera=self.frame @ np.asarray(prior.up_camera))
+        rotation = np.asarray(prior.rotation, np.float64)
+        if prior.translation is None:
+            return prior._replace(rotation=self.frame @ rotation)
+        turned, moved = self.enter(rotation, np.asarray(prior.translation, np.float64))
+        sigma = prior.translation_sigma / self.size
+        return prior._replace(rotation=turned, translation=moved, translation_sigma=sigma)
 
     def enter(self, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> tuple[Array, Array]:
         """Poses of the user in this frame."""
-        moved = (translation + rotation @ self.centre) / self.size
-        return rotation.astype(np.float32), moved.astype(np.float32)
+        moved = (translation + rotation @ self.centre) / self.size @ self.frame.T
+        return (self.frame @ rotation).astype(np.float32), moved.astype(np.float32)
 
     def leave(self, rotation: Array, translation: Array) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Poses of this frame in the user's coordinates, in float64, their rotations orthogonal to its precision."""
-        turn = Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
-        return turn, translation.astype(np.float64) * self.size - turn @ self.centre
+        turn = self.frame.T @ Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
+        return turn, translation.astype(np.float64) * self.size @ self.frame - turn @ self.centre
 
     def clusters(self, count: int) -> tuple[Array, Array, Array, Array]:
-        """Bearings (3, k), their weights, points (3, l) and theirs."""
-        f, a = self._clustered(self.bearings, count)
+        """Offsets of bearings (3, k), their weights, points (3, l) and theirs."""
+        d, a = self._clustered(self.offsets, count)
         p, b = self._clustered(self.points3d, count)
-        f = f / np.linalg.norm(f, axis=-1, keepdims=True)
-        return np.ascontiguousarray(f.T), a, np.ascontiguousarray(p.T), b
+        f = d.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
+        d = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
+        return np.ascontiguousarray(d.T), a, np.ascontiguousarray(p.T), b
 
     def _clustered(self, points: Array, count: int) -> tuple[Array, Array]:
         """At most `count` cluster centres, and how many points each stands for."""
@@ -77,6 +89,16 @@ class Scene:
         centres, members = lloyd(sample, first, self.settings.lloyd_iterations)
         weight = members.astype(np.float32) * np.float32(len(points) / size)
         return centres[members > 0], weight[members > 0]
+
+
+def _turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation (3, 3) that turns `axis` to (0, 0, 1); none if there is no axis, for bearings all around."""
+    length = float(np.linalg.norm(axis))
+    if length < 1e-6:
+        return np.eye(3)
+    forward = axis / length
+    right = np.linalg.svd(forward[None])[2][1]
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def lloyd(points: Array, centres: Array, iterations: int) -> tuple[Array, NDArray[np.int64]]:

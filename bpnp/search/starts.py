@@ -63,26 +63,23 @@ def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) ->
 
 
 def draw_poses(
-    bearings: Array, points3d: Array, count: int, recipe: Recipe, prior: Prior | None, rng: np.random.Generator
+    spread: float, points3d: Array, count: int, recipe: Recipe, prior: Prior | None, rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Rotations (count, 3, 3) and translations (count, 3) to start from.
+    """Rotations (count, 3, 3) and translations (count, 3) to start from, for a camera that looks along (0, 0, 1).
 
-    The weak-perspective translation puts a point of the scene on the mean bearing, at the distance at which the points'
-    extent across it has the extent of the bearings.
+    The weak-perspective translation puts a point of the scene on this axis, at the distance at which the points' extent
+    across it is seen under the angle `spread`, that of the bearings.
     """
     rotation = draw_rotations(count, prior, rng)
-    axis = bearings.mean(0)
-    axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
     sample = points3d[rng.choice(len(points3d), min(200, len(points3d)), replace=False)]
-    across = sample @ rotation.transpose(0, 2, 1)
-    across = across - (across @ axis)[..., None] * axis
+    across = (sample @ rotation.transpose(0, 2, 1))[..., :2]
     extent = np.sqrt(((across - across.mean(1, keepdims=True)) ** 2).sum(-1).mean(-1))
-    depth = extent / angular_spread(bearings) * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
+    depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
     middle = points3d.mean(0)
     seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )
-    translation = depth[:, None] * axis - np.einsum("sij,sj->si", rotation, seen)
+    translation = depth[:, None] * np.array([0.0, 0.0, 1.0]) - np.einsum("sij,sj->si", rotation, seen)
     if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
         # About the middle of the points: there the rotation's error moves the camera, not what it looks at.
         known = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
@@ -92,13 +89,12 @@ def draw_poses(
     return rotation.astype(np.float32), translation.astype(np.float32)
 
 
-def angular_spread(bearings: Array) -> float:
+def angular_spread(offsets: Array) -> float:
     """Root mean square distance of the bearings from their mean, radians for a narrow view."""
-    return max(float(np.sqrt(bearings.var(0).sum())), 1e-6)
+    return max(float(np.sqrt(offsets.var(0, dtype=np.float64).sum())), 1e-12)
 
 
-def solid_angle(bearings: Array) -> float:
+def solid_angle(offsets: Array) -> float:
     """Steradians that the bearings fill: of the rectangle with their principal standard deviations, 4 pi at most."""
-    centred = bearings - bearings.mean(0)
-    variances = np.linalg.eigvalsh(centred.T @ centred / len(bearings))[1:]
-    return float(np.clip(12 * math.sqrt(max(float(variances.prod()), 0.0)), 1e-9, 4 * math.pi))
+    variances = np.linalg.eigvalsh(np.cov(offsets.T.astype(np.float64), bias=True))[1:]
+    return float(np.clip(12 * math.sqrt(max(float(variances.prod()), 0.0)), 1e-20, 4 * math.pi))

@@ -72,7 +72,7 @@ def is_unique(candidates: Candidates, scene: Scene) -> bool:
 def is_plausible(candidates: Candidates, scene: Scene) -> bool:
     """Whether the residuals are about the spacing of the bearings or less, and enough points are matched."""
     rule = scene.settings.evidence
-    spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.bearings))
+    spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.offsets))
     return bool(candidates.scale[0] < rule.plausible_scale * spacing and candidates.matched[0] > rule.plausible_matched)
 
 
@@ -81,7 +81,7 @@ def lead(candidates: Candidates, scene: Scene) -> float:
     limit = scene.settings.evidence.other_deg
     other = ~same_pose(candidates.rotation, candidates.translation, 0, limit, math.inf)
     gap = candidates.score[0] - candidates.score[other].max() if other.any() else math.inf
-    return float(gap) * len(scene.bearings)
+    return float(gap) * len(scene.offsets)
 
 
 def judged(candidates: Candidates, scene: Scene, *, safe: bool, batches: int) -> SearchResult:
@@ -89,7 +89,7 @@ def judged(candidates: Candidates, scene: Scene, *, safe: bool, batches: int) ->
 
     safe: whether the search ended because its best pose was (`is_safe`).
     """
-    counts = f"{len(scene.bearings)} 2D and {len(scene.points3d)} 3D points"
+    counts = f"{len(scene.offsets)} 2D and {len(scene.points3d)} 3D points"
     if not len(candidates):
         return no_pose(f"no pose fits: {counts}, too few or all on one line", batches)
     verdict, reason = _judge(candidates, scene, safe)
@@ -104,7 +104,7 @@ def judged(candidates: Candidates, scene: Scene, *, safe: bool, batches: int) ->
 
 def no_pose(reason: str, batches: int = 0) -> SearchResult:
     """Of points that fix no pose, or for which none was found."""
-    return SearchResult(Candidates.none(), "failed", reason, batches)
+    return SearchResult(Candidates.unscored(np.empty((0, 3, 3)), np.empty((0, 3))), "failed", reason, batches)
 
 
 def _judge(candidates: Candidates, scene: Scene, safe: bool) -> tuple[Verdict, str]:

@@ -25,10 +25,12 @@ def scored(problem: Problem, rotation: Array, translation: Array, deadline: Dead
     scene = Scene(problem.bearings, problem.local3d, 0, DEFAULT)
     starts = Candidates.unscored(*scene.enter(rotation[found], translation[found]))
     # Each starts at the scale of its own residuals: the median distance of a point to the nearest bearing.
-    camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
-    seen = camera / np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
-    tree = cKDTree(scene.bearings)
-    distance = np.stack([np.median(tree.query(points)[0]) for points in seen]).astype(np.float32)
+    tree = cKDTree(problem.bearings)
+    distance = np.zeros(len(starts), np.float32)
+    for i, (r, t) in enumerate(zip(rotation[found], translation[found], strict=True)):
+        camera = problem.local3d @ r.T + t
+        length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12 * scene.size)
+        distance[i] = np.median(tree.query(camera / length)[0])
     starts = replace(starts, scale=np.maximum(distance, scene.smallest_scale))
     poses = finish(scene, starts, DEFAULT.outliers, deadline)
     return judged(poses, scene, safe=is_safe(poses, scene), batches=len(starts))
@@ -41,7 +43,7 @@ def joined(problem: Problem, around: SearchResult, anywhere: SearchResult) -> Se
     for result in (around, anywhere):
         rotation, translation = scene.enter(result.candidates.rotation, result.candidates.translation)
         parts.append(replace(result.candidates, rotation=rotation, translation=translation))
-    poses = merged(parts, DEFAULT.kept, DEFAULT)
+    poses = merged(parts, scene)
     sure = any(result.verdict == "confident" for result in (around, anywhere))
     agree = Candidates.concatenated([poses[:1], parts[1][:1]])
     both = len(agree) == 2 and same_pose(agree.rotation, agree.translation, 0, DEFAULT.evidence.other_deg, np.inf)[1]

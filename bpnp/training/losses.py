@@ -37,7 +37,8 @@ def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tens
         raise ValueError("expected an assignment and a batch with `match3d`, got None")
     partner = match3d.clamp_min(0)
     paired = (match3d >= 0).to(assignment.dtype)
-    paired2d = torch.zeros_like(assignment[:, :, 0]).scatter_add(1, partner, paired)
+    # Several 3D points may have been seen as one 2D point.
+    paired2d = torch.zeros_like(assignment[:, :, 0]).scatter_reduce(1, partner, paired, "amax")
     rows, cols = assignment.sum(2), assignment.sum(1)
     rows = rows if prediction.unmatched2d is None else rows + prediction.unmatched2d
     cols = cols if prediction.unmatched3d is None else cols + prediction.unmatched3d

@@ -7,7 +7,15 @@ import pytest
 import torch
 from torchmetrics import MetricCollection
 
-from bpnp.metrics import MeanOverPairs, PoseErrors, PoseQuartiles, PoseRecall, RecallThresholds, quartiles, recalls
+from bpnp.metrics import (
+    MeanOverPairs,
+    PoseErrors,
+    PoseQuartiles,
+    PoseRecall,
+    RecallThresholds,
+    pose_quartiles,
+    pose_recalls,
+)
 from bpnp.types import Batch, Pose, SolveStats
 
 
@@ -28,7 +36,7 @@ def test_metrics_over_batches_are_the_functions_over_everything() -> None:
         metrics.update(select(errors, list(rows)))
     values = metrics.compute()
     thresholds = RecallThresholds(rotation_deg=(4, 8), joint=[(15, 5)])
-    expected = quartiles(errors) | recalls(errors, thresholds)
+    expected = pose_quartiles(errors) | pose_recalls(errors, thresholds)
     assert values.keys() == expected.keys()
     for key in values:
         torch.testing.assert_close(values[key], expected[key], rtol=0, atol=0)
@@ -69,7 +77,7 @@ def test_two_data_sets_in_one_metric_are_noticed() -> None:
     metric.update(random_errors(1, 5))
     with pytest.warns(UserWarning, match="one pair per `Batch.index`"):
         values = metric.compute()
-    assert values == quartiles(random_errors(0, 5))
+    assert values == pose_quartiles(random_errors(0, 5))
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
@@ -103,7 +111,7 @@ def test_two_processes_give_the_metrics_of_one(tmp_path: Path) -> None:
     ]
     torch.multiprocessing.spawn(_process, (tmp_path, shards), nprocs=2)
     errors = random_errors(0, 7)
-    expected = {key: value.item() for key, value in (quartiles(errors) | recalls(errors)).items()}
+    expected = {key: value.item() for key, value in (pose_quartiles(errors) | pose_recalls(errors)).items()}
     expected["mean"] = (0 + 1 + 4 + 9 + 16 + 25 + 36) / 7
     for rank in range(2):
         assert json.loads((tmp_path / f"{rank}.json").read_text()) == [expected] * 3

@@ -13,8 +13,8 @@ from bpnp.metrics import (
     RecallThresholds,
     centre_error,
     pose_errors,
-    quartiles,
-    recalls,
+    pose_quartiles,
+    pose_recalls,
     reprojection_error,
     rotation_error,
 )
@@ -144,14 +144,14 @@ def test_a_pair_without_a_pose_counts_as_the_worst(broken: str, value: float) ->
     assert errors.rotation_deg[1] == errors.reprojection_deg[1] == 180
     assert errors.translation[1] == errors.centre[1] == math.inf
     assert errors.rotation_deg[[0, 2, 3]].max() < 1e-6
-    values = quartiles(errors)
+    values = pose_quartiles(errors)
     assert values["found"] == 0.75
     assert not any(value.isnan() for value in values.values())
     # The third quartile of 4 lies a quarter of the way from the third to the fourth.
     assert values["translation_q3"] == math.inf
     assert values["translation_q2"] < 1e-6
     assert values["rotation_q3_deg"] == pytest.approx(45, abs=1e-6)
-    assert recalls(errors)["recall_joint_15deg_0.5"] == 0.75
+    assert pose_recalls(errors)["recall_joint_15deg_0.5"] == 0.75
 
 
 def test_pairs_without_a_true_match_are_left_out_of_the_reprojection_figures_only_and_counted() -> None:
@@ -163,17 +163,17 @@ def test_pairs_without_a_true_match_are_left_out_of_the_reprojection_figures_onl
     pose.rotation[1] = math.nan
     errors = pose_errors(pose, batch)
     assert errors.reprojection_deg.isnan().tolist() == [True, False, False, False]
-    values = quartiles(errors)
+    values = pose_quartiles(errors)
     assert values["without_true_pairs"] == 1
     assert values["reprojection_q3_deg"] == pytest.approx(90, abs=1e-6)  # of 0, 0, 180
-    assert recalls(errors)["recall_reprojection_1deg"].item() == pytest.approx(2 / 3)
-    assert recalls(errors)["recall_rotation_1deg"] == 0.75
+    assert pose_recalls(errors)["recall_reprojection_1deg"].item() == pytest.approx(2 / 3)
+    assert pose_recalls(errors)["recall_rotation_1deg"] == 0.75
 
 
 def test_without_matches_there_are_no_reprojection_figures() -> None:
     full = planted_batch(3, 2)
     batch = Batch.from_arrays(full.points2d, full.points3d, full.rotation, full.translation)
-    values = quartiles(pose_errors(true_pose(batch), batch)) | recalls(pose_errors(true_pose(batch), batch))
+    values = pose_quartiles(pose_errors(true_pose(batch), batch)) | pose_recalls(pose_errors(true_pose(batch), batch))
     assert not any("reprojection" in key for key in values)
     assert values["without_true_pairs"] == 2
 
@@ -181,7 +181,7 @@ def test_without_matches_there_are_no_reprojection_figures() -> None:
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 17, 100])
 def test_quartiles_are_those_of_numpy(size: int) -> None:
     errors = PoseErrors(*torch.from_numpy(np.random.default_rng(size).gamma(1.0, 10.0, (4, size))))
-    values = quartiles(errors)
+    values = pose_quartiles(errors)
     for name, error in (("rotation_q{}_deg", errors.rotation_deg), ("translation_q{}", errors.translation),
                         ("centre_q{}", errors.centre), ("reprojection_q{}_deg", errors.reprojection_deg)):  # fmt: skip
         ours = [values[name.format(number)].item() for number in (1, 2, 3)]
@@ -199,7 +199,7 @@ def test_quartiles_are_those_of_numpy(size: int) -> None:
 )
 def test_quartiles_next_to_infinity(values: list[float], expected: list[float]) -> None:
     column = torch.tensor(values, dtype=torch.float64)
-    result = quartiles(PoseErrors(column, column, column, column))
+    result = pose_quartiles(PoseErrors(column, column, column, column))
     assert [result[f"centre_q{number}"].item() for number in (1, 2, 3)] == expected
 
 
@@ -207,7 +207,7 @@ def test_recall_counts_errors_up_to_and_including_the_threshold() -> None:
     rotation = torch.tensor([1.0, 5.0, 9.0, 15.0, 180.0], dtype=torch.float64)
     translation = torch.tensor([0.4, 0.5, 0.9, 0.6, math.inf], dtype=torch.float64)
     errors = PoseErrors(rotation, translation, translation, rotation)
-    assert {key: value.item() for key, value in recalls(errors).items() if "joint" in key or "5deg" in key} == {
+    assert {key: value.item() for key, value in pose_recalls(errors).items() if "joint" in key or "5deg" in key} == {
         "recall_rotation_5deg": 0.4,
         "recall_rotation_15deg": 0.8,
         "recall_reprojection_0.25deg": 0,
@@ -215,7 +215,7 @@ def test_recall_counts_errors_up_to_and_including_the_threshold() -> None:
         "recall_joint_15deg_0.5": 0.4,
         "recall_joint_10deg_1": 0.6,
     }
-    chosen = recalls(errors, RecallThresholds((7,), (), (0.45,), (), ((1, 0.4),)))
+    chosen = pose_recalls(errors, RecallThresholds((7,), (), (0.45,), (), ((1, 0.4),)))
     assert {key: value.item() for key, value in chosen.items()} == {
         "recall_rotation_7deg": 0.4,
         "recall_centre_0.45": 0.2,
@@ -241,4 +241,4 @@ def test_bad_input_raises_one_clear_error() -> None:
         PoseRecall(joint=[(1, math.inf)])
     nan = torch.full((1,), math.nan, dtype=torch.float64)
     with pytest.raises(ValueError, match="expected a rotation error for each pair, got NaN"):
-        quartiles(PoseErrors(nan, nan, nan, nan))
+        pose_quartiles(PoseErrors(nan, nan, nan, nan))

@@ -31,10 +31,10 @@ def uniform(*shape: int) -> Tensor:
     return torch.rand(*shape, dtype=torch.float64)
 
 
-def random_boxes(count: int, spread: float = 3.0) -> Boxes:
+def random_boxes(count: int) -> Boxes:
     """From large to small, elongated, around and away from the origin."""
     halves = 10 ** (-2 * uniform(count, 1)) * (0.3 + uniform(count, 3))
-    return Boxes(1.5 * normal(count, 3), 10 ** (-2 * uniform(count)), spread * normal(count, 3), halves)
+    return Boxes(1.5 * normal(count, 3), 10 ** (-2 * uniform(count)), 3 * normal(count, 3), halves)
 
 
 def some_pose(boxes: Boxes, *, corner: bool) -> tuple[Tensor, Tensor]:
@@ -60,7 +60,7 @@ def whole(turn: Tensor, turn_half: float, place: Tensor, place_half: float) -> B
 def test_uncertainty_angles_and_distances_hold_in_ten_thousand_boxes() -> None:
     boxes, points = random_boxes(10_000), normal(4, 3)
     turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, points)
-    near, far = distance_range(boxes, points)
+    closest, farthest = distance_range(boxes, points)
     for trial in range(20):
         rotation, place = some_pose(boxes, corner=trial % 2 == 1)
         towards = points - place.unsqueeze(1)
@@ -68,8 +68,8 @@ def test_uncertainty_angles_and_distances_hold_in_ten_thousand_boxes() -> None:
         turned, centred = points @ rotation.mT, points @ boxes.rotation.mT
         assert (angle_between(turned, centred) <= turning.unsqueeze(-1) + 1e-9).all()
         distances = towards.norm(dim=-1)
-        assert (distances >= near - 1e-9).all()
-        assert (distances <= far + 1e-9).all()
+        assert (distances >= closest - 1e-9).all()
+        assert (distances <= farthest + 1e-9).all()
 
 
 def test_no_pose_of_ten_thousand_boxes_is_below_the_mixtures_bound() -> None:

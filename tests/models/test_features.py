@@ -9,7 +9,7 @@ from torch.nn import functional as F
 
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
 from bpnp.models.nets.normalisation import MaskedBatchNorm, context_norm
-from bpnp.training.callbacks import CompileNets
+from bpnp.training.plugins import CompileNets
 
 SIZES = (9, 1, 14)
 

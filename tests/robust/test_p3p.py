@@ -1,12 +1,11 @@
 import numpy as np
 import poselib
 import pytest
-import roma
 import torch
 from torch import Tensor
 from torch._subclasses.fake_tensor import FakeTensorMode
 
-from bpnp.geometry import angle_between, rotation_angle, transform
+from bpnp.geometry import angle_between, random_rotations, rotation_angle, transform
 from bpnp.robust.p3p import p3p
 
 
@@ -19,8 +18,7 @@ def planted(size: int, *, seed: int = 0, field: float = 0.8) -> tuple[Tensor, Te
 
     depth = 1 + 7 * uniform(size, 3, 1)
     camera = torch.cat([(2 * uniform(size, 3, 2) - 1) * field * depth, depth], -1)
-    quaternion = torch.nn.functional.normalize(uniform(size, 4) - 0.5, dim=-1)
-    rotation, translation = roma.unitquat_to_rotmat(quaternion), 4 * uniform(size, 3) - 2
+    rotation, translation = random_rotations(size, generator), 4 * uniform(size, 3) - 2
     points3d = (camera - translation.unsqueeze(1)) @ rotation
     return torch.nn.functional.normalize(camera, dim=-1), points3d, rotation, translation
 

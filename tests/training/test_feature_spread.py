@@ -14,8 +14,8 @@ from small_data import small_net
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, BPnPNet
-from bpnp.training.callbacks import LearningRateSchedule
-from bpnp.training.monitors import FeatureSpread, feature_spread
+from bpnp.training.feature_spread import FeatureSpread, feature_spread
+from bpnp.training.schedules import LearningRateSchedule
 from bpnp.training.task import BlindPnPTask
 
 

@@ -181,6 +181,25 @@ def test_matching_likelihood_loss_is_the_sum_over_points_written_out() -> None:
         assert float(losses[b]) == pytest.approx(sum(paired) / len(paired) + sum(alone) / len(alone))
 
 
+def test_an_image_point_with_two_scene_points_is_not_alone() -> None:
+    """Points 0 and 1 of the scene are seen as image point 0: the points alone are image point 1 and scene point 2."""
+    planted = plant(1, 3)
+    points = planted.points2d[0, :2], planted.points3d[0]
+    batch = Batch.from_arrays(*points, match3d=torch.tensor([0, 0, -1]))
+    torch.manual_seed(0)
+    mass = torch.rand(1, 3, 4, dtype=torch.float64)
+    inner, left2d, left3d = mass[:, :2, :3], mass[:, :2, 3], mass[:, 2, :3]
+    left2d.requires_grad_()
+    loss = matching_likelihood_loss(Prediction(inner, unmatched2d=left2d, unmatched3d=left3d), batch)
+    rows, cols = (inner.sum(2) + left2d)[0].tolist(), (inner.sum(1) + left3d)[0].tolist()
+    pairs = [math.log(float(inner[0, 0, j]) / cols[j]) + math.log(float(inner[0, 0, j]) / rows[0]) for j in (0, 1)]
+    alone = [math.log(float(left2d[0, 1]) / rows[1]), math.log(float(left3d[0, 2]) / cols[2])]
+    assert loss.item() == pytest.approx(-sum(pairs) / 4 - sum(alone) / 2, rel=1e-12)
+    (slope,) = torch.autograd.grad(loss.sum(), left2d)
+    assert slope[0, 1] < 0  # more mass in the bin of a point that is alone is better
+    assert slope[0, 0] > 0  # and worse in that of a point with partners
+
+
 def test_matching_likelihood_loss_of_the_truth_is_zero_with_and_without_bins() -> None:
     planted = plant(2, 8)
     truth = planted.permutation()

@@ -10,7 +10,7 @@ from torch import nn
 
 from bpnp import Batch, Pose, Prediction, SolveStats
 from bpnp.datamodules import ColmapDataModule
-from bpnp.training.callbacks import ResultsWriter
+from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
 
 

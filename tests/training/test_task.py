@@ -12,8 +12,9 @@ from torch.utils.data import DataLoader
 from bpnp import Batch, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
-from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
 from bpnp.training.losses import correspondence_loss, pose_loss
+from bpnp.training.results_writer import ResultsWriter
+from bpnp.training.schedules import PoseLossWarmup
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 

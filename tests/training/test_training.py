@@ -15,7 +15,7 @@ from bpnp.report import read_results
 
 ARGUMENTS = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES, *SMALL_NET, "--model.learning_rate=1e-3",
              "--data.fresh_views=true", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1"]  # fmt: skip
-WARMUP = ["--trainer.callbacks=bpnp.training.callbacks.PoseLossWarmup", "--trainer.callbacks.start_epoch=2"]
+WARMUP = ["--trainer.callbacks=bpnp.training.PoseLossWarmup", "--trainer.callbacks.start_epoch=2"]
 
 
 def start(command: str, folder: Path, *arguments: str) -> subprocess.Popen[bytes]:

@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from bpnp.compilation import compiler
-from bpnp.search.kernels_dense import solve_normal_equations
+from bpnp.search.kernels.dense import solve_normal_equations
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 

@@ -88,7 +88,7 @@ def _turns(domain: Boxes) -> Boxes:
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
-    """The pose, or what the weighted PnP layer makes of its inliers if it has as many."""
+    """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
     count = count_inliers(rays, points, rotation, place, angle)
     directions = torch.nn.functional.normalize(points - place, dim=-1)
     inlier = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
@@ -105,7 +105,7 @@ def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angl
 
 
 class GOPAC(PairSolver):
-    """Branch and bound on the number of image points with a scene point near them; exact, and for small problems.
+    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
 
     The camera centre is searched in a cube around the scene's centre, the rotation everywhere. `residual` of the pose
     is the share of image points without a partner; `converged` is the certificate that no pose has more inliers.

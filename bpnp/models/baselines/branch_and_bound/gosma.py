@@ -82,7 +82,7 @@ def align_mixtures(
         best, rotation, place = _best_centre(scene, rays, allowed, best, (rotation, place))
         pending, bounds = join([others, children]), torch.cat([bounds[rest], children_bounds])
         promising = bounds < best - gap * norm
-        # What is left out cannot beat the best by more than the gap.
+        # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
         pending, bounds = pending.pick(promising), bounds[promising]
     certified = len(bounds) == 0 or float(bounds.min()) >= best - gap * norm
     bound = best - gap * norm if certified else float(bounds.min())
@@ -92,10 +92,10 @@ def align_mixtures(
 def _best_centre(
     scene: SceneMixture, rays: RayMixture, boxes: Boxes, best: float, pose: tuple[Tensor, Tensor] | None
 ) -> tuple[float, Tensor, Tensor]:
-    """The pose of lowest distance: the one given, or one that descends from the best of the boxes' centres.
+    """The pose of lowest distance: the one given, or the result of a descent from one of the boxes' centres.
 
-    The few best centres descend together, also where they are worse than the pose: a local optimum hides between them.
-    The lowest of their ends, if it beats the pose, is polished.
+    Adam descends from the best centres, also where they are worse than the pose given, since a better local optimum
+    may lie close to them. The lowest result is polished if it is lower than the pose given.
     """
     if len(boxes.turn) == 0 and pose is not None:
         return best, *pose
@@ -154,7 +154,7 @@ def _unit(scene: SceneMixture, place: Float[Tensor, "b 3"]) -> Float[Tensor, "b 
 
 
 class GOSMA(PairSolver):
-    """Branch and bound on the distance between the mixtures of both point sets; no matching, no start.
+    """Branch and bound on the distance between the mixtures of both point sets; no matching, no initial pose.
 
     The camera centre is searched in a cube around the scene's centre, the rotation everywhere. `residual` of the pose
     is its distance as a share of the image mixture's squared norm (0 for mixtures that coincide); `converged` is the

@@ -1,4 +1,4 @@
-"""Mixtures that stand for the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
+"""Mixture models of the two point sets: von Mises-Fisher on the sphere of rays, Gaussians in the scene."""
 
 from typing import NamedTuple
 

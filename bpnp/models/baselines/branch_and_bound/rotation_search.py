@@ -1,4 +1,4 @@
-"""The rotation that brings most rays near a direction, by branch and bound: the inner search of GOPAC."""
+"""The rotation under which most rays are close to a direction, by branch and bound: the inner search of GOPAC."""
 
 import math
 from typing import NamedTuple
@@ -15,8 +15,8 @@ ROUNDING = 1e-9  # of a cosine
 
 
 class BestRotation(NamedTuple):
-    """`rotation` has `reached` rays within reach; None if no rotation with more than the floor was met. No rotation of
-    the domain has more than `bound`."""
+    """`rotation` has `reached` rays within reach; None if none with more than the floor was found. No rotation of the
+    domain has more than `bound`."""
 
     rotation: Float[Tensor, "3 3"] | None
     reached: int

@@ -12,7 +12,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.monitors import OfflineWandbLogger, TrainingMonitor, first_pairs, watched_values
+from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor, first_pairs, watched_values
 from bpnp.types import Pose, SolveStats
 
 

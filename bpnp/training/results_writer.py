@@ -1,8 +1,7 @@
-"""What happens around training and testing: the switch to the pose loss, and the files that a run leaves."""
+"""The files that a test or a prediction leaves."""
 
 import csv
 import io
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,119 +12,16 @@ import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
 from bpnp.files import written_whole
-from bpnp.models.weights import read_checkpoint
 from bpnp.report import report
 from bpnp.report.folder import write_results
 from bpnp.report.results import PairRow, rows_from
 from bpnp.report.samples import PairView, select_views, thin, views_from, write_views
 from bpnp.types import Batch, Prediction
 
-
-class SafeCheckpointIO(TorchCheckpointIO):
-    """Checkpoints read as data only, with one clear error for a file that is none."""
-
-    def load_checkpoint(
-        self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
-    ) -> dict[str, Any]:
-        return read_checkpoint(path, map_location=map_location)
-
-
-class PoseLossWarmup(Callback):
-    """From the correspondence loss alone to L_c + weight * L_p (paper section 3.4).
-
-    Before `start_epoch` no pose is solved in training. Once switched, a resumed run stays switched.
-
-    Args:
-        start_epoch: first epoch with the pose loss; the paper has 120.
-        weight: gamma_p of Eq. 13.
-    """
-
-    def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:
-        if start_epoch < 0 or weight < 0:
-            raise ValueError(f"expected start_epoch >= 0 and weight >= 0, got {start_epoch} and {weight}")
-        self.start_epoch = start_epoch
-        self.weight = weight
-        self.switched_at: int | None = None
-
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self.switched_at is None and trainer.current_epoch >= self.start_epoch:
-            self.switched_at = trainer.current_epoch
-            rank_zero_info(f"epoch {trainer.current_epoch}: the pose loss joins with weight {self.weight}")
-        pl_module.pose_weight = 0.0 if self.switched_at is None else self.weight  # type: ignore[assignment]
-
-    def state_dict(self) -> dict[str, Any]:
-        return {"switched_at": self.switched_at}
-
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        self.switched_at = state_dict["switched_at"]
-
-
-class LearningRateSchedule(Callback):
-    """Linear warm-up, then the model's learning rate, then a half cosine down to `final` of it.
-
-    The rate depends on the step alone, so that a resumed run goes on where it was, or on another schedule.
-
-    Args:
-        warmup_steps: optimiser steps until the full rate.
-        decay_start: step at which the rate begins to fall; null for never.
-        decay_steps: steps of the fall.
-        final: factor on the rate from then on.
-    """
-
-    def __init__(
-        self, warmup_steps: int = 200, decay_start: int | None = None, decay_steps: int = 1000, final: float = 0.02
-    ) -> None:
-        if warmup_steps < 0 or (decay_start or 0) < 0 or decay_steps < 1 or not 0 <= final <= 1:
-            raise ValueError(
-                "expected warmup_steps, decay_start >= 0, decay_steps >= 1 and final in [0, 1], got "
-                f"{warmup_steps}, {decay_start}, {decay_steps} and {final}"
-            )
-        self.warmup_steps = warmup_steps
-        self.decay_start = decay_start
-        self.decay_steps = decay_steps
-        self.final = final
-
-    def factor(self, step: int) -> float:
-        """On the learning rate, at a step."""
-        rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
-        if self.decay_start is None:
-            return rise
-        done = min(1.0, max(0.0, (step - self.decay_start) / self.decay_steps))
-        return rise * (self.final + (1 - self.final) * (1 + math.cos(math.pi * done)) / 2)
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        rate = float(pl_module.learning_rate) * self.factor(trainer.global_step)  # type: ignore[arg-type]
-        for optimizer in trainer.optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = rate
-
-
-class CompileNets(Callback):
-    """torch.compile of the solver's nets for training: a minute or more to start with, then quicker steps.
-
-    The layers stay as they are, and so do checkpoints: parameters keep their names. On a CPU it pays from about a
-    thousand steps on.
-
-    Args:
-        names: attributes of the solver to compile.
-        backend: of torch.compile.
-    """
-
-    def __init__(self, names: Sequence[str] = ("features2d", "features3d"), backend: str = "inductor") -> None:
-        self.names = tuple(names)
-        self.backend = backend
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        solver = pl_module.get_submodule("solver")
-        missing = [name for name in self.names if not isinstance(getattr(solver, name, None), torch.nn.Module)]
-        if missing:
-            raise ValueError(f"expected nets of {type(solver).__name__}, got {missing}; try others in `names`")
-        for name in self.names:
-            getattr(solver, name).compile(backend=self.backend)
+POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
 
 
 class ResultsWriter(Callback):
@@ -193,9 +89,6 @@ class ResultsWriter(Callback):
 
     def _folder(self, trainer: Trainer, stage: str) -> Path:
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / stage
-
-
-POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
 
 
 def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], list[Any]]:

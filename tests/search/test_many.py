@@ -190,3 +190,22 @@ def test_points_at_the_end_of_the_world_do_not_matter(problem):
     rotation, _, stats = search(rays, points3d, settings=SearchSettings(max_batches=8))
     assert bool(stats.converged[0])
     assert rotation_error(rotation, problem.rotation[:1]).item() < 1
+
+
+@pytest.mark.parametrize("spread", [0.1, 0.01, 0.003, 0.0008])
+def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
+    """80 points of unit extent seen under `spread` radians from far away, noise of 0.002 of it, 10 outliers a side."""
+    rng = np.random.default_rng(1)
+    points, noise = rng.normal(size=(90, 3)), 0.002 * spread * rng.normal(size=(80, 3))
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, np.sqrt(2) / spread])
+    camera = points[:80] @ rotation.T + translation
+    outliers = np.column_stack([spread * rng.normal(size=(10, 2)), np.ones(10)])
+    rays = np.concatenate([camera / np.linalg.norm(camera, axis=-1, keepdims=True) + noise, outliers])
+    aside = Rotation.random(rng=rng).as_matrix()  # the view is not along the camera's axis
+    rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ aside.T
+    found = search_poses(rays, points)
+    turned, moved = found.best
+    assert found.verdict == "confident"
+    assert np.degrees(Rotation.from_matrix(turned.T @ aside @ rotation).magnitude()) < 0.2
+    assert np.linalg.norm(moved - aside @ translation) < 0.002 * translation[2]
+    assert found.residual == pytest.approx(0.002 * spread, rel=0.3)

@@ -1,0 +1,242 @@
+"""Annealing of many poses on clusters, a kernel for each pair of a bearing and a point; one start stays in the cache.
+
+docs/search.md states the mathematics. Arrays are float32 and coordinate-major, so that loops over points vectorise.
+Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`Scene`): the small numbers of a narrow
+view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
+
+Shapes, for m bearings and n points: f (3, m) offsets of the bearings; a (m,), b (n,) weights; p (3, n) points; rotation
+(3, 3), translation (3,); q (4, n) sums over the bearings of W_ij (f_i - u_j) and, in the last row, of W_ij, W the soft
+assignment and u_j = g(R p_j + t); hessian (6, 6), of which the lower half is used, gradient (6,), step (6,) in (w, s).
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bpnp.compilation import compiler
+
+F = np.float32
+# Sums in any order, but NaN and infinity keep their meaning: they mark a lost pose.
+compiled = compiler(
+    fastmath={"reassoc", "contract", "arcp", "nsz", "afn"}, error_model="numpy", boundscheck=False
+)  # fmt: skip
+LARGEST_TURN = 0.5  # radians in one step
+RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
+DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
+POWER = 256  # of the kernel: eight squarings
+
+
+@compiled
+def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
+    """(x, y, z) x (a, b, c)."""
+    return y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@compiled
+def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
+    """R (x, y, z)."""
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
+@compiled
+def direction(x: Any, y: Any, z: Any) -> Any:
+    """The unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
+    inverse = F(1) / math.sqrt(x * x + y * y + z * z + F(1e-12))
+    x, y, z = x * inverse, y * inverse, z * inverse
+    return x, y, -(x * x + y * y) / (F(1) + z) if z > F(0) else z - F(1), inverse
+
+
+@compiled
+def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, hessian: Any, gradient: Any) -> None:
+    """Fill Hessian and gradient of sum_j q_j . u_j in (w, s), y = R p + t moving by w x Rp + s, Gauss-Newton's.
+
+    For one point the gradient in y is (q - (q.u) u) / |y|, the Hessian |q| (I - u u^T) / |y|^2, q the sum W_ij f_i.
+    Both are written in W_ij (f_i - u_j) and in u_x, u_y, which are small numbers in a narrow view.
+    """
+    g0 = g1 = g2 = g3 = g4 = g5 = F(0)
+    a00 = a01 = a02 = a11 = a12 = a22 = F(0)
+    b00 = b01 = b02 = b10 = b11 = b12 = b20 = b21 = b22 = F(0)
+    c00 = c01 = c02 = c11 = c12 = c22 = F(0)
+    for j in range(p.shape[1]):
+        x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
+        ux, uy, dz, inverse = direction(x + translation[0], y + translation[1], z + translation[2])
+        uz = dz + F(1)
+        qx, qy, qz, total = q[0, j], q[1, j], q[2, j], q[3, j]
+        along = qx * ux + qy * uy + qz * uz
+        hx, hy, hz = (qx - along * ux) * inverse, (qy - along * uy) * inverse, (qz - along * uz) * inverse
+        t0, t1, t2 = cross(x, y, z, hx, hy, hz)
+        g0, g1, g2, g3, g4, g5 = g0 + t0, g1 + t1, g2 + t2, g3 + hx, g4 + hy, g5 + hz
+        squared = qx * qx + qy * qy + qz * qz + total * (F(2) * along + total)
+        w = math.sqrt(max(squared, F(0))) * inverse * inverse
+        m00, m01, m02 = w * (uy * uy + uz * uz), -w * ux * uy, -w * ux * uz
+        m11, m12, m22 = w * (ux * ux + uz * uz), -w * uy * uz, w * (ux * ux + uy * uy)
+        c00, c01, c02, c11, c12, c22 = c00 + m00, c01 + m01, c02 + m02, c11 + m11, c12 + m12, c22 + m22
+        e00, e10, e20 = cross(x, y, z, m00, m01, m02)
+        e01, e11, e21 = cross(x, y, z, m01, m11, m12)
+        e02, e12, e22 = cross(x, y, z, m02, m12, m22)
+        b00, b01, b02 = b00 + e00, b01 + e01, b02 + e02
+        b10, b11, b12 = b10 + e10, b11 + e11, b12 + e12
+        b20, b21, b22 = b20 + e20, b21 + e21, b22 + e22
+        k00, k01, k02 = cross(x, y, z, e00, e01, e02)
+        _, k11, k12 = cross(x, y, z, e10, e11, e12)
+        _, _, k22 = cross(x, y, z, e20, e21, e22)
+        a00, a01, a02, a11, a12, a22 = a00 + k00, a01 + k01, a02 + k02, a11 + k11, a12 + k12, a22 + k22
+    hessian[0, 0], hessian[1, 0], hessian[2, 0] = a00, a01, a02
+    hessian[1, 1], hessian[2, 1], hessian[2, 2] = a11, a12, a22
+    hessian[3, 0], hessian[4, 0], hessian[5, 0] = b00, b01, b02
+    hessian[3, 1], hessian[4, 1], hessian[5, 1] = b10, b11, b12
+    hessian[3, 2], hessian[4, 2], hessian[5, 2] = b20, b21, b22
+    hessian[3, 3], hessian[4, 3], hessian[5, 3] = c00, c01, c02
+    hessian[4, 4], hessian[5, 4], hessian[5, 5] = c11, c12, c22
+    gradient[0], gradient[1], gradient[2], gradient[3], gradient[4], gradient[5] = g0, g1, g2, g3, g4, g5
+
+
+@compiled
+def solve_normal_equations(hessian: Any, gradient: Any, step: Any) -> bool:
+    """Solve hessian step = gradient by Cholesky, in place; False if it is not positive definite, or not finite."""
+    for j in range(6):
+        pivot = hessian[j, j]
+        for k in range(j):
+            pivot -= hessian[j, k] * hessian[j, k]
+        if not (pivot > 0 and math.isfinite(pivot)):
+            return False
+        hessian[j, j] = math.sqrt(pivot)
+        for i in range(j + 1, 6):
+            value = hessian[i, j]
+            for k in range(j):
+                value -= hessian[i, k] * hessian[j, k]
+            hessian[i, j] = value / hessian[j, j]
+    for i in range(6):
+        value = gradient[i]
+        for k in range(i):
+            value -= hessian[i, k] * step[k]
+        step[i] = value / hessian[i, i]
+    for i in range(5, -1, -1):
+        value = step[i]
+        for k in range(i + 1, 6):
+            value -= hessian[k, i] * step[k]
+        step[i] = value / hessian[i, i]
+    return True
+
+
+@compiled
+def move(
+    q: Any, p: Any, rotation: Any, translation: Any, length: Any, hessian: Any, gradient: Any, step: Any
+) -> bool:  # fmt: skip
+    """`length` times one damped Gauss-Newton step of the pose, in place; False if the points do not fix the pose."""
+    normal_equations(q, p, rotation, translation, hessian, gradient)
+    for k in range(6):
+        hessian[k, k] *= F(1 + DAMPING)
+    if not solve_normal_equations(hessian, gradient, step):
+        return False
+    for k in range(6):
+        step[k] *= length
+    turn(rotation, step)
+    for k in range(3):
+        translation[k] += step[3 + k]
+    return True
+
+
+@compiled
+def turn(rotation: Any, vector: Any) -> None:
+    """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
+    x, y, z = vector[0], vector[1], vector[2]
+    angle: Any = math.sqrt(x * x + y * y + z * z)
+    shrink = min(F(1), F(LARGEST_TURN) / (angle + F(1e-20)))
+    angle *= shrink
+    half = F(0.5) * angle
+    factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)
+    w = math.cos(half)
+    x *= factor
+    y *= factor
+    z *= factor
+    d00, d01, d02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    d10, d11, d12 = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    d20, d21, d22 = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    for c in range(3):
+        r0, r1, r2 = rotation[0, c], rotation[1, c], rotation[2, c]
+        rotation[0, c] = d00 * r0 + d01 * r1 + d02 * r2
+        rotation[1, c] = d10 * r0 + d11 * r1 + d12 * r2
+        rotation[2, c] = d20 * r0 + d21 * r1 + d22 * r2
+
+
+@compiled
+def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, kernel: Any,
+           base: Any, row: Any, q: Any) -> Any:  # fmt: skip
+    """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
+
+    The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2: within 3 % of exp(z) where it exceeds 0.02, and without a
+    call. scale: s, radians. outlier: o of `Scene.outlier_density`. kernel (n, m), base (m,), row (m,): scratch.
+    """
+    m, n = f.shape[1], p.shape[1]
+    total_a, total_b = F(a.sum()), F(b.sum())
+    sharp = F(1) / (scale * scale * F(POWER))
+    for i in range(m):
+        row[i] = outlier * total_b
+        base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
+    for j in range(n):
+        x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
+        x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
+        q[0, j], q[1, j], q[2, j] = x, y, z
+        shift = F(-0.5) * sharp * (x * x + y * y + z * z)
+        x, y, z = sharp * x, sharp * y, sharp * z
+        column, weight, line = F(0), b[j], kernel[j]
+        for i in range(m):
+            v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(0))
+            v = v * v
+            v = v * v
+            v = v * v
+            v = v * v
+            v = v * v
+            v = v * v
+            v = v * v
+            v = v * v
+            line[i] = v
+            column += a[i] * v
+            row[i] += weight * v
+        q[3, j] = column
+    likelihood = F(0)
+    for i in range(m):
+        likelihood += a[i] * math.log(row[i] / (total_b * scale * scale))
+        row[i] = a[i] / row[i]
+    for j in range(n):
+        weight, line = b[j] / (q[3, j] + outlier * total_a), kernel[j]
+        q0, q1, q2, total = F(0), F(0), F(0), F(0)
+        for i in range(m):
+            v = line[i] * line[i] * row[i]
+            q0 += v * f[0, i]
+            q1 += v * f[1, i]
+            q2 += v * f[2, i]
+            total += v
+        q[0, j] = (q0 - total * q[0, j]) * weight
+        q[1, j] = (q1 - total * q[1, j]) * weight
+        q[2, j] = (q2 - total * q[2, j]) * weight
+        q[3, j] = total * weight
+    return likelihood / total_a
+
+
+@compiled
+def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
+            score: Any) -> None:  # fmt: skip
+    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
+
+    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
+    not fix. outlier: o / s^2 of `Scene.outlier_density`.
+    """
+    m, n = f.shape[1], p.shape[1]
+    for k in range(len(rotation)):
+        kernel, base, row, q = np.empty((n, m), F), np.empty(m, F), np.empty(m, F), np.empty((4, n), F)
+        hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)
+        for scale in scales:
+            score[k] = assign(
+                f, a, p, b, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base, row, q
+            )  # fmt: skip
+            fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), hessian, gradient, step)
+            if not (fixed and math.isfinite(score[k])):
+                score[k] = -np.inf
+                break

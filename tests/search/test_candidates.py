@@ -1,0 +1,56 @@
+"""Merging of poses: which are kept, and in how many batches each was found."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.candidates import Candidates, best_distinct, merged
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
+
+
+@pytest.fixture
+def scene() -> Scene:
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-0.4, 0.4, (30, 2)), np.ones(30)])
+    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    return Scene(rays, rng.normal(size=(30, 3)), 0, DEFAULT)
+
+
+def poses(degrees: list[float], score: list[float], hits: list[int]) -> Candidates:
+    """Poses turned about one axis, at one place."""
+    rotation = Rotation.from_rotvec(np.radians(degrees)[:, None] * [0, 0, 1]).as_matrix().astype(np.float32)
+    found = Candidates.unscored(rotation, np.tile(np.float32([0, 0, 5]), (len(degrees), 1)))
+    return replace(found, score=np.float32(score), hits=np.array(hits))
+
+
+def test_a_pose_that_a_fresh_and_a_shaken_start_reach_counts_as_found(scene: Scene) -> None:
+    """The shaken start has no hits, but the better score."""
+    found = best_distinct(poses([0, 1, 40], [2.0, 1.9, 1.0], [0, 1, 0]), scene, 8)
+    assert found.hits.tolist() == [1, 0]
+    assert found.score.tolist() == [2.0, 1.0]
+
+
+def test_two_starts_of_a_batch_are_one_hit_and_those_of_several_batches_add_up(scene: Scene) -> None:
+    batches = [poses([0, 1], [2.0, 1.9], [1, 1]), poses([0.5, 60], [2.1, 1.0], [1, 1]), poses([1], [1.0], [3])]
+    found = merged(batches, scene)
+    assert found.hits.tolist() == [5, 1]
+    assert found.score.tolist() == [np.float32(2.1), 1.0]
+
+
+def test_a_pose_without_a_score_is_left_out(scene: Scene) -> None:
+    assert best_distinct(poses([0, 90], [-np.inf, 1.0], [1, 1]), scene, 8).score.tolist() == [1.0]
+    assert len(best_distinct(Candidates.none(), scene, 8)) == 0
+
+
+def test_a_narrow_view_hardly_tells_poses_at_different_distances_apart() -> None:
+    rng = np.random.default_rng(0)
+    rays = np.column_stack([rng.uniform(-1e-3, 1e-3, (30, 2)), np.ones(30)])
+    narrow = Scene(rays / np.linalg.norm(rays, axis=-1, keepdims=True), rng.normal(size=(30, 3)), 0, DEFAULT)
+    same = poses([0, 0], [2.0, 1.0], [1, 1])
+    same.translation[:, 2] = [1000, 1001]
+    assert len(best_distinct(same, narrow, 8)) == 1
+    same.translation[:, 2], same.translation[1, 0] = 1000, 1
+    assert len(best_distinct(same, narrow, 8)) == 2

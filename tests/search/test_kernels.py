@@ -1,0 +1,133 @@
+"""The compiled loops against the formulas of docs/search.md in float64, finite differences, and each other."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.distance import cdist
+
+from bpnp.geometry import random_rotations, retract
+from bpnp.search.kernels.dense import POWER, assign, descend, normal_equations, turn
+from bpnp.search.kernels.grid import CAPACITY, REACH, assign_sparse, build_grid, descend_sparse
+
+FORWARD = np.array([0.0, 0.0, 1.0])
+
+
+class View:
+    """60 points of unit extent that fill `spread` radians, 50 of them and 10 outliers as bearings."""
+
+    def __init__(self, spread: float, seed: int = 0) -> None:
+        rng = np.random.default_rng(seed)
+        self.rotation = random_rotations(1, torch.Generator().manual_seed(seed))[0].double().numpy()
+        self.translation = np.array([0.1, -0.05, 1.4 / spread])
+        self.points = rng.normal(size=(60, 3)) * 0.8
+        seen = self.directions()[:50] + 0.02 * spread * rng.normal(size=(50, 3))
+        lost = FORWARD + spread * np.column_stack([rng.normal(size=(10, 2)), np.zeros(10)])
+        self.bearings = np.concatenate([seen, lost])
+        self.bearings /= np.linalg.norm(self.bearings, axis=-1, keepdims=True)
+        self.offsets = np.ascontiguousarray((self.bearings - FORWARD).T.astype(np.float32))
+        self.a, self.b = (rng.uniform(0.5, 2, 60).astype(np.float32) for _ in range(2))
+
+    def directions(self) -> np.ndarray:
+        camera = self.points @ self.rotation.T + self.translation
+        return camera / np.linalg.norm(camera, axis=-1, keepdims=True)
+
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.rotation.astype(np.float32), self.translation.astype(np.float32)
+
+    def points32(self) -> np.ndarray:
+        return np.ascontiguousarray(self.points.T.astype(np.float32))
+
+
+@pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
+@pytest.mark.parametrize("relative", [0.3, 0.05])
+def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative: float) -> None:
+    view, scale, outlier = View(spread), relative * spread, 0.07
+    q = np.empty((4, 60), np.float32)
+    kernel, scratch = np.empty((60, 60), np.float32), np.empty((2, 60), np.float32)
+    likelihood = assign(
+        view.offsets, view.a, view.points32(), view.b, *view.pose(), np.float32(scale), np.float32(outlier), kernel,
+        *scratch, q,
+    )  # fmt: skip
+    a, b, u = view.a.astype(float), view.b.astype(float), view.directions()
+    k = np.maximum(1 - cdist(view.bearings, u, "sqeuclidean") / (2 * scale**2 * POWER), 0) ** POWER
+    row = k @ b + outlier * b.sum()
+    weight = (a[:, None] * k / row[:, None]) * (k * b / (a @ k + outlier * a.sum()))
+    assert likelihood == pytest.approx((a * np.log(row / (b.sum() * scale**2))).sum() / a.sum(), abs=2e-3)
+    np.testing.assert_allclose(q[3], weight.sum(0), rtol=0.01, atol=1e-3)
+    residual = weight.T @ view.bearings - weight.sum(0)[:, None] * u
+    np.testing.assert_allclose(q[:3].T, residual, atol=2e-3 * scale * max(1.0, weight.sum(0).max()))
+
+
+@pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
+def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters(spread: float) -> None:
+    view, scale, outlier = View(spread), 0.05 * spread, 0.002
+    grid = tuple(build_grid(np.ascontiguousarray(view.offsets.T), 0.01 * spread))[:5]
+    index, kernel = np.empty((60, CAPACITY), np.int32), np.empty((60, CAPACITY), np.float32)
+    row, column, q = np.empty(60, np.float32), np.empty(60, np.float32), np.empty((4, 60), np.float32)
+    likelihood, matched = assign_sparse(
+        grid, view.points32(), *view.pose(), np.float32(scale), np.float32(outlier), index, kernel,
+        np.empty(60, np.int32), row, column, q,
+    )  # fmt: skip
+    squared = cdist(view.bearings, view.directions(), "sqeuclidean")
+    k = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
+    assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
+    assert 0.5 < matched < 50 / 60 + 0.05
+    one = np.ones(60, np.float32)
+    dense = assign(
+        view.offsets, one, view.points32(), one, *view.pose(), np.float32(scale), np.float32(outlier),
+        np.empty((60, 60), np.float32), row, column, q,
+    )  # fmt: skip
+    assert dense == pytest.approx(likelihood, abs=0.1)
+
+
+@pytest.mark.parametrize("spread", [0.5, 0.01])
+def test_the_gradient_is_that_of_finite_differences(spread: float) -> None:
+    view = View(spread)
+    rng = np.random.default_rng(1)
+    total, u = rng.uniform(0.5, 1, 60), view.directions()
+    residual = 0.1 * spread * rng.normal(size=(60, 3))
+    weighted = residual + total[:, None] * u  # sum_i W_ij f_i
+    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
+    points = np.ascontiguousarray(view.points.T)
+    normal_equations(np.vstack([residual.T, total]), points, view.rotation, view.translation, hessian, gradient)
+    depth = float(view.translation[2])
+    for k in range(6):
+        step = torch.zeros(6, dtype=torch.float64)
+        step[k] = 1e-5 * (depth if k == 5 else 1)
+        values = []
+        for sign in (1, -1):
+            r, t = retract(sign * step, torch.as_tensor(view.rotation), torch.as_tensor(view.translation))
+            camera = view.points @ r.numpy().T + t.numpy()
+            values.append((weighted * (camera / np.linalg.norm(camera, axis=-1, keepdims=True) - u)).sum())
+        slope = (values[0] - values[1]) / (2 * float(step[k]))
+        assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-6 * np.abs(gradient).max() * spread)
+    assert np.linalg.eigvalsh(hessian + np.tril(hessian, -1).T).min() > 0
+
+
+def test_a_turn_is_the_exponential_on_the_left() -> None:
+    rotation = random_rotations(1, torch.Generator().manual_seed(3))[0].double()
+    vector = torch.tensor([0.1, -0.3, 0.2], dtype=torch.float64)
+    expected, _ = retract(torch.cat([vector, torch.zeros(3)]), rotation, torch.zeros(3, dtype=torch.float64))
+    turned = rotation.numpy().copy()
+    turn(turned, vector.numpy())
+    np.testing.assert_allclose(turned, expected.numpy(), atol=1e-7)
+
+
+@pytest.mark.parametrize("part", ["rotation", "translation"])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: float) -> None:
+    view, scales = View(0.3), np.array([0.1, 0.05, 0.02], np.float32)
+    rotation, translation = (np.stack([values] * 3) for values in view.pose())
+    (rotation if part == "rotation" else translation)[1].flat[0] = value
+    poses = [(rotation.copy(), translation.copy()) for _ in range(2)]
+    score, result = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
+    one = np.ones(60, np.float32)
+    descend(view.offsets, one, view.points32(), one, *poses[0], scales, np.float32(0.5), score)
+    grid = tuple(build_grid(np.ascontiguousarray(view.offsets.T), 0.02))[:5]
+    descend_sparse(grid, view.points32(), *poses[1], scales, np.float32(0.5), 3, result)
+    for values in (score, result[:, 0]):
+        assert values[1] == -math.inf
+        assert np.isfinite(values[[0, 2]]).all()
+        assert values[0] == values[2]

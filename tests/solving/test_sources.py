@@ -1,0 +1,108 @@
+"""What `solve` does with a user's modules, with its time, and in several threads."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from planted import plant
+from small_data import small_net
+
+from bpnp import solve
+from bpnp.search.annealing import Deadline
+from bpnp.search.verdict import SearchResult, no_pose
+from bpnp.solving import sources
+from bpnp.solving.sources import evaluation_copy
+from bpnp.types import Pose, Prediction, SolveStats
+
+
+class Recorder(torch.nn.Module):
+    """Notes in which mode its parts run."""
+
+    modes: set[bool]
+
+    def __init__(self, *, fails: bool = False) -> None:
+        super().__init__()
+        self.part, self.frozen = torch.nn.Linear(1, 1), torch.nn.BatchNorm1d(1).eval()
+        self.fails = fails
+
+    def forward(self, batch) -> Prediction:
+        seen.update({self.training, self.part.training, self.frozen.training, torch.is_grad_enabled()})
+        if self.fails:
+            raise RuntimeError("on purpose")
+        rotation, translation = torch.eye(3).expand(len(batch), 3, 3), torch.tensor([[0.0, 0.0, 5.0]])
+        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
+        return Prediction(poses={"fixed": Pose(rotation, translation.expand(len(batch), 3), stats)})
+
+
+seen: set[bool] = set()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_module_keeps_the_mode_of_each_of_its_parts(fails: bool) -> None:
+    planted, module = plant(1, 30), Recorder(fails=fails)
+    before = {name: part.training for name, part in module.named_modules()}
+    assert set(before.values()) == {True, False}
+    seen.clear()
+    if fails:
+        with pytest.raises(RuntimeError, match="on purpose"):
+            solve(planted.points2d[0], planted.points3d[0], solver=module)
+    else:
+        solve(planted.points2d[0], planted.points3d[0], solver=module)
+    assert seen == {False}
+    assert {name: part.training for name, part in module.named_modules()} == before
+
+
+def test_a_module_stays_on_its_device() -> None:
+    module = Recorder()
+    copied = evaluation_copy(module, torch.device("meta"))
+    assert copied.part.weight.device.type == "meta"
+    assert module.part.weight.device.type == "cpu"
+    assert evaluation_copy(module.eval(), None) is module
+    assert evaluation_copy(module, torch.device("cpu")) is module
+
+
+def test_threads_that_share_a_module_see_it_in_evaluation_mode() -> None:
+    planted, module = plant(1, 30), Recorder()
+    seen.clear()
+    with ThreadPoolExecutor(4) as threads:
+        list(threads.map(lambda _: solve(planted.points2d[0], planted.points3d[0], solver=module), range(8)))
+    assert seen == {False}
+    assert module.training
+
+
+def test_several_threads_find_what_one_does() -> None:
+    pairs = [plant(1, 300, seed=seed, noise=0.001, outliers2d=60, outliers3d=60) for seed in range(4)]
+
+    def solved(i: int) -> str:
+        solution = solve(pairs[i].points2d[0], pairs[i].points3d[0])
+        return replace(solution, seconds=0.0).to_json()
+
+    alone = [solved(i) for i in range(4)]
+    together = threading.Barrier(4, timeout=60)
+
+    def at_once(i: int) -> str:
+        together.wait()
+        return solved(i)
+
+    with ThreadPoolExecutor(4) as threads:
+        assert list(threads.map(at_once, range(4))) == alone
+
+
+@pytest.mark.parametrize("limit", [None, 30.0])
+def test_the_time_limit_of_a_pair_counts_once(limit: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a net as prior the search around its pose and the one everywhere have one deadline."""
+    deadlines: list[Deadline] = []
+
+    def search(*_, deadline: Deadline, **__) -> SearchResult:
+        deadlines.append(deadline)
+        return no_pose("none")
+
+    monkeypatch.setattr(sources, "search_poses", search)
+    planted = plant(1, 30)
+    solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=limit)
+    assert len(deadlines) == 2
+    assert deadlines[0] is deadlines[1]
+    assert np.isinf(deadlines[0].at) == (limit is None)
