@@ -32,6 +32,7 @@ MAY_IMPORT = {
     "models": {"robust", "layers", "search"},
     "solving": {"robust", "layers", "search", "models"},
     "datamodules": set(),
+    "maps": {"solving", "search", "models", "robust", "layers", "datamodules"},
     "report": set(),
     "training": {"robust", "layers", "models", "report"},
     "localization": {"search", "solving", "datamodules", "report"},
@@ -39,7 +40,7 @@ MAY_IMPORT = {
     "commands": {"models", "training", "datamodules", "report"},
     "cli": {"commands", "training", "datamodules", "report", "localization", "table"},
     "__main__": {"cli"},
-    "": {"models", "search", "solving"},
+    "": {"maps", "models", "search", "solving"},
 }  # fmt: skip
 LIGHTNING = {"training", "datamodules", "cli", "commands", "table"}
 ONE_FILE_EACH = ("cv2", "poselib", "pycolmap", "trimesh")

@@ -56,6 +56,8 @@ class Solution:
     verdict: "confident"; "ambiguous", other poses explain the points about as well; "failed", this pose, if there is
         one, is a guess. reason: why, in words.
     seconds: for this pair; a share of the time where many were solved together.
+    view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
+        the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
     """
 
@@ -75,6 +77,17 @@ class Solution:
     seconds: float
     points2d: Array = field(repr=False)
     points3d: Array = field(repr=False)
+    view: str | None = None
+    point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
+
+    @property
+    def match_places(self) -> npt.NDArray[np.int64]:
+        """(k, 2) places of the matches in `points2d` and `points3d`."""
+        if self.point_ids is None:
+            return self.matches
+        order = np.argsort(self.point_ids)
+        place = order[np.searchsorted(self.point_ids, self.matches[:, 1], sorter=order)]
+        return np.column_stack([self.matches[:, 0], place])
 
     @property
     def centre(self) -> Array:
@@ -104,7 +117,10 @@ class Solution:
             content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
-            known = {f.name: content[f.name] for f in fields(cls)}
+            known = {f.name: content[f.name] for f in fields(cls) if f.name not in OF_A_MAP}
+            known |= {name: content.get(name) for name in OF_A_MAP}
+            if known["point_ids"] is not None:
+                known["point_ids"] = np.array(known["point_ids"], np.int64)
             candidates = tuple(
                 Candidate(_array(c["rotation"], 3, 3), _array(c["translation"], 3), c["score"], c["inlier_count"])
                 for c in known["candidates"]
@@ -124,6 +140,7 @@ class Solution:
             raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
 
 
+OF_A_MAP = ("view", "point_ids")  # not in the files of versions that had no maps
 POSE = ("rotation", "translation", "centre")
 SHAPES = {"rotation": (3, 3), "translation": (3,), "points2d": (-1, 2), "points3d": (-1, 3)}
 

@@ -8,52 +8,24 @@ COLMAP writes composed with the rig, so `rigs` and `frames` are not needed.
 Source: https://colmap.github.io/format.html
 """
 
-import operator
-import re
+import mmap
 import struct
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from array import array
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.datamodules.colmap.model_records import POINT, CameraRecord, ColmapError, ImageRecord, ModelRecords
+from bpnp.datamodules.colmap.text_files import text_camera, text_image, text_point, text_records
+
+__all__ = ["FILES", "CameraRecord", "ColmapError", "ImageRecord", "ModelRecords", "model_format", "read_records"]
+
 FILES = ("cameras", "images", "points3D")
+TRACK_ELEMENT = 8
 KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])  # no point: 2^64 - 1 in the file, so -1 here
-
-
-class ColmapError(ValueError):
-    """A COLMAP folder or file that cannot be used; the message names it."""
-
-
-@dataclass(frozen=True)
-class CameraRecord:
-    model: str
-    params: NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class ImageRecord:
-    """quaternion (w, x, y, z) and translation are cam_from_world; keypoints (k, 2) pixels; point_ids (k,), -1: none."""
-
-    name: str
-    image_id: int
-    camera_id: int
-    quaternion: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    keypoints: NDArray[np.float64]
-    point_ids: NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class ModelRecords:
-    """What the three files hold. points3d (n, 3) has the ids `point_ids` (n,)."""
-
-    cameras: dict[int, CameraRecord]
-    images: list[ImageRecord]
-    point_ids: NDArray[np.int64]
-    points3d: NDArray[np.float64]
 
 
 def model_format(folder: Path) -> str | None:
@@ -80,37 +52,39 @@ def read_records(folder: Path, *, camera_models: Mapping[int, tuple[str, int]]) 
     if suffix == "bin":
         cameras = dict(_binary_cameras(_Cursor(paths[0], contents[0]), camera_models))
         images = list(_binary_images(_Cursor(paths[1], contents[1])))
-        points = list(_binary_points(_Cursor(paths[2], contents[2])))
+        points = _binary_points(_Cursor(paths[2], contents[2]))
     else:
         names = dict(camera_models.values())
-        cameras = dict(_records(paths[0], contents[0], lambda line, _: _text_camera(line, names)))
-        images = list(_records(paths[1], contents[1], _text_image))
-        points = list(_records(paths[2], contents[2], _text_point))
-    for path, records in zip(paths, (cameras, images, points), strict=True):
-        if not records:
+        cameras = dict(text_records(paths[0], contents[0][:], lambda line, _: text_camera(line, names)))
+        images = list(text_records(paths[1], contents[1][:], text_image))
+        points = np.array(list(text_records(paths[2], contents[2][:], text_point)), POINT)
+    for path, entries in zip(paths, (cameras, images, points), strict=True):
+        if not len(entries):
             raise ColmapError(f"expected cameras, images and points in a COLMAP model, got none in {path}; try another")
     return ModelRecords(
         cameras=cameras,
         images=images,
-        point_ids=np.array([p[0] for p in points], dtype=np.int64),
-        points3d=np.array([p[1:] for p in points], dtype=np.float64).reshape(-1, 3),
+        point_ids=points["point_id"].copy(),
+        points3d=points["position"].copy(),
+        track_lengths=points["track_length"].astype(np.int64),
     )
 
 
-def _content(path: Path) -> bytes:
+def _content(path: Path) -> mmap.mmap:
+    """The bytes of a file, read as they are used: most of images.bin are keypoints without a point."""
     try:
-        content = path.read_bytes()
+        with path.open("rb") as file:
+            if path.stat().st_size:
+                return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     except OSError as error:
         raise ColmapError(f"expected a readable COLMAP file, got {error}; try its permissions") from error
-    if not content:
-        raise ColmapError(f"expected a COLMAP file, got {path} of 0 bytes; try copying the model again")
-    return content
+    raise ColmapError(f"expected a COLMAP file, got {path} of 0 bytes; try copying the model again")
 
 
 class _Cursor:
     """Walks a binary file; no read goes past its end."""
 
-    def __init__(self, path: Path, content: bytes) -> None:
+    def __init__(self, path: Path, content: mmap.mmap) -> None:
         self.path, self.content, self.offset = path, content, 0
 
     def skip(self, size: int) -> int:
@@ -148,7 +122,7 @@ class _Cursor:
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<Ii2Q")
 _IMAGE = struct.Struct("<I7dI")
-_POINT = struct.Struct("<q3d3BdQ")
+CHUNK = 2**16  # points that are copied at a time
 
 
 def _binary_cameras(cursor: _Cursor, models: Mapping[int, tuple[str, int]]) -> Iterator[tuple[int, CameraRecord]]:
@@ -176,70 +150,18 @@ def _binary_images(cursor: _Cursor) -> Iterator[ImageRecord]:
     cursor.finish()
 
 
-def _binary_points(cursor: _Cursor) -> Iterator[tuple[int, float, float, float]]:
+def _binary_points(cursor: _Cursor) -> NDArray[Any]:
+    starts = array("q")
     for _ in cursor.records():
-        point_id, x, y, z, _, _, _, _, track_length = cursor.take(_POINT)
-        cursor.skip(8 * track_length)
-        yield point_id, x, y, z
+        starts.append(cursor.skip(POINT.itemsize))
+        (track_length,) = _COUNT.unpack_from(cursor.content, cursor.offset - _COUNT.size)
+        cursor.skip(TRACK_ELEMENT * track_length)
     cursor.finish()
-
-
-def _records(path: Path, content: bytes, parse: Callable[[bytes, Iterator[bytes]], Any]) -> Iterator[Any]:
-    """Every record of a text file. `parse` gets its first line, and the lines after it to draw from.
-
-    Comments and blank lines between records are skipped. The count in COLMAP's header, where there is one, and the
-    line break at the end are what shows that a text file was cut.
-    """
-    if not content.endswith(b"\n"):
-        raise ColmapError(
-            f"expected {path} to end with a line break, got {content[-20:]!r}: it looks truncated; try copying the "
-            "model again, or add the line break if it is whole"
-        )
-    lines = content.splitlines()
-    rest = iter(lines)
-    found = 0
-    for line in rest:
-        if line.startswith(b"#") or not line.strip():
-            continue
-        try:
-            record = parse(line, rest)
-        except (ValueError, OverflowError, StopIteration) as error:
-            number = len(lines) - operator.length_hint(rest)
-            raise ColmapError(
-                f"expected a COLMAP record, got {line[:40]!r} at line {number} of {path} ({error or 'cut short'}); "
-                "try copying the model again"
-            ) from error
-        found += 1
-        yield record
-    header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
-    if header and int(header[1]) > found:
-        raise ColmapError(
-            f"expected {int(header[1])} records in {path} as its header says, got {found}: it is truncated; try "
-            "copying the model again, or correct the header if records were removed on purpose"
-        )
-
-
-def _text_camera(line: bytes, models: Mapping[str, int]) -> tuple[int, CameraRecord]:
-    camera_id, name, _, _, *params = line.split()
-    model = name.decode(errors="backslashreplace")
-    if len(params) != models.get(model):
-        raise ValueError(f"{len(params)} parameters, camera model {model} has {models.get(model, 'never been known')}")
-    return int(camera_id), CameraRecord(model, np.array(params, dtype=np.float64))
-
-
-def _text_image(line: bytes, rest: Iterator[bytes]) -> ImageRecord:
-    image_id, *numbers, camera_id, name = line.split(maxsplit=9)  # a name may have spaces
-    pose = np.array(numbers, dtype=np.float64)
-    fields = next(rest).split()
-    keypoints = np.array(fields, dtype=np.float64).reshape(-1, 3)[:, :2]
-    point_ids = np.array(fields[2::3], dtype=np.int64)
-    shown = name.rstrip().decode(errors="backslashreplace")
-    return ImageRecord(shown, int(image_id), int(camera_id), pose[:4], pose[4:], keypoints, point_ids)
-
-
-def _text_point(line: bytes, rest: Iterator[bytes]) -> tuple[int, float, float, float]:
-    del rest
-    point_id, x, y, z, _, _, _, _, *track = line.split()
-    if len(track) % 2:
-        raise ValueError(f"a track of {len(track)} numbers, should be pairs")
-    return int(np.int64(int(point_id))), float(x), float(y), float(z)
+    content = np.frombuffer(cursor.content, np.uint8)
+    points = np.empty(len(starts), POINT)
+    places = np.frombuffer(starts, np.int64) if len(starts) else np.empty(0, np.int64)
+    rows = points.view(np.uint8).reshape(len(points), POINT.itemsize)
+    for first in range(0, len(points), CHUNK):
+        part = slice(first, first + CHUNK)
+        rows[part] = content[places[part, None] + np.arange(POINT.itemsize)]
+    return points

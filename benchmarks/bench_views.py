@@ -1,0 +1,176 @@
+"""Photos against the points of k map views, by the protocol of GoMatch (ECCV 2022): AUC at 1, 5 and 10 px and more.
+
+python benchmarks/bench_views.py --data ../shared/data --methods solve view-prior --outliers 0.5 0.75 1 castle-P30
+Methods: solve; view-prior (the first view's pose as `PosePrior`); rough-prior (4 degrees and 4 % of the distance off,
+2 s); bpnpnet and learned (the packaged networks); oracle (RANSAC on the true pairs). Photos are left out of their map.
+"""
+
+import argparse
+import json
+import time
+import warnings
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+import poselib
+from scipy.spatial.transform import Rotation
+from view_pairs import LEAST_PAIRS, Array, ViewPair, disturbed, scene_pairs
+
+from bpnp import PosePrior, solve
+from bpnp.models import load_pretrained
+
+AUC_PX = (1.0, 5.0, 10.0)
+VIEW_DEGREES, VIEW_SHARE = 15.0, 0.15  # how far a photo is from a view that shares a third of its points
+ROUGH_DEGREES, ROUGH_SHARE, ROUGH_SECONDS = 4.0, 0.04, 2.0
+Answer = tuple[Array, Array, str]  # rotation, translation, verdict
+
+
+def by_search(pair: ViewPair, prior: PosePrior | None, seed: int, time_limit: float | None) -> Answer:
+    camera = np.diag([pair.focal, pair.focal, 1.0])
+    found = solve(pair.focal * pair.points2d, pair.points3d, camera, prior=prior, seed=seed, time_limit=time_limit)
+    return found.rotation, found.translation, found.verdict
+
+
+def plain(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    return by_search(pair, None, seed, time_limit)
+
+
+def view_prior(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    rotation, translation = pair.views[0]
+    return by_search(pair, prior_at(pair, rotation, translation, VIEW_DEGREES, VIEW_SHARE), seed, time_limit)
+
+
+def rough_prior(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    pose = disturbed(pair, ROUGH_DEGREES, ROUGH_SHARE, np.random.default_rng(seed))
+    return by_search(pair, prior_at(pair, *pose, ROUGH_DEGREES, ROUGH_SHARE), seed, time_limit or ROUGH_SECONDS)
+
+
+def prior_at(pair: ViewPair, rotation: Array, translation: Array, degrees: float, share: float) -> PosePrior:
+    """A prior whose translation is known to within `share` of the median distance of the points."""
+    distance = np.median(np.linalg.norm(pair.points3d @ rotation.T + translation, axis=-1))
+    return PosePrior(rotation, translation, degrees, share * float(distance))  # type: ignore[arg-type]
+
+
+def learned(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    camera = np.diag([pair.focal, pair.focal, 1.0])
+    found = solve(
+        pair.focal * pair.points2d, pair.points3d, camera, prior="learned", seed=seed, time_limit=time_limit
+    )  # fmt: skip
+    return found.rotation, found.translation, found.verdict
+
+
+def bpnpnet(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    del time_limit
+    found = solve(pair.points2d, pair.points3d, solver=load_pretrained("procedural-so3"), seed=seed)
+    return found.rotation, found.translation, found.verdict
+
+
+def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    del time_limit
+    seen = pair.match3d >= 0
+    camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [pair.focal, pair.focal, 0.0, 0.0]}
+    pose, _ = poselib.estimate_absolute_pose(
+        pair.focal * pair.points2d[pair.match3d[seen]], pair.points3d[seen], camera, {"seed": seed}, {}
+    )
+    return np.asarray(pose.R), np.asarray(pose.t), "confident"
+
+
+METHODS: dict[str, Callable[[ViewPair, int, float | None], Answer]] = {
+    "solve": plain, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned, "bpnpnet": bpnpnet,
+    "oracle": oracle,
+}  # fmt: skip
+
+
+def measured(pair: ViewPair, method: str, seed: int, time_limit: float | None) -> dict[str, object]:
+    """One photo's errors, verdict and seconds."""
+    start, cpu = time.perf_counter(), time.process_time()
+    rotation, translation, verdict = METHODS[method](pair, seed, time_limit)
+    seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
+    found = bool(np.isfinite(rotation).all())
+    centre, truth = -rotation.T @ translation, -pair.rotation.T @ pair.translation
+    return {
+        "photo": pair.name,
+        "points": [len(pair.points2d), len(pair.points3d), pair.true_pairs],
+        "rotation_deg": float(np.degrees(Rotation.from_matrix(rotation @ pair.rotation.T).magnitude())) if found else 180.0,
+        "centre": float(np.linalg.norm(centre - truth)) if found else np.inf,
+        "reprojection_px": pair.reprojection_error(rotation, translation) if found else np.inf,
+        "verdict": verdict,
+        "seconds": seconds,
+        "cpu_seconds": cpu,
+    }  # fmt: skip
+
+
+def area_under_recall(errors: Array, threshold: float) -> float:
+    """Mean over t in (0, threshold] of the share of errors below t, in percent; exact for the step function."""
+    return float(100 * np.clip(1 - errors / threshold, 0, None).mean())
+
+
+def summary(rows: Sequence[dict]) -> dict[str, object]:
+    pixels, degrees, centre = (
+        np.array([row[key] for row in rows]) for key in ("reprojection_px", "rotation_deg", "centre")
+    )
+    sure = np.array([row["verdict"] == "confident" for row in rows])
+    return {
+        "photos": len(rows),
+        "too_few_pairs": int(sum(row["points"][2] < LEAST_PAIRS for row in rows)),
+        "auc_px": {str(px): area_under_recall(pixels, px) for px in AUC_PX},
+        "under_1_deg": float((degrees < 1).mean()),
+        "rotation_q_deg": np.percentile(degrees, (25, 50, 75)).tolist(),
+        "centre_q": np.percentile(centre, (25, 50, 75)).tolist(),
+        "confident": float(sure.mean()),
+        "confident_over_2_deg": int((sure & (degrees > 2)).sum()),
+        "seconds_mean": float(np.mean([row["seconds"] for row in rows])),
+        "cpu_seconds_mean": float(np.mean([row["cpu_seconds"] for row in rows])),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="SCENE")
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=["solve"])
+    parser.add_argument("--views", type=int, default=1, help="k (default: 1)")
+    parser.add_argument(
+        "--outliers", type=float, nargs="+", default=[0.5, 0.75, 1.0], help="largest share of each side"
+    )
+    parser.add_argument("--all-points", action="store_true", help="do not thin to 1,024")
+    parser.add_argument("--limit", type=int, default=12, help="photos of a scene (default: 12)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--time-limit", type=float)
+    parser.add_argument("--output", type=Path, help="JSON to write the rows to")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    results = []
+    for outliers in options.outliers:
+        thinned = {} if not options.all_points else {"most": None}
+        pairs = [
+            pair
+            for name in options.scenes
+            for pair in scene_pairs(options.data, name, limit=options.limit, views=options.views, outliers=outliers, **thinned)
+        ]  # fmt: skip
+        for method in options.methods:
+            rows = [measured(pair, method, options.seed, options.time_limit) for pair in pairs]
+            row = {"method": method, "views": options.views, "outliers": outliers} | summary(rows)
+            print(line(row), flush=True)
+            for name in options.scenes if len(options.scenes) > 1 else ():
+                part = [one for one in rows if str(one["photo"]).startswith(f"{name}/")]
+                print(f"    {name:20s} {line(row | summary(part))}", flush=True)
+            results.append(row | {"rows": rows})
+            if options.output:
+                options.output.parent.mkdir(parents=True, exist_ok=True)
+                options.output.write_text(json.dumps(results, indent=1) + "\n")
+
+
+def line(row: dict) -> str:
+    auc = " / ".join(f"{value:.0f}" for value in row["auc_px"].values())
+    turn = " / ".join(f"{value:.3g}" for value in row["rotation_q_deg"])
+    return (
+        f"{row['method']:12s} k {row['views']:2d}  o {100 * row['outliers']:.0f} %  {row['photos']} photos  AUC {auc}  <1 deg "
+        f"{100 * row['under_1_deg']:.0f} %  rotation {turn} deg  confident {100 * row['confident']:.0f} %, wrong "
+        f"{row['confident_over_2_deg']}  {row['seconds_mean']:.1f} s, {row['cpu_seconds_mean']:.1f} CPU s"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,138 @@
+"""Photos of COLMAP models against points that other views of the model see, with natural outliers: GoMatch's protocol.
+
+Zhou, Agostinho, Osep, Leal-Taixe, "Is geometry enough for matching in visual localization?", ECCV 2022, section 5.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
+
+LEAST_OVERLAP = 0.35
+MOST_POINTS = 1024
+LEAST_PAIRS = 10  # fewer true pairs count as a failure
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ViewPair:
+    """A photo's keypoints (m, 2), normalised, and the points (n, 3) of its views; match3d (n,), -1 for no partner.
+
+    rotation, translation: of the photo. views: poses of the k views, most overlap first. focal: pixels.
+    outliers: share of the points without a partner, of the 2D and of the 3D side.
+    """
+
+    name: str
+    points2d: Array
+    points3d: Array
+    match3d: NDArray[np.int64]
+    rotation: Array
+    translation: Array
+    views: tuple[tuple[Array, Array], ...]
+    focal: float
+
+    @property
+    def true_pairs(self) -> int:
+        return int((self.match3d >= 0).sum())
+
+    @property
+    def outliers(self) -> tuple[float, float]:
+        return 1 - self.true_pairs / len(self.points2d), 1 - self.true_pairs / len(self.points3d)
+
+    def reprojection_error(self, rotation: Array, translation: Array) -> float:
+        """Mean error of the true points, pixels; infinite for no pose, points behind it, or too few true pairs."""
+        seen = self.match3d >= 0
+        camera = self.points3d[seen] @ rotation.T + translation
+        if self.true_pairs < LEAST_PAIRS or not np.isfinite(camera).all() or not (camera[:, 2] > 0).all():
+            return np.inf
+        error = camera[:, :2] / camera[:, 2:] - self.points2d[self.match3d[seen]]
+        return float(self.focal * np.linalg.norm(error, axis=-1).mean())
+
+
+def photos(scene: Reconstruction, limit: int) -> list[ImagePoints]:
+    """At most `limit` photos, spread evenly over those that have a view of enough overlap."""
+    usable = [image for image in scene.images if len(overlapping(scene, image))]
+    return [usable[k] for k in sorted({int(k * len(usable) / limit) for k in range(limit)})]
+
+
+def overlapping(scene: Reconstruction, query: ImagePoints) -> list[tuple[float, ImagePoints]]:
+    """The views that see at least `LEAST_OVERLAP` of the photo's points, and this share, largest first."""
+    seen = np.zeros(len(scene.points3d), bool)
+    seen[query.seen] = True
+    shares = [
+        (float(seen[view.seen].sum() / max(len(query.seen), 1)), view) for view in scene.images if view is not query
+    ]
+    return sorted((pair for pair in shares if pair[0] >= LEAST_OVERLAP), key=lambda pair: -pair[0])
+
+
+def view_pair(
+    scene: Reconstruction,
+    query: ImagePoints,
+    *,
+    views: int,
+    outliers: float,
+    seed: int = 0,
+    most: int | None = MOST_POINTS,
+) -> ViewPair:
+    """One photo against the points that `views` views see.
+
+    outliers: of each side at most this share of all points is without a partner; 1 for all that there are.
+    most: points of the larger side; true pairs and outliers are thinned alike, so that their ratio stays. None for all.
+    For one view it is drawn among those that overlap enough, for more they are the ones that overlap most.
+    """
+    rng = np.random.default_rng([seed, query.image_id])
+    candidates = [view for _, view in overlapping(scene, query)]
+    chosen = [candidates[rng.integers(len(candidates))]] if views == 1 else candidates[:views]
+    # Points that the photo alone holds together with one view would not be in the map without it.
+    tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
+    tracks[query.observed] -= 1
+    in_map = np.unique(np.concatenate([view.seen for view in chosen]))
+    in_map = in_map[tracks[in_map] >= 2]
+    true, place, _ = np.intersect1d(query.seen, in_map, assume_unique=True, return_indices=True)
+    others2d = np.concatenate([np.delete(query.points2d, place, 0), query.clutter2d])
+    others3d = np.setdiff1d(in_map, query.observed)
+    allowed = np.inf if outliers >= 1 else len(true) * outliers / (1 - outliers)
+    counts = [len(true), min(len(others2d), allowed), min(len(others3d), allowed)]
+    larger = counts[0] + max(counts[1:])
+    share = 1.0 if most is None else min(1.0, most / max(larger, 1))
+    kept, extra2d, extra3d = (int(count * share) for count in counts)
+    pick = rng.choice(len(true), kept, replace=False)
+    points2d = np.concatenate(
+        [query.points2d[place[pick]], others2d[rng.choice(len(others2d), extra2d, replace=False)]]
+    ).astype(np.float64)
+    index3d = np.concatenate([true[pick], rng.choice(others3d, extra3d, replace=False)]).astype(np.int64)
+    order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
+    match3d = np.full(len(index3d), -1)
+    match3d[:kept] = np.argsort(order2d)[:kept]
+    return ViewPair(
+        name=f"{scene.name}/{query.name}",
+        points2d=points2d[order2d],
+        points3d=scene.points3d[index3d[order3d]],
+        match3d=match3d[order3d],
+        rotation=query.rotation,
+        translation=query.translation,
+        views=tuple((view.rotation, view.translation) for view in chosen),
+        focal=query.focal,
+    )
+
+
+def scene_pairs(
+    data: Path, name: str, *, limit: int, views: int, outliers: float, seed: int = 0, most: int | None = MOST_POINTS
+) -> Iterator[ViewPair]:
+    scene = read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
+    for query in photos(scene, limit):
+        yield view_pair(scene, query, views=views, outliers=outliers, seed=seed, most=most)
+
+
+def disturbed(pair: ViewPair, degrees: float, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """The true pose, turned by `degrees` about a random axis and its camera moved by `share` of the distance."""
+    axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    rotation = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ pair.rotation
+    centre = -pair.rotation.T @ pair.translation
+    distance = np.median(np.linalg.norm(pair.points3d - centre, axis=-1))
+    return rotation, -rotation @ (centre + share * distance * shift)
