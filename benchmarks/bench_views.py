@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import poselib
 from scipy.spatial.transform import Rotation
-from view_pairs import LEAST_PAIRS, Array, ViewPair, disturbed, scene_pairs
+from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, scene_pairs
 
 from bpnp import PosePrior, solve
 from bpnp.models import load_pretrained
@@ -49,7 +49,7 @@ def rough_prior(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 def prior_at(pair: ViewPair, rotation: Array, translation: Array, degrees: float, share: float) -> PosePrior:
     """A prior whose translation is known to within `share` of the median distance of the points."""
     distance = np.median(np.linalg.norm(pair.points3d @ rotation.T + translation, axis=-1))
-    return PosePrior(rotation, translation, degrees, share * float(distance))  # type: ignore[arg-type]
+    return PosePrior(rotation, translation, degrees, share * float(distance))
 
 
 def learned(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
@@ -92,13 +92,18 @@ def measured(pair: ViewPair, method: str, seed: int, time_limit: float | None) -
     return {
         "photo": pair.name,
         "points": [len(pair.points2d), len(pair.points3d), pair.true_pairs],
-        "rotation_deg": float(np.degrees(Rotation.from_matrix(rotation @ pair.rotation.T).magnitude())) if found else 180.0,
+        "rotation_deg": turned_by(rotation @ pair.rotation.T) if found else 180.0,
         "centre": float(np.linalg.norm(centre - truth)) if found else np.inf,
         "reprojection_px": pair.reprojection_error(rotation, translation) if found else np.inf,
         "verdict": verdict,
         "seconds": seconds,
         "cpu_seconds": cpu,
     }  # fmt: skip
+
+
+def turned_by(rotation: Array) -> float:
+    """Angle of a rotation, degrees."""
+    return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
 
 
 def area_under_recall(errors: Array, threshold: float) -> float:
@@ -143,11 +148,11 @@ def main() -> None:
     warnings.simplefilter("ignore")
     results = []
     for outliers in options.outliers:
-        thinned = {} if not options.all_points else {"most": None}
+        chosen = {"limit": options.limit, "views": options.views, "most": None if options.all_points else MOST_POINTS}
         pairs = [
             pair
             for name in options.scenes
-            for pair in scene_pairs(options.data, name, limit=options.limit, views=options.views, outliers=outliers, **thinned)
+            for pair in scene_pairs(options.data, name, outliers=outliers, **chosen)
         ]  # fmt: skip
         for method in options.methods:
             rows = [measured(pair, method, options.seed, options.time_limit) for pair in pairs]
@@ -165,11 +170,10 @@ def main() -> None:
 def line(row: dict) -> str:
     auc = " / ".join(f"{value:.0f}" for value in row["auc_px"].values())
     turn = " / ".join(f"{value:.3g}" for value in row["rotation_q_deg"])
-    return (
-        f"{row['method']:12s} k {row['views']:2d}  o {100 * row['outliers']:.0f} %  {row['photos']} photos  AUC {auc}  <1 deg "
-        f"{100 * row['under_1_deg']:.0f} %  rotation {turn} deg  confident {100 * row['confident']:.0f} %, wrong "
-        f"{row['confident_over_2_deg']}  {row['seconds_mean']:.1f} s, {row['cpu_seconds_mean']:.1f} CPU s"
-    )
+    what = f"{row['method']:12s} k {row['views']:2d}  o {100 * row['outliers']:.0f} %  {row['photos']} photos"
+    spent = f"{row['seconds_mean']:.1f} s, {row['cpu_seconds_mean']:.1f} CPU s"
+    sure = f"confident {100 * row['confident']:.0f} %, wrong {row['confident_over_2_deg']}"
+    return f"{what}  AUC {auc}  <1 deg {100 * row['under_1_deg']:.0f} %  rotation {turn} deg  {sure}  {spent}"
 
 
 if __name__ == "__main__":

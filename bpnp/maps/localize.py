@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.maps.scene_map import SceneMap
-from bpnp.maps.views import Region, covering_regions, regions_of_views
+from bpnp.maps.regions import Region, covering_regions, regions_of_views
+from bpnp.maps.views import ViewedPoints
 from bpnp.search.starts import PosePrior
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
@@ -18,7 +18,7 @@ RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
 def localize(
-    scene: SceneMap,
+    scene: ViewedPoints,
     keypoints: Any,
     camera: Any,
     *,
@@ -26,7 +26,7 @@ def localize(
     scores: Any = None,
     prior: PosePrior | None = None,
     seed: int = 0,
-    time_limit: float | None = None,
+    time_limit: float | int | None = None,
 ) -> Solution:
     """The pose of a photo in a map, from its keypoints alone.
 
@@ -46,7 +46,9 @@ def localize(
     if time_limit is not None and not 0 < time_limit < math.inf:
         raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
     if scores is not None and np.shape(scores) != np.shape(keypoints)[:1]:
-        raise ValueError(f"expected `scores` of shape {np.shape(keypoints)[:1]}, one a keypoint, got {np.shape(scores)}")
+        raise ValueError(
+            f"expected `scores` of shape {np.shape(keypoints)[:1]}, one a keypoint, got {np.shape(scores)}"
+        )
     regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
     best: Solution | None = None
     for region in regions:
@@ -63,7 +65,13 @@ def localize(
 
 
 def _tried(
-    scene: SceneMap, region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, seed: int, left: float | None
+    scene: ViewedPoints,
+    region: Region,
+    keypoints: Any,
+    camera: Any,
+    prior: PosePrior | None,
+    seed: int,
+    left: float | None,
 ) -> Solution:
     """The best pose of the photo among the points of one region."""
     known = region.prior(scene) if prior is None else prior

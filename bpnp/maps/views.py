@@ -1,76 +1,96 @@
-"""Which part of a map to try first: the points of given views, or of views that together see most of the map."""
+"""The views of a map and the points that they see."""
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 
-from bpnp.maps.scene_map import SceneMap, View
-from bpnp.search.starts import PosePrior
+from bpnp.cameras import Camera
 
-VIEW_DEGREES = 12.0  # root mean square angle per axis between photos that share a third of their points
-VIEW_SHARE = 0.1  # the same of the shift of what they look at, in distances to it
+Array = NDArray[np.float64]
+Map = TypeVar("Map", bound="ViewedPoints")
+LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
 
 
 @dataclass(frozen=True, eq=False)
-class Region:
-    """Points of the map, by their places in `points3d`, that one view, or several, see; `view` has the most of them."""
+class View:
+    """A registered image of the map; camera = rotation p + translation (COLMAP's cam_from_world).
 
-    view: View
+    points: (k,) places in `SceneMap.points3d` of the points that it sees, ascending.
+    """
+
+    name: str
+    camera: Camera
+    rotation: Array
+    translation: Array
     points: NDArray[np.int32]
 
-    def prior(self, scene: SceneMap) -> PosePrior:
-        """The view's pose, as wide as photos of one place lie apart."""
-        camera = scene.points3d[self.points] @ self.view.rotation.T + self.view.translation
-        distance = float(np.median(np.linalg.norm(camera, axis=-1)))
-        return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * distance)  # type: ignore[arg-type]
+    @property
+    def centre(self) -> Array:
+        """Centre of the camera in the scene, -R^T t."""
+        return -self.rotation.T @ self.translation
 
 
-def regions_of_views(scene: SceneMap, names: Iterable[str]) -> list[Region]:
-    """One region for each view, in the order given. Raises ValueError for unknown names, or if there is none."""
-    views = scene.named(names)
-    if not views:
-        raise ValueError("expected names of views to try, got none; try views=None for all of the map")
-    return [Region(view, view.points) for view in views if len(view.points)]
+@dataclass(frozen=True, eq=False)
+class ViewedPoints:
+    """n points and the views that see them; `bpnp.SceneMap` is such a set, read from a COLMAP model.
 
-
-def covering_regions(scene: SceneMap) -> Iterator[Region]:
-    """The points of one view after the other, each time of the one that sees most points that none before saw.
-
-    Greedy maximum coverage; views that see nothing new follow, largest first.
+    points3d: (n, 3) scene units, in the order of their ids. point_ids: (n,) ids in the COLMAP model.
+    track_lengths: (n,) views that see each point. views: in the order of their names.
     """
-    visibility = scene.visibility
-    new = np.diff(visibility.indptr).astype(np.int64)
-    size, left, unseen = new.copy(), np.ones(len(new), bool), np.ones(len(scene.points3d), bool)
-    for _ in scene.views:
-        best = int(np.lexsort((size, new, left))[-1])
-        left[best] = False
-        view = scene.views[best]
-        if not len(view.points):
-            continue
-        fresh = view.points[unseen[view.points]]
-        unseen[fresh] = False
-        new = new - np.asarray(visibility[:, fresh].sum(1)).ravel()
-        yield Region(view, view.points)
 
+    points3d: Array
+    point_ids: NDArray[np.int64]
+    track_lengths: NDArray[np.int32]
+    views: tuple[View, ...]
 
-def read_pairs(path: str | Path) -> dict[str, list[str]]:
-    """The views to try for each photo, from a text file of pairs `photo view`, one a line, as hloc's retrieval writes.
+    @cached_property
+    def visibility(self) -> csr_array:
+        """(views, n) with 1 where a view sees a point."""
+        counts = [len(view.points) for view in self.views]
+        columns = np.concatenate([view.points for view in self.views])
+        entries = np.ones(len(columns), np.int32), columns, np.concatenate([[0], np.cumsum(counts)])
+        return csr_array(entries, shape=(len(self.views), len(self.points3d)))
 
-    Raises ValueError for a file that cannot be read or a line without two names.
-    """
-    try:
-        lines = Path(path).read_text(encoding="utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected a text file of pairs of names, got {error}") from error
-    pairs: dict[str, list[str]] = {}
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
-            continue
-        names = line.split()
-        if len(names) != 2:
-            raise ValueError(f"expected two names, a photo's and a view's, got {line!r} at line {number} of {path}")
-        pairs.setdefault(names[0], []).append(names[1])
-    return pairs
+    @cached_property
+    def covisibility(self) -> csr_array:
+        """(views, views): how many points two views both see."""
+        return csr_array(self.visibility @ self.visibility.T)
+
+    @cached_property
+    def view_numbers(self) -> dict[str, int]:
+        """Places in `views` by name."""
+        return {view.name: i for i, view in enumerate(self.views)}
+
+    def named(self, names: Iterable[str]) -> list[View]:
+        """The views of these names. Raises ValueError for one that the map does not have."""
+        wanted = list(names)
+        if unknown := [name for name in wanted if name not in self.view_numbers]:
+            some = ", ".join(view.name for view in self.views[:5])
+            raise ValueError(f"expected names of views of the map, got {', '.join(unknown[:5])}; try {some}, ...")
+        return [self.views[self.view_numbers[name]] for name in wanted]
+
+    def without(self: Map, names: Collection[str]) -> Map:
+        """The map as it would be without these views: also points that then fewer than two views see are left out.
+
+        Raises ValueError for a name that the map does not have, or if no view that sees a point is left.
+        """
+        left_out = {view.name for view in self.named(names)}
+        views = [view for view in self.views if view.name not in left_out]
+        return replace(self, views=tuple(views)).seen_by(LEAST_TRACK)
+
+    def seen_by(self: Map, least: int) -> Map:
+        """Only such points as `least` or more of the views see. Raises ValueError if none is left."""
+        tracks = np.zeros(len(self.points3d), np.int32)
+        for view in self.views:
+            tracks[view.points] += 1
+        kept = tracks >= least
+        if not kept.any():
+            raise ValueError(f"expected points that {least} or more views see, got none in {len(self.views)} views")
+        place = np.cumsum(kept, dtype=np.int32) - 1
+        views = tuple(replace(view, points=place[view.points[kept[view.points]]]) for view in self.views)
+        return type(self)(self.points3d[kept], self.point_ids[kept], tracks[kept], views)

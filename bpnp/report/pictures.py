@@ -38,7 +38,7 @@ def solution_picture(solution: Any, *, title: str | None = None, photo: Array | 
     from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    points2d, matches = np.asarray(solution.points2d), np.asarray(solution.match_places)
+    points2d, matches = np.asarray(solution.points2d), np.asarray(getattr(solution, "match_places", solution.matches))
     box = picture_box(points2d)
     height = WIDTH * (box.bottom - box.top) / (box.right - box.left)
     figure = Figure(figsize=(WIDTH, float(np.clip(height, 2.5, 9)) + CAPTIONS), layout="constrained")

@@ -32,7 +32,7 @@ class Solved(Protocol):
 
 def solution_view(solution: Solved, *, id: str | None = None) -> PairView:
     """The view of a solution. A pose that was not found, None or NaN, is none. Raises ValueError for missing points."""
-    parts = {name: getattr(solution, name, None) for name in (*NEEDED, "matches")}
+    parts = {name: getattr(solution, name, None) for name in (*NEEDED, "matches", "point_ids")}
     verdict, ratio = getattr(solution, "verdict", None), getattr(solution, "inlier_ratio", None)
     return _view(parts, id=id or _title("solution", verdict, ratio))
 
@@ -86,6 +86,10 @@ def _view(parts: dict[str, Any], *, id: str) -> PairView:
     matches = parts.get("matches")
     if matches is not None:
         matches = _array(parts, "matches", (-1, 2)).astype(np.int64) if len(matches) else None
+    if matches is not None and parts.get("point_ids") is not None:  # of a map: places of the points from their ids
+        ids = np.asarray(parts["point_ids"])
+        order = np.argsort(ids)
+        matches[:, 1] = order[np.searchsorted(ids, matches[:, 1], sorter=order)]
     finite = np.isfinite(points2d[:, 0]) & np.isfinite(points2d[:, 1])
     if not finite.all():
         if not finite.any():

@@ -36,7 +36,7 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class ModelRecords:
-    """What the three files hold. points3d (n, 3) has the ids `point_ids` (n,) and `track_lengths` (n,): observations."""
+    """What the three files hold. points3d (n, 3) has the ids `point_ids` and `track_lengths` observations."""
 
     cameras: dict[int, CameraRecord]
     images: list[ImageRecord]

@@ -1,0 +1,71 @@
+"""A photo's pose in a map comes from its keypoints alone; matches are ids of the map's points."""
+
+import numpy as np
+import pytest
+from planted_model import Planted, plant_model
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap, Solution
+
+CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneMap, Planted]:
+    folder = tmp_path_factory.mktemp("map")
+    truth = plant_model(folder, camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    return SceneMap.from_colmap(folder), truth
+
+
+def photo_of(truth: Planted, number: int) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels of a new photo near view `number`, clutter last, and the ids of what it sees (0: clutter)."""
+    turn = Rotation.from_euler("xyz", [4, -6, 3], degrees=True).as_matrix()
+    camera = truth.points3d[truth.seen[number]] @ (turn @ truth.rotations[number]).T + truth.translations[number]
+    pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
+    ids = np.concatenate([truth.seen[number] + 1, np.zeros(len(truth.clutter_px[number]), int)])
+    return np.concatenate([pixels, truth.clutter_px[number]]), ids
+
+
+def assert_right(solution: Solution, truth: Planted, number: int, ids: np.ndarray) -> None:
+    turn = Rotation.from_euler("xyz", [4, -6, 3], degrees=True).as_matrix()
+    np.testing.assert_allclose(solution.rotation, turn @ truth.rotations[number], atol=2e-3)
+    np.testing.assert_allclose(solution.translation, truth.translations[number], atol=2e-2)
+    right = ids[solution.matches[:, 0]] == solution.matches[:, 1]
+    assert right.sum() > 70
+    assert right.mean() > 0.9
+
+
+def test_a_photo_near_a_given_view(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    keypoints, ids = photo_of(truth, 1)
+    solution = scene.localize(keypoints, CAMERA, views=["photo 1.jpg"])
+    assert_right(solution, truth, 1, ids)
+    assert solution.view == "photo 1.jpg"
+    assert solution.verdict == "confident"
+
+
+def test_a_photo_somewhere_in_the_map(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    keypoints, ids = photo_of(truth, 2)
+    assert_right(scene.localize(keypoints, CAMERA), truth, 2, ids)
+
+
+def test_matches_and_their_places_name_the_same_points(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    solution = scene.localize(photo_of(truth, 0)[0], CAMERA, views=["photo 0.jpg"])
+    assert solution.point_ids is not None
+    np.testing.assert_array_equal(solution.point_ids[solution.match_places[:, 1]], solution.matches[:, 1])
+    again = Solution.from_json(solution.to_json())
+    assert again.view == "photo 0.jpg"
+    np.testing.assert_array_equal(again.match_places, solution.match_places)
+
+
+def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    keypoints, _ = photo_of(truth, 0)
+    with pytest.raises(ValueError, match="expected names of views of the map, got nowhere"):
+        scene.localize(keypoints, CAMERA, views=["nowhere"])
+    with pytest.raises(ValueError, match=r"expected `scores` of shape \(105,\), one a keypoint, got \(3,\)"):
+        scene.localize(keypoints, CAMERA, scores=[1, 2, 3])
+    with pytest.raises(ValueError, match="expected a positive `time_limit`, got 0"):
+        scene.localize(keypoints, CAMERA, time_limit=0)

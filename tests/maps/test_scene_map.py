@@ -1,0 +1,124 @@
+"""Maps are read with the points, tracks and views that the model has, whichever its form."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from planted_model import OPENCV, Planted, plant_model
+
+from bpnp import SceneMap
+from bpnp.maps.regions import covering_regions, read_pairs, regions_of_views
+
+
+@pytest.fixture(scope="module")
+def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Planted]:
+    folder = tmp_path_factory.mktemp("map")
+    return folder, plant_model(folder, images=4, points=60, seen=25, seed=3)
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_the_planted_map_comes_back(tmp_path: Path, text: bool) -> None:
+    truth = plant_model(tmp_path, images=4, points=60, seen=25, text=text)
+    scene = SceneMap.from_colmap(tmp_path)
+    seen = np.unique(np.concatenate(truth.seen))
+    np.testing.assert_array_equal(scene.point_ids, seen + 1)  # pycolmap counts from 1
+    np.testing.assert_allclose(scene.points3d, truth.points3d[seen])
+    np.testing.assert_array_equal(scene.track_lengths, np.bincount(np.concatenate(truth.seen), minlength=60)[seen])
+    assert [view.name for view in scene.views] == [f"photo {i}.jpg" for i in range(4)]
+    for view, rotation, translation, points in zip(
+        scene.views, truth.rotations, truth.translations, truth.seen, strict=True
+    ):
+        np.testing.assert_allclose(view.rotation, rotation, atol=1e-12)
+        np.testing.assert_allclose(view.rotation @ view.centre + translation, 0, atol=1e-9)
+        np.testing.assert_array_equal(scene.point_ids[view.points], points + 1)
+        pixels = view.camera.project(truth.points3d[points] @ rotation.T + translation)
+        assert np.isfinite(pixels).all()
+        assert view.camera.focal == pytest.approx(np.mean(OPENCV[1][:2]))
+
+
+def test_covisibility_counts_the_common_points(planted: tuple[Path, Planted]) -> None:
+    scene, truth = SceneMap.from_colmap(planted[0]), planted[1]
+    expected = [[len(np.intersect1d(a, b)) for b in truth.seen] for a in truth.seen]
+    np.testing.assert_array_equal(scene.covisibility.toarray(), expected)
+
+
+def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -> None:
+    scene, truth = SceneMap.from_colmap(planted[0]), planted[1]
+    rest = scene.without(["photo 1.jpg"])
+    others = np.bincount(np.concatenate([seen for i, seen in enumerate(truth.seen) if i != 1]), minlength=60)
+    kept = np.flatnonzero(others >= 2)
+    np.testing.assert_array_equal(rest.point_ids, kept + 1)
+    np.testing.assert_array_equal(rest.track_lengths, others[kept])
+    np.testing.assert_array_equal(rest.point_ids[rest.views[1].points] - 1, np.intersect1d(truth.seen[2], kept))
+    assert [view.name for view in rest.views] == ["photo 0.jpg", "photo 2.jpg", "photo 3.jpg"]
+    assert len(scene.views) == 4
+
+
+def test_regions_cover_the_map_and_the_largest_gain_comes_first(planted: tuple[Path, Planted]) -> None:
+    scene, _ = SceneMap.from_colmap(planted[0]), planted[1]
+    regions = list(covering_regions(scene))
+    assert sorted(region.view.name for region in regions) == [view.name for view in scene.views]
+    covered: set[int] = set()
+    left = list(scene.views)
+    for region in regions:
+        gain = len(set(region.points.tolist()) - covered)
+        assert gain == max(len(set(view.points.tolist()) - covered) for view in left)
+        covered |= set(region.points.tolist())
+        left.remove(region.view)
+    assert len(covered) == len(scene.points3d)
+
+
+def test_views_are_found_by_their_names(planted: tuple[Path, Planted]) -> None:
+    scene = SceneMap.from_colmap(planted[0])
+    assert [region.view.name for region in regions_of_views(scene, ["photo 2.jpg", "photo 0.jpg"])] == [
+        "photo 2.jpg", "photo 0.jpg",
+    ]  # fmt: skip
+    with pytest.raises(ValueError, match=r"expected names of views of the map, got a\.jpg; try photo 0\.jpg"):
+        regions_of_views(scene, ["photo 0.jpg", "a.jpg"])
+    with pytest.raises(ValueError, match="got none; try views=None"):
+        regions_of_views(scene, [])
+
+
+def test_pairs_of_a_retrieval(tmp_path: Path) -> None:
+    path = tmp_path / "pairs.txt"
+    path.write_text("q1.jpg db/a.jpg\nq2.jpg db/b.jpg\n\nq1.jpg db/c.jpg\n")
+    assert read_pairs(path) == {"q1.jpg": ["db/a.jpg", "db/c.jpg"], "q2.jpg": ["db/b.jpg"]}
+    path.write_text("q1.jpg db/a.jpg 0.3\n")
+    with pytest.raises(ValueError, match=r"expected two names.* got 'q1.jpg db/a.jpg 0.3' at line 1"):
+        read_pairs(path)
+    with pytest.raises(ValueError, match="expected a text file of pairs"):
+        read_pairs(tmp_path / "none.txt")
+
+
+def test_a_map_without_views_is_one_clear_error(tmp_path: Path) -> None:
+    plant_model(tmp_path)
+    images = tmp_path / "images.bin"
+    content = bytearray(images.read_bytes())
+    whole, offset = bytes(content), 8
+    for _ in range(struct.unpack_from("<Q", whole)[0]):  # no keypoint has a point
+        offset = whole.index(b"\0", offset + 64) + 1
+        (count,) = struct.unpack_from("<Q", whole, offset)
+        for i in range(count):
+            struct.pack_into("<q", content, offset + 8 + 24 * i + 16, -1)
+        offset += 8 + 24 * count
+    images.write_bytes(content)
+    with pytest.raises(ValueError, match="expected a map with views that see points"):
+        SceneMap.from_colmap(tmp_path)
+
+
+def test_a_real_map_is_that_of_pycolmap(shared_data: Path) -> None:
+    folder = shared_data / "colmap/fountain-P11/sparse/0"
+    scene, model = SceneMap.from_colmap(folder), pycolmap.Reconstruction(folder)
+    assert len(scene.points3d) == model.num_points3D()
+    assert {view.name for view in scene.views} == {image.name for image in model.images.values()}
+    by_id = dict(zip(scene.point_ids.tolist(), zip(scene.points3d, scene.track_lengths, strict=True), strict=True))
+    for number, point in model.points3D.items():
+        np.testing.assert_array_equal(by_id[number][0], point.xyz)
+        assert by_id[number][1] == len({element.image_id for element in point.track.elements})
+    for image in model.images.values():
+        (view,) = scene.named([image.name])
+        np.testing.assert_allclose(view.centre, image.projection_center(), atol=1e-9)
+        seen = {point.point3D_id for point in image.points2D if point.has_point3D()}
+        assert set(scene.point_ids[view.points].tolist()) == seen
