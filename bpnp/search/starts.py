@@ -13,9 +13,13 @@ Array = NDArray[np.float32]
 
 
 class PosePrior(NamedTuple):
-    """A rough pose, camera = R p + t, and how rough: one standard deviation in degrees and in scene units.
+    """A rough pose, camera = R p + t, and one standard deviation of its errors.
 
-    Without a translation only the rotation is known.
+    rotation: (3, 3). translation: (3,) in scene units, or None where only the rotation is known.
+    rotation_sigma_deg: degrees about each axis. translation_sigma: scene units along each axis.
+
+    >>> PosePrior(np.eye(3), np.array([0, 0, 6]), rotation_sigma_deg=5.0, translation_sigma=0.5).rotation_sigma_deg
+    5.0
     """
 
     rotation: ArrayLike
@@ -25,7 +29,11 @@ class PosePrior(NamedTuple):
 
 
 class GravityPrior(NamedTuple):
-    """The direction up, in the camera and in the scene, known to within `sigma_deg` (one standard deviation)."""
+    """The direction up, (3,) in camera and in scene coordinates, of any length; sigma_deg: its standard deviation.
+
+    >>> GravityPrior(up_camera=np.array([0, -1, 0]), up_scene=np.array([0, 0, 1])).sigma_deg
+    2.0
+    """
 
     up_camera: ArrayLike
     up_scene: ArrayLike
@@ -45,7 +53,7 @@ def super_fibonacci(count: int) -> NDArray[np.float64]:
 
 
 def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) -> NDArray[np.float64]:
-    """An evenly spread set, turned at random, or rotations drawn from the prior (the first one its mean)."""
+    """An even set over SO(3), turned at random, or rotations drawn from the prior (the first one its mean)."""
     if prior is None:
         return super_fibonacci(count) @ Rotation.from_quat(rng.standard_normal(4)).as_matrix()
     if isinstance(prior, PosePrior):

@@ -50,14 +50,25 @@ def solve(
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.
-    clutter: share of the points that is expected to have no partner, if known.
-    time_limit: seconds after which the search ends with what it has.
+    clutter: share of the points that has no partner, if known; other shares are then not tried.
+    time_limit: seconds a pair, for the module of `prior` and the search together. At the limit each stage of the search
+        ends with the poses that it has, and the best of them is returned; matching it to all points comes after.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
     progress: called with (pair, batch of starts, seconds).
 
     A pose that is not to be trusted has the verdict "failed"; so have points from which none follows (on one line, or
     fewer than four different ones). Raises ValueError for input that is not usable: wrong or swapped shapes, NaN, fewer
-    than 4 points, a singular camera, an unknown option.
+    than 4 points, a singular camera, an unknown option. A module that is given is left as it is.
+
+    >>> rng = np.random.default_rng(0)
+    >>> scene = rng.normal(size=(60, 3))
+    >>> camera = scene + [0, 0, 6]  # R = I, t = (0, 0, 6)
+    >>> image = rng.permutation(camera[:, :2] / camera[:, 2:])
+    >>> solution = solve(image, scene)
+    >>> solution.verdict, solution.inlier_count
+    ('confident', 60)
+    >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
+    True
     """
     return solve_many(
         [points2d], [points3d], camera, solver=solver, prior=prior, inlier_threshold=inlier_threshold, clutter=clutter,
@@ -84,6 +95,11 @@ def solve_many(
     points2d: a sequence of arrays (m_i, 2). points3d: one of (n_i, 3), or one array (n, 3) that all pairs share.
     camera, prior: one for all, or a list with one each. time_limit: seconds a pair. On a GPU a module
     solves pairs of similar size together. Raises ValueError as `solve`, before anything is solved; it names the pair.
+
+    >>> scene = np.random.default_rng(0).normal(size=(60, 3))
+    >>> images = [(scene + [x, 0, 6])[:, :2] / (scene + [x, 0, 6])[:, 2:] for x in (0, 1)]
+    >>> [round(float(solution.translation[0]), 3) + 0.0 for solution in solve_many(images, scene)]
+    [0.0, 1.0]
     """
     for name, value in (("inlier_threshold", inlier_threshold), ("time_limit", time_limit)):
         if value is not None and not 0 < value < math.inf:
