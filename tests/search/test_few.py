@@ -1,6 +1,7 @@
 import itertools
 import math
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,9 +10,12 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.robust.p3p import p3p
-from bpnp.search.constellation.p3p import p3p_depths
-from bpnp.search.constellation.triangles import pose_of_triangle, triangle_table
-from bpnp.search.few import SETTINGS, enumerate_poses, margin
+from bpnp.search.few.p3p import p3p_depths
+from bpnp.search.few.pairs import p2p_turned, p2p_upright
+from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
+from bpnp.search.few.triangles import pose_of_triangle, triangle_table
+from bpnp.search.point_sets import PointSets
+from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 RADIUS = 2e-3
@@ -34,6 +38,11 @@ def planted(
     order = rng.permutation(seen + background)
     match = np.concatenate([np.arange(seen), np.full(background, -1)])[order]
     return directions(np.concatenate([rays, lights]))[order], points, rotation, translation, match
+
+
+def solved(rays: Array, points: Array, *, is_safe: Any = None, deadline: float = math.inf, **known: Any) -> FewPoses:
+    sets = PointSets(rays, points, **known)
+    return enumerate_poses(sets, radius=RADIUS, is_safe=is_safe, deadline=deadline)
 
 
 def degrees(one: Array, other: Array) -> float:
@@ -94,7 +103,7 @@ def test_planted_poses_are_found(seen: int, hidden: int, background: int) -> Non
         rays, points, rotation, translation, match = planted(
             np.random.default_rng(seed), seen, hidden=hidden, background=background
         )
-        poses = enumerate_poses(rays, points, radius=RADIUS)
+        poses = solved(rays, points)
         errors = [degrees(r, rotation) for r in poses.rotation]
         assert min(errors) < 3
         found += errors[0] < 3
@@ -107,20 +116,20 @@ def test_planted_poses_are_found(seen: int, hidden: int, background: int) -> Non
 def test_the_order_of_the_points_does_not_matter() -> None:
     rng = np.random.default_rng(3)
     rays, points, _, _, _ = planted(rng, 8, hidden=4, background=3)
-    one = enumerate_poses(rays, points, radius=RADIUS)
+    one = solved(rays, points)
     rows, columns = rng.permutation(len(rays)), rng.permutation(len(points))
-    other = enumerate_poses(rays[rows], points[columns], radius=RADIUS)
-    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-6)
+    other = solved(rays[rows], points[columns])
+    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-5)
     match = np.where(other.match[0] >= 0, columns[other.match[0]], -1)
     np.testing.assert_array_equal(match, one.match[0][rows])
 
 
 def test_unit_and_origin_of_the_scene_do_not_matter() -> None:
     rays, points, _, _, _ = planted(np.random.default_rng(4), 8, hidden=3, background=3)
-    one = enumerate_poses(rays, points, radius=RADIUS)
+    one = solved(rays, points)
     offset = np.array([300.0, -20, 7])
-    other = enumerate_poses(rays, 1000 * points + offset, radius=RADIUS)
-    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-6)
+    other = solved(rays, 1000 * points + offset)
+    np.testing.assert_allclose(other.rotation[0], one.rotation[0], atol=1e-5)
     centre = 1000 * (-one.rotation[0].T @ one.translation[0]) + offset
     np.testing.assert_allclose(-other.rotation[0].T @ other.translation[0], centre, atol=0.01)
 
@@ -128,9 +137,9 @@ def test_unit_and_origin_of_the_scene_do_not_matter() -> None:
 def test_turning_the_camera_turns_the_pose() -> None:
     rays, points, _, _, _ = planted(np.random.default_rng(5), 8, background=2)
     turn = Rotation.from_rotvec([1.0, 2.0, -0.5]).as_matrix()
-    one, other = (enumerate_poses(f, points, radius=RADIUS) for f in (rays, rays @ turn.T))
-    np.testing.assert_allclose(other.rotation[0], turn @ one.rotation[0], atol=1e-6)
-    np.testing.assert_allclose(other.translation[0], turn @ one.translation[0], atol=1e-5)
+    one, other = (solved(f, points) for f in (rays, rays @ turn.T))
+    np.testing.assert_allclose(other.rotation[0], turn @ one.rotation[0], atol=1e-5)
+    np.testing.assert_allclose(other.translation[0], turn @ one.translation[0], atol=1e-4)
 
 
 def brute_force(rays: Array, points: Array, radius: float) -> int:
@@ -149,7 +158,7 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     """On exact points with one stray, the enumeration matches as many as trying everything does."""
     rng = np.random.default_rng(seed)
     rays, points, rotation, _, _ = planted(rng, 5, background=1, noise=0.0)
-    poses = enumerate_poses(rays, points, radius=RADIUS, is_safe=lambda _: False)
+    poses = solved(rays, points, is_safe=lambda _: False)
     assert poses.exhausted
     assert poses.matches_within(1e-6).max() == brute_force(rays, points, 1e-6) == 5
     assert degrees(poses.rotation[poses.matches_within(1e-6).argmax()], rotation) < 1e-3
@@ -161,13 +170,13 @@ def test_labels_allow_only_their_own() -> None:
     labels3d = rng.integers(0, 4, len(points))
     labels2d = np.where(match >= 0, labels3d[match], rng.integers(0, 4, len(rays)))
     labels2d[0] = -1
-    poses = enumerate_poses(rays, points, radius=RADIUS, labels2d=labels2d, labels3d=labels3d)
+    poses = solved(rays, points, labels2d=labels2d, labels3d=labels3d)
     assert degrees(poses.rotation[0], rotation) < 3
     for chosen in poses.match:
         pairs = (chosen >= 0) & (labels2d >= 0)
         np.testing.assert_array_equal(labels2d[pairs], labels3d[chosen[pairs]])
-    assert poses.solved < enumerate_poses(rays, points, radius=RADIUS).solved
-    swapped = enumerate_poses(rays, points, radius=RADIUS, labels2d=np.full(len(rays), 9), labels3d=labels3d)
+    assert poses.solved < solved(rays, points).solved
+    swapped = solved(rays, points, labels2d=np.full(len(rays), 9), labels3d=labels3d)
     assert not len(swapped.evidence)
 
 
@@ -179,12 +188,12 @@ def test_points_that_face_away_are_not_matched() -> None:
         camera = points @ rotation.T + translation
         facing = (camera * (points @ rotation.T)).sum(-1) < -0.2 * np.linalg.norm(camera, axis=-1)
         rays = directions(camera[facing]) + NOISE * rng.standard_normal((facing.sum(), 3))
-        poses = enumerate_poses(directions(rays), points, radius=RADIUS, normals3d=points)
+        poses = solved(directions(rays), points, normals3d=points)
         assert degrees(poses.rotation[0], rotation) < 3
         for r, t, match in zip(poses.rotation, poses.translation, poses.match, strict=True):
             seen = points[match[match >= 0]]
             assert (((seen @ r.T + t) * (seen @ r.T)).sum(-1) < 0).all()
-        inside_out = enumerate_poses(directions(rays), points, radius=RADIUS, normals3d=-points)
+        inside_out = solved(directions(rays), points, normals3d=-points)
         assert all(degrees(r, rotation) > 3 for r in inside_out.rotation)
 
 
@@ -194,7 +203,7 @@ def test_every_twin_of_a_symmetric_constellation_is_a_candidate() -> None:
     points = np.concatenate([np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1), [[0, 0, 0.6]]])
     rotation, translation = Rotation.from_rotvec([0.4, -0.5, 0.2]).as_matrix(), np.array([0.2, 0.1, 5.0])
     rays = directions(points @ rotation.T + translation)
-    poses = enumerate_poses(rays, points, radius=RADIUS)
+    poses = solved(rays, points)
     quarter = Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix()
     for turns in range(4):
         twin = rotation @ np.linalg.matrix_power(quarter, turns)
@@ -202,17 +211,93 @@ def test_every_twin_of_a_symmetric_constellation_is_a_candidate() -> None:
     assert margin(poses) < 1
 
 
+def unit(rng: np.random.Generator) -> Array:
+    return directions(rng.standard_normal(3))
+
+
+def test_two_pairs_and_the_vertical_give_the_pose() -> None:
+    rng = np.random.default_rng(11)
+    for _ in range(200):
+        angle, translation = rng.uniform(-math.pi, math.pi), rng.uniform(-2, 2, 3)
+        rotation = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+        points = rng.uniform(-1, 1, (2, 3)) + [0, 4, 0] @ rotation
+        camera = points @ rotation.T + translation
+        poses = np.empty((2, 12))
+        count = p2p_upright(*directions(camera), *points, poses)
+        planted_pose = np.concatenate([rotation.ravel(), translation])
+        assert min(np.abs(pose - planted_pose).max() for pose in poses[:count]) < 1e-6
+        for pose in poses[:count]:
+            seen = points @ pose[:9].reshape(3, 3).T + pose[9:]
+            np.testing.assert_allclose(directions(seen), directions(camera), atol=1e-7)
+
+
+def test_two_pairs_and_the_rotation_give_the_pose() -> None:
+    rng = np.random.default_rng(12)
+    for _ in range(200):
+        rotation, translation = Rotation.from_rotvec(3 * unit(rng)).as_matrix(), np.array([0.5, -0.3, 5.0])
+        points = rng.uniform(-1, 1, (2, 3))
+        rays, pose = directions(points @ rotation.T + translation), np.empty(12)
+        assert p2p_turned(*rays, *points, rotation.ravel(), 0.1, 1e-4, pose)
+        np.testing.assert_allclose(pose, np.concatenate([rotation.ravel(), translation]), atol=1e-6)
+        off = Rotation.from_rotvec(0.05 * unit(rng)).as_matrix() @ rotation
+        assert p2p_turned(*rays, *points, off.ravel(), 0.1, 1e-4, pose)
+        found = pose[:9].reshape(3, 3)
+        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(directions(points @ found.T + pose[9:]), rays, atol=1e-9)
+        way, normal = rotation @ (points[1] - points[0]), np.cross(*rays)
+        out_of_plane = Rotation.from_rotvec(0.5 * directions(np.cross(way, normal))).as_matrix()
+        assert not p2p_turned(*rays, *points, (out_of_plane @ rotation).ravel(), 0.1, 1e-4, pose)
+
+
+@pytest.mark.parametrize("kind", ["gravity", "rotation", "pose"])
+def test_what_is_known_of_the_pose_finds_it_among_few_points(kind: str) -> None:
+    rng = np.random.default_rng(13)
+    up = np.array([0.0, 0, 1])
+    for _ in range(10):
+        rays, points, rotation, translation, _ = planted(rng, 6, hidden=6, background=2)
+        tilt = Rotation.from_rotvec(0.01 * unit(rng)).as_matrix()
+        prior = {
+            "gravity": GravityPrior(tilt @ rotation @ up, up, 1.0),
+            "rotation": PosePrior(tilt @ rotation, None, 1.0),
+            "pose": PosePrior(tilt @ rotation, translation + 0.03 * unit(rng), 1.0, 0.03),
+        }[kind]
+        poses = solved(rays, points, prior=prior)
+        assert degrees(poses.rotation[0], rotation) < 2
+        assert poses.solved == 0 or kind != "pose"
+        assert poses.solved < 40_000
+        for r in poses.rotation:
+            tilted = math.degrees(math.acos(float((tilt @ rotation @ up) @ (r @ up))))
+            off = tilted if kind == "gravity" else degrees(r, tilt @ rotation)
+            assert off < 4.5
+
+
+def test_three_points_and_gravity_fix_a_pose() -> None:
+    rng = np.random.default_rng(14)
+    rays, points, rotation, _, _ = planted(rng, 3, noise=0.0)
+    up = np.array([0.0, 1, 0])
+    poses = solved(rays, points, prior=GravityPrior(rotation @ up, up, 0.5))
+    assert degrees(poses.rotation[0], rotation) < 0.1
+
+
+def test_a_wrong_prior_hides_no_pose_that_it_allows() -> None:
+    """The predicted pose is 30 degrees off, within two standard deviations: the enumeration finds the right one."""
+    rays, points, rotation, translation, _ = planted(np.random.default_rng(15), 9, background=2)
+    turn = Rotation.from_rotvec([0.0, math.radians(30), 0]).as_matrix()
+    poses = solved(rays, points, prior=PosePrior(turn @ rotation, translation, 15.0, 1.0))
+    assert degrees(poses.rotation[0], rotation) < 1
+
+
 def test_unrelated_points_have_no_margin() -> None:
     rng = np.random.default_rng(9)
     for m, n in ((6, 6), (10, 17), (20, 20)):
         for _ in range(5):
             rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (m, 2)), np.ones(m)]))
-            assert margin(enumerate_poses(rays, rng.standard_normal((n, 3)), radius=RADIUS)) < math.log(1000)
+            assert margin(solved(rays, rng.standard_normal((n, 3)))) < math.log(1000)
 
 
 def test_the_deadline_ends_the_enumeration() -> None:
     rng = np.random.default_rng(10)
     rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (40, 2)), np.ones(40)]))
-    poses = enumerate_poses(rays, rng.standard_normal((60, 3)), radius=RADIUS, deadline=time.monotonic())
+    poses = solved(rays, rng.standard_normal((60, 3)), deadline=time.monotonic())
     assert not poses.exhausted
     assert poses.solved < SETTINGS.most / 2

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.constellation.matching import build_grid
-from bpnp.search.constellation.neighbourhoods import list_triples, orientations, sphere
-from bpnp.search.constellation.triangles import triangle_table
+from bpnp.search.few.matching import build_grid
+from bpnp.search.few.neighbourhoods import list_triples, orientations, sphere
+from bpnp.search.few.triangles import triangle_table
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -39,6 +39,7 @@ class SceneArrays:
         self.witnesses = np.ascontiguousarray(self.order[:, :witnesses])
         self._tables: tuple[NDArray[Any], ...] | None = None
         self._within: dict[int, int] = {0: 0, 1: 0}
+        self._pairs: dict[int, NDArray[np.int64]] = {}
 
     def triples(self, near: int) -> tuple[tuple[NDArray[Any], ...], int]:
         """Tables of the triples (triples, sides, frames, middles, orientations), and how many of them, the first ones,
@@ -61,6 +62,12 @@ class SceneArrays:
         assert self._tables is not None
         return self._tables, self._within[near]
 
+    def pairs(self, near: int) -> NDArray[np.int64]:
+        """Pairs (t, 2) of a point and one of its `near` nearest, nearest first."""
+        if near not in self._pairs:
+            self._pairs[near] = pairs_within(self.order, self.rank, near)
+        return self._pairs[near]
+
 
 class ImageArrays:
     """Bearings in a frame whose z axis is their mean, stereographic, in a grid.
@@ -71,7 +78,7 @@ class ImageArrays:
     """
 
     def __init__(self, bearings: Array, radius: float | Array, labels2d: Labels | None, reach: float) -> None:
-        self.turn = _onto_z(bearings.mean(0))
+        self.turn = onto_z(bearings.mean(0))
         rays = bearings @ self.turn.T
         inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
         self.rays = np.ascontiguousarray(np.column_stack([rays, inverse]))
@@ -91,6 +98,21 @@ class ImageArrays:
             more = triples_between(self.order, self.rank, self._near + 1, near)
             self._triples, self._near = np.concatenate([self._triples, more]), near
         return self._triples
+
+    def pairs(self, near: int) -> NDArray[np.int64]:
+        """Pairs (s, 2) of an image point and one of its `near` nearest, nearest first."""
+        return pairs_within(self.order, self.rank, near)
+
+
+def pairs_within(order: NDArray[np.int64], rank: NDArray[np.int64], near: int) -> NDArray[np.int64]:
+    """Pairs (t, 2) of a point and one of its `near` nearest, each pair once, nearest in rank first."""
+    own, parts = np.arange(len(order)), []
+    for k in range(min(near, order.shape[1])):
+        other = order[:, k]
+        back = rank[other, own]
+        once = (back > k) | ((back == k) & (own < other))
+        parts.append(np.stack([own, other], -1)[once])
+    return np.ascontiguousarray(np.concatenate(parts))
 
 
 def scene_arrays(points3d: Array, normals3d: Array | None, labels3d: Labels | None, witnesses: int) -> SceneArrays:
@@ -150,7 +172,7 @@ def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, NDArray[np.i
     return corner, starts, items
 
 
-def _onto_z(direction: Array) -> Array:
+def onto_z(direction: Array) -> Array:
     """A rotation that takes a direction to the z axis; any if it is zero."""
     length = float(np.linalg.norm(direction))
     if length < 1e-9:

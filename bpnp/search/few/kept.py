@@ -2,20 +2,21 @@
 
 `found`: poses (c, 12), evidence (c,), counts (c, 3) of matches, points in sight and points expected, matches (c, m),
 squared distances (c, m), the place of the best (1,), and (2,) numbers of the sweep. `work`: depths (4, 3), axes (3, 3),
-the pose at hand (12,), its matches (m,) and squared distances (m,), and a 6 x 6 system.
+the pose at hand (12,), its matches (m,) and squared distances (m,), a 6 x 6 system, poses (2, 12) of two pairs, and
+the place (4,) that a prior allows.
 """
 
 import math
 from typing import Any
 
 from bpnp.compilation import compiler
-from bpnp.search.constellation.adjustment import refine
-from bpnp.search.constellation.matching import evidence, match
+from bpnp.search.few.adjustment import refine
+from bpnp.search.few.matching import evidence, match
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 SAME = 1 + 2 * math.cos(math.radians(3.0))  # trace of the turn between two poses that are the same
 SAME_SHIFT, SAME_DEPTH = 0.1, 0.05  # of the scene's extent and of its distance
-TIGHTENING = 4  # rounds of a refinement: matches, then a step
+TIGHTER, FINAL = 0.55, 3  # factor of the radius from one step of a refinement to the next, and steps at the last
 BEHIND = 1.0  # matches that a hypothesis may have less than any other had, to be refined
 LACKING = 0.25  # matches that an expected but missing point takes away
 
@@ -56,12 +57,35 @@ def try_pose(
 def tightened(
     pose: Any, rays: Any, scene: Any, image: Any, reach: float, last: float, prior: Any, work: Any
 ) -> bool:  # fmt: skip
-    """Gauss-Newton steps, in place, on matches within a radius that shrinks from `reach` to `last`."""
-    for _ in range(TIGHTENING):
+    """Gauss-Newton steps, in place, on matches within a radius that shrinks from `reach` to `last`, and two at it."""
+    left = FINAL
+    while left > 0:
         count, _, _ = match(pose, reach, scene, image, work[3], work[4])
-        if count < 3 or not refine(pose, rays, scene[0], work[3], prior, work[5], work[6], work[7]):
+        if count < 3 and count + len(prior) < 3:
             return False
-        reach = max(last, 0.6 * reach)
+        if not refine(pose, rays, scene[0], work[3], prior, work[5], work[6], work[7]):
+            return False
+        left -= reach <= last
+        reach = max(last, TIGHTER * reach)
+    return allowed(pose, prior, work[9])
+
+
+@compiled
+def allowed(pose: Any, prior: Any, place: Any) -> bool:
+    """Whether the pose agrees with what is known of it: directions a that R takes to b, rows (a, b, weight, largest
+    squared distance) of `prior`; and the translation, (t, largest squared distance) in `place`."""
+    shift2 = 0.0
+    for k in range(3):
+        shift2 += (pose[9 + k] - place[k]) ** 2
+    if shift2 > place[3]:
+        return False
+    for k in range(len(prior)):
+        x, y, z = prior[k, 0], prior[k, 1], prior[k, 2]
+        dx = pose[0] * x + pose[1] * y + pose[2] * z - prior[k, 3]
+        dy = pose[3] * x + pose[4] * y + pose[5] * z - prior[k, 4]
+        dz = pose[6] * x + pose[7] * y + pose[8] * z - prior[k, 5]
+        if dx * dx + dy * dy + dz * dz > prior[k, 7]:
+            return False
     return True
 
 

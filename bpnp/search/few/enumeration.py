@@ -3,10 +3,10 @@
 from typing import Any
 
 from bpnp.compilation import compiler
-from bpnp.search.constellation.kept import consider
-from bpnp.search.constellation.matching import WIDEST_MATCHED, nearest, sight
-from bpnp.search.constellation.p3p import p3p_depths
-from bpnp.search.constellation.triangles import pose_of_triangle
+from bpnp.search.few.kept import allowed, consider
+from bpnp.search.few.matching import WIDEST_MATCHED, nearest, sight
+from bpnp.search.few.p3p import p3p_depths
+from bpnp.search.few.triangles import pose_of_triangle
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 SKIPPED = 5  # matches of the best pose from which its own triples are not solved again
@@ -46,9 +46,7 @@ def sweep(
                     continue
                 a, b, c = triples3d[t, 0], triples3d[t, 1], triples3d[t, 2]
                 if not (
-                    _fits(labels2d[i], labels3d[a])
-                    and _fits(labels2d[j], labels3d[b])
-                    and _fits(labels2d[k], labels3d[c])
+                    fits(labels2d[i], labels3d[a]) and fits(labels2d[j], labels3d[b]) and fits(labels2d[k], labels3d[c])
                 ):
                     continue
                 known, pairs = found[3][best[0]], found[2][best[0], 0]
@@ -58,7 +56,9 @@ def sweep(
                 for s in range(p3p_depths(chord01, chord12, chord20, sides[t, 0], sides[t, 1], depths)):
                     if not pose_of_triangle(rays, i, j, k, depths[s], sides[t, 2], frames[t], middles[t], axes, pose):
                         continue
-                    if not (_faces(pose, scene, rays, a, i, b, j, c, k) and _allowed(pose, prior)):
+                    if not (faces(pose, scene, rays, a, i, b, j) and faces(pose, scene, rays, b, j, c, k)):
+                        continue
+                    if not allowed(pose, prior, work[9]):
                         continue
                     if witnessed(pose, a, b, c, i, j, k, witnesses, need, reach, scene, image):
                         consider(pose, rays, scene, image, reach, used, density, prior, found, work)
@@ -67,7 +67,7 @@ def sweep(
 
 
 @compiled
-def _fits(one: int, other: int) -> bool:
+def fits(one: int, other: int) -> bool:
     return one < 0 or other < 0 or one == other
 
 
@@ -86,13 +86,11 @@ def _determinant(rays: Any, i: int, j: int, k: int) -> float:
 
 
 @compiled
-def _faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int, c: int, k: int) -> bool:
-    """Whether the three points face the camera that sees them along the rays i, j, k."""
+def faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int) -> bool:
+    """Whether points a and b face the camera that sees them along the rays i and j."""
     normals = scene[1]
-    if not len(normals):
-        return True
-    return _cosine(pose, normals, a, rays, i) > WIDEST_MATCHED and (
-        _cosine(pose, normals, b, rays, j) > WIDEST_MATCHED and _cosine(pose, normals, c, rays, k) > WIDEST_MATCHED
+    return len(normals) == 0 or (
+        _cosine(pose, normals, a, rays, i) > WIDEST_MATCHED and _cosine(pose, normals, b, rays, j) > WIDEST_MATCHED
     )
 
 
@@ -103,19 +101,6 @@ def _cosine(pose: Any, normals: Any, a: int, rays: Any, i: int) -> float:
     ny = pose[3] * x + pose[4] * y + pose[5] * z
     nz = pose[6] * x + pose[7] * y + pose[8] * z
     return -(nx * rays[i, 0] + ny * rays[i, 1] + nz * rays[i, 2])
-
-
-@compiled
-def _allowed(pose: Any, prior: Any) -> bool:
-    """Whether the rotation takes the directions of the prior to within four standard deviations of where they are."""
-    for k in range(len(prior)):
-        x, y, z = prior[k, 0], prior[k, 1], prior[k, 2]
-        dx = pose[0] * x + pose[1] * y + pose[2] * z - prior[k, 3]
-        dy = pose[3] * x + pose[4] * y + pose[5] * z - prior[k, 4]
-        dz = pose[6] * x + pose[7] * y + pose[8] * z - prior[k, 5]
-        if dx * dx + dy * dy + dz * dz > prior[k, 7]:
-            return False
-    return True
 
 
 @compiled

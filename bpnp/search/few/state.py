@@ -1,0 +1,134 @@
+"""An enumeration under way: the poses that were kept so far, and what the compiled loops work on."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.few.arrays import ImageArrays, SceneArrays
+from bpnp.search.few.enumeration import sweep
+from bpnp.search.few.kept import try_pose
+from bpnp.search.few.knowledge import Knowledge
+from bpnp.search.few.matching import RADII
+from bpnp.search.few.pairs import sweep_pairs
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+
+
+class Stage(NamedTuple):
+    """A block of hypotheses: the `near2d` nearest of an image point with the `near3d` nearest of a scene point.
+
+    pairs: of a hypothesis, 3, or 2 where a prior lets them fix a pose. reach: radii within which a point counts for
+    such a pose, before it is refined.
+    """
+
+    pairs: int
+    near2d: int
+    near3d: int
+    reach: float
+
+
+class Enumeration:
+    """One pair of point sets. kept: distinct poses at most. reach: the largest at which matches are looked up."""
+
+    def __init__(self, scene: SceneArrays, image: ImageArrays, known: Knowledge, kept: int, reach: float) -> None:
+        self.scene, self.image, self.known, self.widest = scene, image, known, reach
+        m, n = len(image.rays), len(scene.arrays[0])
+        self.found = (
+            np.zeros((kept, 12)), np.full(kept, -math.inf), np.zeros((kept, 3), np.int64), np.full((kept, m), -1),
+            np.zeros((kept, m)), np.zeros(1, np.int64), np.zeros(2),
+        )  # fmt: skip
+        self.work = (
+            np.empty((4, 3)), np.empty((3, 3)), np.empty(12), np.empty(m, np.int64), np.empty(m), np.empty((6, 6)),
+            np.empty(6), np.empty(6), np.empty((2, 12)), known.place,
+        )  # fmt: skip
+        self.used, k = known.pairs, known.pairs
+        problems = _log_choose(m, k) + _log_choose(n, k) + math.lgamma(k + 1) + known.log_share
+        self.tests = math.log(RADII) + max(problems, 0.0)
+        self.solved = 0
+        self._done: dict[tuple[int, float], tuple[int, int]] = {}
+
+    @property
+    def best(self) -> float:
+        """Evidence of the best pose, nats."""
+        return float(self.found[1].max())
+
+    def begin(self, stage: Stage) -> int:
+        """How many image triples, or pairs, the stage has; those that were done before are not solved again."""
+        m, n = len(self.image.rays), len(self.scene.arrays[0])
+        self.stage = stage
+        if stage.pairs == 3:
+            self._image, (self._scene, self._count) = self.image.triples(stage.near2d), self.scene.triples(stage.near3d)
+        else:
+            self._image, self._pairs = self.image.pairs(stage.near2d), self.scene.pairs(stage.near3d)
+            self._count = len(self._pairs)
+        self._before = self._done.get((stage.pairs, stage.reach), (0, 0))
+        self._done[stage.pairs, stage.reach] = len(self._image), self._count
+        # How many witnesses make a hypothesis worth a look depends on what chance gives it.
+        chance = self.scene.witnesses.shape[1] * m * self.image.density * stage.reach**2
+        need = (1 if chance < 0.05 else 2 if chance < 0.3 else 3) + (stage.pairs == 2)
+        self._need = min(need, m - stage.pairs, n - stage.pairs)
+        self.found[6][1] = 0.0
+        return len(self._image)
+
+    def sweep(self, place: int, chunk: int) -> int:
+        """The image triple, or pair, after about `chunk` hypotheses, or after the best pose has become better."""
+        stop = max(self.best + 1e-9, self.tests)
+        rest = (
+            self.scene.witnesses, self._need, self.scene.arrays, self.image.arrays, self.stage.reach, self.used,
+            self.image.density, self.known.directions,
+        )  # fmt: skip
+        block = place, len(self._image), *self._before, self._count, stop, chunk, self.image.rays, self._image
+        if self.stage.pairs == 3:
+            place, solved = sweep(*block, self._scene, *rest, self.found, self.work)
+        else:
+            place, solved = sweep_pairs(
+                *block, self._pairs, *rest, self.known.upright, self.known.turned, self.found, self.work
+            )  # fmt: skip
+        self.solved += solved
+        return int(place)
+
+    def vary_best(self) -> None:
+        """Refine the best pose again on other matches, and its mirror twin: its nearly flat matched points seen at the
+        opposite tilt."""
+        if not math.isfinite(self.best):
+            return
+        for reach in (0.5 * self.widest, self.widest):
+            self.refine(self.found[0][int(self.found[1].argmax())], reach)
+        best = int(self.found[1].argmax())
+        matched = self.found[3][best]
+        seen = self.scene.arrays[0][matched[matched >= 0]]
+        if len(seen) < 3:
+            return
+        rotation, translation = self.found[0][best, :9].reshape(3, 3), self.found[0][best, 9:]
+        centre = seen.mean(0)
+        normal = np.linalg.svd(seen - centre)[2][2]
+        middle = rotation @ centre + translation
+        sight = middle / np.linalg.norm(middle)
+        turned = (np.eye(3) - 2 * np.outer(sight, sight)) @ rotation @ (np.eye(3) - 2 * np.outer(normal, normal))
+        self.refine(np.concatenate([turned.ravel(), middle - turned @ centre]), self.widest)
+
+    def refine(self, pose: Array, reach: float) -> None:
+        """Refine a pose (12,) of these frames from matches within `reach` radii, and keep it."""
+        self.work[2][:] = pose
+        try_pose(
+            self.image.rays, self.scene.arrays, self.image.arrays, reach, self.used, self.image.density,
+            self.known.directions, self.found, self.work,
+        )  # fmt: skip
+
+    def enter(self, rotation: Array, translation: Array) -> Array:
+        """A pose of the given points as (12,) in these frames."""
+        turned = self.image.turn @ rotation
+        middle = self.image.turn @ (rotation @ self.scene.centre + translation)
+        return np.concatenate([turned.ravel(), middle / self.scene.size])
+
+    def leave(self, poses: Array) -> tuple[Array, Array]:
+        """Poses (c, 12) of these frames as rotations (c, 3, 3) and translations (c, 3) of the given points."""
+        rotation = self.image.turn.T @ poses[:, :9].reshape(-1, 3, 3)
+        return rotation, self.scene.size * poses[:, 9:] @ self.image.turn - rotation @ self.scene.centre
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if n >= k else 0.0
