@@ -12,7 +12,7 @@ from pathlib import Path
 import bench_layers
 import bench_ransac
 import bench_scaling
-from timing import let_waiting_threads_sleep, machine
+from timing import machine, restart_with_settings
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -32,5 +32,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    let_waiting_threads_sleep()
+    restart_with_settings()
     main()

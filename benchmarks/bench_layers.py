@@ -20,7 +20,7 @@ import torch
 from layer_rows import Row, Size, all_rows
 from rich.console import Console
 from rich.table import Table
-from timing import Spread, let_waiting_threads_sleep, machine, write_json
+from timing import Spread, machine, restart_with_settings, write_json
 
 RESULTS = Path(__file__).parent / "results"
 COLUMNS = ("what", "inputs", "B", "ours ms", "paper's ms", "ratio", "CPU ratio", "target", "error", "paper's error")
@@ -84,5 +84,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    let_waiting_threads_sleep()
+    restart_with_settings()
     main()

@@ -25,7 +25,7 @@ from problems import planted, planted_network
 from rich.console import Console
 from rich.table import Table
 from steps import training_losses
-from timing import let_waiting_threads_sleep, machine, write_json
+from timing import machine, restart_with_settings, write_json
 
 RESULTS = Path(__file__).parent / "results"
 SIZES = (250, 500, 1000, 2000, 4000, 8000, 14742)
@@ -167,5 +167,5 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    let_waiting_threads_sleep()
+    restart_with_settings()
     main()

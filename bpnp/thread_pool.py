@@ -8,14 +8,14 @@ from functools import lru_cache
 import torch
 
 
-def spread(work: Callable[[int, int], object], count: int, *, least: int = 1) -> None:
+def spread(work: Callable[[int, int], object], count: int) -> None:
     """Call work(first, last) on consecutive shares of range(count), one a thread, and wait for all of them.
 
-    As many threads as torch has (`torch.set_num_threads`, OMP_NUM_THREADS), and no share smaller than `least`. Only
+    As many threads as torch has (`torch.set_num_threads`, OMP_NUM_THREADS), and no empty share. Only
     work that gives the GIL back gains, as numba's `nogil` functions do; it writes to its own share of an array.
     Python's threads and not a pool of numba's: that one does not survive the fork of a loader's workers.
     """
-    shares = max(1, min(torch.get_num_threads(), count // least))
+    shares = max(1, min(torch.get_num_threads(), count))
     if shares == 1:
         work(0, count)
         return

@@ -26,11 +26,11 @@ def test_every_index_is_visited_once(threads: int, count: int) -> None:
     assert (seen == 1).all()
 
 
-def test_shares_are_not_smaller_than_asked(threads: int) -> None:
+def test_no_thread_has_an_empty_share(threads: int) -> None:
     shares: list[int] = []
-    spread(lambda first, last: shares.append(last - first), 20, least=8)
-    assert sum(shares) == 20
-    assert min(shares) >= 8
+    spread(lambda first, last: shares.append(last - first), 2)
+    assert sum(shares) == 2
+    assert min(shares) >= 1
     assert len(shares) == min(threads, 2)
 
 
