@@ -10,6 +10,7 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
+from bpnp.layers.implicit import BackwardStats
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.composition import described
@@ -124,6 +125,16 @@ class BlindPnPTask(LightningModule):
         pose = prediction.poses[self.pose_estimate]
         values = pose_losses(pose, batch, bounds=self.pose_bounds)
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
+
+    def on_after_backward(self) -> None:
+        """The share of this step's samples whose gradient a layer could not solve for."""
+        stats = [module.backward_stats for module in self.solver.modules() if hasattr(module, "backward_stats")]
+        counts = [each for each in stats if isinstance(each, BackwardStats)]
+        samples = sum(each.samples for each in counts)
+        if samples:
+            self._log_train(backward_failed=sum(each.unconverged for each in counts) / samples)
+        for each in counts:
+            each.reset()
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Without a finite gradient the step is left out, by the optimiser itself and on its device."""

@@ -5,11 +5,12 @@ import numpy as np
 import pytest
 import torch
 from lightning import Trainer
+from planted import plant
 from small_data import SMALL_MESHES, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from bpnp import Batch, Prediction
+from bpnp import Batch, Matcher, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
 from bpnp.training.losses import correspondence_loss, pose_loss
@@ -88,6 +89,23 @@ def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) ->
     assert broken.skipped.tolist() == [1, 1]
     for name, value in broken.solver.named_parameters():
         torch.testing.assert_close(value, short.solver.get_parameter(name), rtol=0, atol=0, msg=name)
+
+
+@pytest.mark.parametrize("kind", ["BPnPNet", "Matcher"])
+def test_gradients_that_a_layer_could_not_solve_for_are_counted_step_by_step(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    solver = small_net() if kind == "BPnPNet" else Matcher(channels=8, depth=1, heads=2)
+    task, logged = BlindPnPTask(solver), []
+    monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.append(values))
+    batch = plant(4, 12, dtype=torch.float32).batch()
+    counts = solver.transport.backward_stats if kind == "BPnPNet" else solver.backward_stats
+    for failed in (0, 3):
+        task.losses(solver.match(batch), batch).total.mean().backward()
+        assert counts.samples == 4  # of this step alone
+        counts.unconverged += failed
+        task.on_after_backward()
+    assert logged == [{"train/backward_failed": 0.0}, {"train/backward_failed": 0.75}]
 
 
 def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path) -> None:
