@@ -57,9 +57,9 @@ def _jacobian(
     camera: y = R p + t, which a step moves by w x R p + s. turned: R p.
     """
     inverse = torch.where(inlier, 1 / camera[..., 2], 0)
-    u, v = (torch.where(inlier, camera[..., i] * inverse, 0) for i in (0, 1))
-    a, b, c = torch.where(inlier.unsqueeze(-1), turned, 0).unbind(-1)
-    zero, one = torch.zeros_like(u), torch.ones_like(u)
-    along_x = torch.stack([-u * b, c + u * a, -b, one, zero, -u], -2)
-    along_y = torch.stack([-c - v * b, v * a, a, zero, one, -v], -2)
-    return torch.cat([along_x, along_y], -1) * inverse.repeat(1, 1, 2).unsqueeze(-2)
+    u, v = camera[..., 0] * inverse, camera[..., 1] * inverse
+    a, b, c = (turned * inverse.unsqueeze(-1)).unbind(-1)
+    zero = torch.zeros_like(u)
+    along_x = torch.stack([-u * b, c + u * a, -b, inverse, zero, -u * inverse], -2)
+    along_y = torch.stack([-c - v * b, v * a, a, zero, inverse, -v * inverse], -2)
+    return torch.cat([along_x, along_y], -1)

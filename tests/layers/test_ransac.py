@@ -209,3 +209,15 @@ def test_options_must_be_positive(option: dict[str, Any]) -> None:
     ((name, value),) = option.items()
     with pytest.raises(ValueError, match=f"expected `{name}` > 0, got {value}"):
         ransac_pnp(planted.permutation(), planted.points2d, planted.points3d, **option)
+
+
+def test_arguments_by_name_and_in_half_precision(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_type_checker(monkeypatch)
+    planted = plant(2, 30, seed=9)
+    points = {"points2d": planted.points2d, "points3d": planted.points3d}
+    expected = ransac_pnp(planted.permutation(), **points)
+    by_name = ransac_pnp(assignment=planted.permutation(), **points)
+    assert torch.equal(by_name[0], expected[0])
+    half = ransac_pnp(planted.permutation().bfloat16(), **points)
+    assert half[0].dtype == torch.float32
+    assert rotation_angle(half[0].double(), planted.rotation).max() < 1e-3

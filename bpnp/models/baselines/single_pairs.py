@@ -54,14 +54,8 @@ class PairSolver(nn.Module):
         return self.solve(pair, math.inf if self.time_limit is None else time.monotonic() + self.time_limit)
 
 
-def one_pose(
-    rotation: Float[Tensor, "3 3"],
-    translation: Float[Tensor, "3"],
-    iterations: int,
-    residual: float,
-    converged: bool,
-) -> Pose:
-    """A batch of one pose."""
+def one_pose(rotation: Tensor, translation: Tensor, iterations: int, residual: float, converged: bool) -> Pose:
+    """A batch of one pose, of a rotation (3, 3) and a translation (3,)."""
     stats = SolveStats(torch.tensor([iterations]), rotation.new_tensor([residual]), torch.tensor([converged]))
     return Pose(rotation.unsqueeze(0), translation.unsqueeze(0), stats.to(rotation.device))
 
