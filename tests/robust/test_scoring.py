@@ -99,4 +99,5 @@ def test_poses_are_refined_independently() -> None:
     pairs, poses = problem()
     together = refine_locally(poses, pairs, 0.01**2, 4)
     alone = refine_locally(poses[1:, 2:3], Pairs(*(v[1:] for v in pairs)), 0.01**2, 4)
-    assert rotation_angle(alone[0, 0, :, :3], together[1, 2, :, :3]) < 1e-10
+    # Near the optimum, rounding of the score decides which of two iterates is returned.
+    assert rotation_angle(alone[0, 0, :, :3], together[1, 2, :, :3]) < 1e-8
