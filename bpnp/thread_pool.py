@@ -8,7 +8,7 @@ from functools import lru_cache
 import torch
 
 
-def spread(work: Callable[[int, int], object], count: int) -> None:
+def in_threads(work: Callable[[int, int], object], count: int) -> None:
     """Call work(first, last) on consecutive shares of range(count), one a thread, and wait for all of them.
 
     As many threads as torch has (`torch.set_num_threads`, OMP_NUM_THREADS), and no empty share. Only

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from bpnp.thread_pool import spread
+from bpnp.thread_pool import in_threads
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -22,13 +22,13 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
 def test_every_index_is_visited_once(threads: int, count: int) -> None:
     seen = np.zeros(count, int)
-    spread(lambda first, last: np.add.at(seen, np.arange(first, last), 1), count)
+    in_threads(lambda first, last: np.add.at(seen, np.arange(first, last), 1), count)
     assert (seen == 1).all()
 
 
 def test_no_thread_has_an_empty_share(threads: int) -> None:
     shares: list[int] = []
-    spread(lambda first, last: shares.append(last - first), 2)
+    in_threads(lambda first, last: shares.append(last - first), 2)
     assert sum(shares) == 2
     assert min(shares) >= 1
     assert len(shares) == min(threads, 2)
@@ -39,7 +39,7 @@ def test_shares_run_at_the_same_time() -> None:
     torch.set_num_threads(3)
     together = threading.Barrier(3, timeout=20)
     try:
-        spread(lambda _first, _last: together.wait(), 3)
+        in_threads(lambda _first, _last: together.wait(), 3)
     finally:
         torch.set_num_threads(before)
 
@@ -50,7 +50,7 @@ def test_an_error_in_any_share_is_raised(threads: int) -> None:
             raise ArithmeticError("last share")
 
     with pytest.raises(ArithmeticError, match="last share"):
-        spread(fail, 10)
+        in_threads(fail, 10)
 
 
 def _square(results: "multiprocessing.Queue[float]") -> None:
@@ -60,7 +60,7 @@ def _square(results: "multiprocessing.Queue[float]") -> None:
     def work(first: int, last: int) -> None:
         squares[first:last] = np.arange(first, last) ** 2
 
-    spread(work, 10)
+    in_threads(work, 10)
     results.put(float(squares.sum()))
 
 
@@ -68,7 +68,7 @@ def _square(results: "multiprocessing.Queue[float]") -> None:
 def test_a_fork_has_threads_of_its_own() -> None:
     before = torch.get_num_threads()
     torch.set_num_threads(2)
-    spread(lambda _first, _last: None, 10)
+    in_threads(lambda _first, _last: None, 10)
     torch.set_num_threads(before)
     context = multiprocessing.get_context("fork")
     results = context.Queue()

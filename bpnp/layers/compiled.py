@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.compilation import compiler
-from bpnp.thread_pool import spread
+from bpnp.thread_pool import in_threads
 
 # Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
@@ -84,7 +84,7 @@ def run(loop: Any, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> N
     if not all(x.is_contiguous() for x in outputs):
         raise ValueError(f"expected contiguous outputs, got strides {[x.stride() for x in outputs]}")
     arrays = [x.detach().contiguous().numpy() for x in (*inputs, *outputs)]
-    spread(lambda first, last: loop(first, last, *arrays), len(outputs[0]))
+    in_threads(lambda first, last: loop(first, last, *arrays), len(outputs[0]))
 
 
 @compiled

@@ -15,7 +15,7 @@ from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
 from bpnp.search.settings import ClusterStage, Recipe
 from bpnp.search.starts import Prior, draw_poses
-from bpnp.thread_pool import spread as in_threads
+from bpnp.thread_pool import in_threads
 
 
 @dataclass(frozen=True)
