@@ -23,6 +23,7 @@ from bpnp.geometry import bearings
 from bpnp.metrics.errors import rotation_error, translation_error
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
+from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.types import Batch
 
@@ -61,8 +62,7 @@ def run(
         batch = Batch.from_arrays(pair.points2d, pair.points3d, pair.rotation, pair.translation)
         start, cpu = time.perf_counter(), time.process_time()
         found = search_poses(
-            bearings(batch.points2d)[0].double().numpy(),
-            batch.points3d[0].double().numpy(),
+            PointSets(bearings(batch.points2d)[0].double().numpy(), batch.points3d[0].double().numpy()),
             seed=seed,
             deadline=Deadline.after(time_limit),
             settings=settings,
@@ -77,6 +77,7 @@ def run(
                 "rotation_deg": float(rotation_error(turn, batch.rotation.double())),
                 "translation": float(translation_error(shift, batch.translation.double())),
                 "verdict": found.verdict,
+                "log10_false_alarms": found.log10_false_alarms,
                 "scale_deg": float(np.rad2deg(found.residual)),
                 "matched": float(found.candidates.matched[0]) if len(found.candidates) else 0.0,
                 "batches": found.batches,

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from bpnp.geometry import bearings as bearings_of
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
+from bpnp.search.point_sets import PointSets
 from bpnp.search.refine import refine_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
@@ -45,8 +46,9 @@ def search(
 
     def one(_: int, f: Array, p: Array) -> SearchResult:
         return search_poses(
-            f, p, prior=prior, clutter=clutter, seed=seed, deadline=Deadline.after(time_limit), settings=settings
-        )
+            PointSets(f, p, prior=prior), clutter=clutter, seed=seed, deadline=Deadline.after(time_limit),
+            settings=settings,
+        )  # fmt: skip
 
     return _each(one, bearings, points3d, mask2d, mask3d)
 
@@ -70,7 +72,7 @@ def refine(
 
     def one(i: int, f: Array, p: Array) -> SearchResult:
         starts = _host(rotation[i]), _host(translation[i])
-        return refine_poses(f, p, *starts, outliers=outliers, seed=seed, settings=settings)
+        return refine_poses(PointSets(f, p), *starts, outliers=outliers, seed=seed, settings=settings)
 
     return _each(one, bearings, points3d, mask2d, mask3d)
 

@@ -21,6 +21,7 @@ class Candidates:
     matched: (c,) expected share of min(m, n) points that have a partner.
     scale: (c,) standard deviation of the residuals per axis, radians, at which score and matched were taken.
     hits: (c,) batches whose own starts ended at this pose.
+    log10_false_alarms: (c,) how likely chance fits as well (`bpnp.search.false_alarms`); NaN before it is weighed.
     """
 
     rotation: NDArray[Any]
@@ -29,13 +30,22 @@ class Candidates:
     matched: NDArray[Any]
     scale: NDArray[Any]
     hits: NDArray[np.int64]
+    log10_false_alarms: NDArray[np.float64]
 
     @classmethod
     def unscored(cls, rotation: NDArray[Any], translation: NDArray[Any], *, hits: int = 0) -> "Candidates":
         """Poses to start from."""
         c = len(rotation)
         zero = np.zeros(c, np.float32)
-        return cls(rotation, translation, np.full(c, -math.inf, np.float32), zero, zero, np.full(c, hits, np.int64))
+        return cls(
+            rotation,
+            translation,
+            np.full(c, -math.inf, np.float32),
+            zero,
+            zero,
+            np.full(c, hits, np.int64),
+            np.full(c, math.nan),
+        )
 
     @classmethod
     def none(cls) -> "Candidates":
@@ -85,3 +95,12 @@ def merged(parts: Sequence[Candidates], scene: Scene) -> Candidates:
     """The best distinct poses of several batches; a pose has the hits of all batches that found it."""
     sources = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     return best_distinct(Candidates.concatenated(parts), scene, scene.settings.kept, sources=sources)
+
+
+def in_user_frame(candidates: Candidates, scene: Scene) -> Candidates:
+    """Candidates of a scene in the coordinates and unit of the user, in float64."""
+    rotation, translation = scene.leave(candidates.rotation, candidates.translation)
+    score, matched, scale = (
+        values.astype(np.float64) for values in (candidates.score, candidates.matched, candidates.scale)
+    )
+    return replace(candidates, rotation=rotation, translation=translation, score=score, matched=matched, scale=scale)

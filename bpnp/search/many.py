@@ -4,24 +4,22 @@ import math
 import time
 from collections.abc import Callable
 
-import numpy as np
-from numpy.typing import NDArray
-
 from bpnp.search.annealing import Deadline, finish, run_batch
-from bpnp.search.candidates import Candidates, merged
+from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
-from bpnp.search.verdict import SearchResult, is_exhausted, is_safe, judged, no_pose
+from bpnp.search.verdict import SearchResult, is_certain, is_exhausted, judged, no_pose, weighed
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
+LEADERS = 3  # candidates that are weighed after a batch; all of them are in the end
 
 
 def search_poses(
-    bearings: NDArray[np.float64],
-    points3d: NDArray[np.float64],
+    sets: PointSets,
     *,
-    prior: Prior | None = None,
+    around: Prior | None = None,
     clutter: float | None = None,
     seed: int = 0,
     deadline: Deadline | None = None,
@@ -32,10 +30,9 @@ def search_poses(
 
     Maximises the likelihood of the bearings under the mixture
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
-    A the solid angle of the view, by annealing s from starts over all rotations.
+    A the solid angle of the view, by annealing s from starts over all rotations, or around `sets.prior`.
 
-    bearings: (m, 3) unit vectors of any field of view. points3d: (n, 3), any unit, any origin.
-    prior: what is known of the pose. seed: of everything that is random.
+    around: where to start instead, if that is no more than a guess from the same points. seed: of all that is random.
     clutter: share of the points without a partner to expect, from 0 to below 1; it is then the only one
         that is tried, which saves time at the end. None for that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
@@ -47,17 +44,16 @@ def search_poses(
     if clutter is not None and not 0 <= clutter < 1:
         raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
     start, end = time.monotonic(), deadline or Deadline()
-    if degenerate(bearings) or degenerate(points3d):
-        return no_pose(
-            f"no pose fits: {len(bearings)} 2D and {len(points3d)} 3D points, too few or all on one line"
-        )  # fmt: skip
-    scene = Scene(bearings, points3d, seed, settings)
+    if degenerate(sets.bearings) or degenerate(sets.points3d):
+        counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
+        return no_pose(f"no pose fits: {counts}, too few or all on one line")
+    scene, prior = Scene(sets, seed, settings), around or sets.prior
     known = None if prior is None else scene.enter_prior(prior)
     share = settings.outliers if clutter is None else max(clutter, settings.least_outliers)
     candidates = Candidates.none()
     batches, stalled, best = 0, 0, -math.inf
-    safe = exhausted = False
-    while batches < settings.max_batches and not (safe or exhausted or end.passed()):
+    over = False
+    while batches < settings.max_batches and not (over or end.passed()):
         recipe = settings.recipes[batches % len(settings.recipes)]
         found = run_batch(scene, recipe, known, candidates, share, end)
         candidates = merged([candidates, found], scene)
@@ -65,9 +61,10 @@ def search_poses(
         if len(candidates):
             stalled = stalled + 1 if candidates.score[0] < best + settings.evidence.better else 0
             best = float(candidates.score[0])
-            safe, exhausted = is_safe(candidates, scene), is_exhausted(candidates, scene, stalled)
+            leaders = weighed(in_user_frame(candidates[:LEADERS], scene), sets, settings.evidence)
+            over = is_certain(leaders, sets, settings.evidence) or is_exhausted(candidates, scene, stalled)
         if progress is not None:
             progress(batches, time.monotonic() - start)
     if len(candidates):
         candidates = finish(scene, candidates, share, end, None if clutter is None else ())
-    return judged(candidates, scene, safe=safe, batches=batches)
+    return judged(in_user_frame(candidates, scene), sets, batches=batches, rule=settings.evidence)

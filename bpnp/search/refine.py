@@ -6,15 +6,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import Deadline, anneal_on_clusters, finish, refine_batch
-from bpnp.search.candidates import Candidates
+from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.verdict import SearchResult, is_safe, judged, no_pose
+from bpnp.search.verdict import SearchResult, judged, no_pose
 
 
 def refine_poses(
-    bearings: NDArray[np.float64],
-    points3d: NDArray[np.float64],
+    sets: PointSets,
     rotation: NDArray[np.float64],
     translation: NDArray[np.float64],
     *,
@@ -27,9 +27,8 @@ def refine_poses(
     The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
     beyond `settings.refine.direct` are first annealed on clusters, as the search does, and the likeliest go on.
 
-    bearings: (m, 3) unit vectors. points3d: (n, 3), any unit. rotation (s, 3, 3), translation (s, 3): the starts;
-    those with NaN are missing. outliers: share of the points without a partner to expect, in (0, 1); None for that of
-    the settings.
+    rotation (s, 3, 3), translation (s, 3): the starts; those with NaN are missing. outliers: share of the
+    points without a partner to expect, in (0, 1); None for that of the settings.
 
     `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
     pose, there are no candidates. Raises ValueError for `outliers` out of range.
@@ -38,9 +37,9 @@ def refine_poses(
     if not 0 < share < 1:
         raise ValueError(f"expected `outliers` in (0, 1), a share of the points, got {share}")
     given = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
-    if not given.any() or degenerate(bearings) or degenerate(points3d):
+    if not given.any() or degenerate(sets.bearings) or degenerate(sets.points3d):
         return no_pose("no start, or points that fix no pose")
-    scene, never = Scene(bearings, points3d, seed, settings), Deadline()
+    scene, never = Scene(sets, seed, settings), Deadline()
     starts = Candidates.unscored(*scene.enter(rotation[given], translation[given]))
     crowd = len(starts)
     if crowd > settings.refine.direct:
@@ -49,7 +48,7 @@ def refine_poses(
     poses = refine_batch(scene, starts, share, never) if len(starts) else starts
     if len(poses):
         poses = finish(scene, poses, share, never)
-    return judged(poses, scene, safe=is_safe(poses, scene), batches=annealed)
+    return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
 
 
 def _likeliest(scene: Scene, starts: Candidates, outliers: float) -> Candidates:

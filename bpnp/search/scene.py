@@ -8,6 +8,7 @@ from scipy.cluster.vq import vq
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import MIN_POINTS
+from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread, solid_angle
 
@@ -27,9 +28,8 @@ class Scene:
     smallest_scale: of the residuals, radians. rng: of all that is random.
     """
 
-    def __init__(
-        self, bearings: NDArray[np.float64], points3d: NDArray[np.float64], seed: int, settings: SearchSettings
-    ) -> None:
+    def __init__(self, sets: PointSets, seed: int, settings: SearchSettings) -> None:
+        bearings, points3d = sets.bearings, sets.points3d
         self.settings = settings
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)

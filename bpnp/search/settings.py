@@ -79,28 +79,30 @@ class RefineSettings:
 
 @dataclass(frozen=True)
 class Evidence:
-    """When a pose is accepted (`bpnp.search.verdict`).
+    """When a pose is accepted (`bpnp.search.verdict`). Logarithms to base 10.
 
-    other_deg: poses with rotations farther apart are different answers.
-    far_lead, far_hits: a pose is safe if it leads the next different one by so many nats and came out of so many
-    batches; lead, hits: or by these. The lead is of the log-likelihood of all bearings together.
-    matched, over_chance: or if this share of the points is matched and so many times the share expected by chance.
-    plausible_scale: largest residuals, in half the spacing of the bearings; larger ones fit a shape, not points.
-    plausible_matched: least share of matched points; wrong poses of sparse points had up to a quarter.
-    stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search.
+    false_alarms: of the number of false alarms, at most, for "confident". It is a bound; on unrelated points an
+    exhaustive search stayed above 1 in 999 of 1000 cases, and never came below 0.1.
+    lead: by which every different pose must have more. other_deg, other_shift: poses with rotations farther apart, or
+    translations by this share of their length, are different.
+    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed;
+    far_false_alarms: below it one is enough, since repeated structure does not reach it.
+    stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search,
+    as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the bearings, and
+    its matched share above plausible_matched; wrong poses of sparse points had up to a quarter.
     """
 
-    other_deg: float = 10.0
-    far_lead: float = 100.0
-    far_hits: int = 2
-    lead: float = 20.0
-    hits: int = 4
-    matched: float = 0.2
-    over_chance: float = 6.0
-    plausible_scale: float = 2.0
-    plausible_matched: float = 0.25
+    false_alarms: float = -2.0
+    lead: float = 2.0
+    other_deg: float = 5.0
+    other_shift: float = 0.1
+    hits: int = 2
+    far_false_alarms: float = -60.0
     stalled: int = 4
     better: float = 0.002
+    enough_hits: int = 4
+    plausible_scale: float = 2.0
+    plausible_matched: float = 0.25
 
 
 @dataclass(frozen=True)

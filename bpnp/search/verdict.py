@@ -1,7 +1,13 @@
-"""When the search stops, and what it says about its best pose: all of it is here."""
+"""When a search stops, and what it says about its best pose: all of it is here.
+
+The currency is the number of false alarms (`bpnp.search.false_alarms`): how many poses would fit as well if the image
+had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`, every different pose has at least
+1 / `Evidence.lead` times as many, and no search elsewhere is missing. "ambiguous": better than chance, but one of the
+conditions is not met. "failed": no pose, or none better than chance.
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -9,7 +15,10 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose
 from bpnp.search.candidates import Candidates
+from bpnp.search.false_alarms import log10_false_alarms
+from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT, Evidence
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 
@@ -19,9 +28,7 @@ class SearchResult:
     """What is known of one pair's pose.
 
     candidates: distinct poses in the user's coordinates, float64, best first. batches: of starts that were tried.
-    verdict: "confident", more starts would hardly have changed the best pose; "ambiguous", it fits about as closely as
-    the bearings lie, but another one may as well; "failed", there is no pose or the best fits only loosely.
-    reason: of the verdict, in words.
+    verdict: see the head of this file. reason: of the verdict, in words.
     """
 
     candidates: Candidates
@@ -41,65 +48,94 @@ class SearchResult:
         """Scale of the best pose's residuals, radians; infinite if there is none."""
         return float(self.candidates.scale[0]) if len(self.candidates) else math.inf
 
+    @property
+    def log10_false_alarms(self) -> float:
+        """Of the best pose; infinite if there is none."""
+        return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
-def is_safe(candidates: Candidates, scene: Scene) -> bool:
-    """Whether more starts would hardly change the best pose, and no other one comes close.
 
-    Either more points match than chance explains (`is_unique`), or the pose leads all different ones by enough, came
-    out of enough batches of starts, and is plausible.
+def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Candidates:
+    """The candidates, in the user's coordinates, with their false alarms; the best first, the others as they were.
+
+    Best is the first one whose false alarms exceed the fewest by less than the lead that a verdict asks for: among
+    poses that chance cannot tell apart, the order of the search, which is that of the likelihood, decides.
+    """
+    if not len(candidates):
+        return candidates
+    alarms = np.array(
+        [log10_false_alarms(sets, r, t) for r, t in zip(candidates.rotation, candidates.translation, strict=True)]
+    )
+    first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
+    order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
+    return replace(candidates, log10_false_alarms=alarms)[order]
+
+
+def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> tuple[float, int]:
+    """Decades by which the best pose has fewer false alarms than the next different one, and the place of that one.
+
+    Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
+    distance. Infinite and -1 if there is none.
+    """
+    middle = candidates.rotation @ np.median(sets.points3d, 0) + candidates.translation
+    shift = rule.other_shift * float(np.linalg.norm(middle[0]))
+    others = np.flatnonzero(~same_pose(candidates.rotation, middle, 0, rule.other_deg, shift))
+    if not len(others):
+        return math.inf, -1
+    nearest = int(others[np.argmin(candidates.log10_false_alarms[others])])
+    return float(candidates.log10_false_alarms[nearest] - candidates.log10_false_alarms[0]), nearest
+
+
+def is_certain(
+    candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence, *, exhaustive: bool = False
+) -> bool:
+    """Whether weighed candidates leave no doubt about the first: the verdict "confident".
+
+    exhaustive: whether every pose that fits some points was looked at. Otherwise a better one may have been missed,
+    unless two batches of starts found this one, or its false alarms are far below any repeated structure's.
     """
     if not len(candidates):
         return False
-    rule, ahead, hits = scene.settings.evidence, lead(candidates, scene), int(candidates.hits[0])
-    found = (ahead > rule.far_lead and hits >= rule.far_hits) or (ahead > rule.lead and hits >= rule.hits)
-    return is_unique(candidates, scene) or (found and is_plausible(candidates, scene))
+    alarms, hits = float(candidates.log10_false_alarms[0]), int(candidates.hits[0])
+    found = exhaustive or hits >= rule.hits or alarms <= rule.far_false_alarms
+    return alarms <= rule.false_alarms and found and lead(candidates, sets, rule)[0] >= rule.lead
 
 
 def is_exhausted(candidates: Candidates, scene: Scene, stalled: int) -> bool:
-    """Whether batches keep ending at the best pose, or `stalled` of them in a row did not better it."""
+    """Whether a search should end though no pose is certain: batches keep ending at the best one, or stall.
+
+    stalled: batches in a row that did not better it. It has to be plausible: its residuals about the spacing of the
+    bearings or less, and enough points matched; otherwise the right pose has not been met yet.
+    """
     rule = scene.settings.evidence
-    enough = len(candidates) > 0 and (int(candidates.hits[0]) >= rule.hits or stalled >= rule.stalled)
-    return enough and is_plausible(candidates, scene)
-
-
-def is_unique(candidates: Candidates, scene: Scene) -> bool:
-    """Whether the matched share exceeds a floor, and several times what chance matches within two scales."""
-    rule = scene.settings.evidence
-    by_chance = len(scene.points3d) / scene.solid_angle * math.pi * (2 * float(candidates.scale[0])) ** 2
-    return bool(candidates.matched[0] > max(rule.matched, rule.over_chance * by_chance))
-
-
-def is_plausible(candidates: Candidates, scene: Scene) -> bool:
-    """Whether the residuals are about the spacing of the bearings or less, and enough points are matched."""
-    rule = scene.settings.evidence
+    if not len(candidates) or (int(candidates.hits[0]) < rule.enough_hits and stalled < rule.stalled):
+        return False
     spacing = 0.5 * math.sqrt(scene.solid_angle / len(scene.offsets))
     return bool(candidates.scale[0] < rule.plausible_scale * spacing and candidates.matched[0] > rule.plausible_matched)
 
 
-def lead(candidates: Candidates, scene: Scene) -> float:
-    """Log-likelihood of all bearings under the best pose over that under the next different one, nats."""
-    limit = scene.settings.evidence.other_deg
-    other = ~same_pose(candidates.rotation, candidates.translation, 0, limit, math.inf)
-    gap = candidates.score[0] - candidates.score[other].max() if other.any() else math.inf
-    return float(gap) * len(scene.offsets)
-
-
-def judged(candidates: Candidates, scene: Scene, *, safe: bool, batches: int) -> SearchResult:
-    """The candidates of a scene in the user's coordinates, with the verdict on the best of them.
-
-    safe: whether the search ended because its best pose was (`is_safe`).
-    """
-    counts = f"{len(scene.offsets)} 2D and {len(scene.points3d)} 3D points"
+def judged(
+    candidates: Candidates, sets: PointSets, *, batches: int, exhaustive: bool = False,
+    rule: Evidence = DEFAULT.evidence,
+) -> SearchResult:  # fmt: skip
+    """The verdict on candidates in the user's coordinates, best first."""
     if not len(candidates):
-        return no_pose(f"no pose fits: {counts}, too few or all on one line", batches)
-    verdict, reason = _judge(candidates, scene, safe)
-    rotation, translation = scene.leave(candidates.rotation, candidates.translation)
-    score, matched, scale = (
-        values.astype(np.float64) for values in (candidates.score, candidates.matched, candidates.scale)
-    )
-    return SearchResult(
-        Candidates(rotation, translation, score, matched, scale, candidates.hits), verdict, reason, batches
-    )
+        return no_pose("no pose was found", batches)
+    candidates = weighed(candidates, sets, rule)
+    alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
+    chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
+    if is_certain(candidates, sets, rule, exhaustive=exhaustive):
+        return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
+    if alarms > 0:
+        return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
+    if ahead < rule.lead:
+        turned = candidates.rotation[0].T @ candidates.rotation[other]
+        degrees = math.degrees(math.acos(min(max((float(np.trace(turned)) - 1) / 2, -1.0), 1.0)))
+        reason = f"{chance}, but a pose {degrees:.0f} deg away fits about as well ({_number(ahead)} times the number)"
+    elif alarms > rule.false_alarms:
+        reason = f"{chance}: too many to be sure"
+    else:
+        reason = f"{chance}, but the search came upon this pose only once, and a better one may have been missed"
+    return SearchResult(candidates, "ambiguous", reason, batches)
 
 
 def no_pose(reason: str, batches: int = 0) -> SearchResult:
@@ -107,12 +143,6 @@ def no_pose(reason: str, batches: int = 0) -> SearchResult:
     return SearchResult(Candidates.unscored(np.empty((0, 3, 3)), np.empty((0, 3))), "failed", reason, batches)
 
 
-def _judge(candidates: Candidates, scene: Scene, safe: bool) -> tuple[Verdict, str]:
-    if safe:
-        return "confident", "the matches are unique, or the pose leads all others and was found again and again"
-    if not is_plausible(candidates, scene):
-        return "failed", "no pose fits closely; more batches, more time or a prior may help"
-    gap = lead(candidates, scene)
-    if gap <= scene.settings.evidence.lead:
-        return "ambiguous", f"another pose explains the points nearly as well, {gap:.0f} nats behind"
-    return "ambiguous", "the pose fits and leads, but too few batches of starts came upon it to be sure"
+def _number(log10: float) -> str:
+    """10^x in words that can be read at a glance."""
+    return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"

@@ -10,11 +10,14 @@ import torch
 
 from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
+from bpnp.search.point_sets import PointSets
+from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = npt.NDArray[np.float64]
 Unit = Literal["px", "normalised", "rad"]
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
+FLOOR_PIXELS = 0.1  # no detector of points is better
 UNIT_NORM = 1e-3
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
@@ -53,6 +56,14 @@ class Problem:
             return 1.0
         stretch = (1 + (self.points2d[self.usable] ** 2).sum(-1)) ** 0.75
         return float(np.median(stretch) * (1.0 if self.camera is None else self.camera.focal))
+
+    def sets(self, prior: PosePrior | GravityPrior | None = None) -> PointSets:
+        """What a search is given: the points around `origin`, the prior there, and the noise floor of the detector."""
+        if isinstance(prior, PosePrior) and prior.translation is not None:
+            moved = np.asarray(prior.translation) + np.asarray(prior.rotation) @ self.origin
+            prior = prior._replace(translation=moved)
+        floor = None if self.camera is None else FLOOR_PIXELS / self.per_radian
+        return PointSets(self.bearings, self.local3d, floor=floor, prior=prior)
 
     def project(self, rotation: Array, translation: Array, points: Array) -> Array:
         """Where points (p, 3) around `origin` are seen, in the coordinates of `image`; NaN if they cannot be."""

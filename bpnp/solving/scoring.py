@@ -5,24 +5,23 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from bpnp.distinct_poses import same_pose
 from bpnp.search.annealing import Deadline, finish
-from bpnp.search.candidates import Candidates, merged
+from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
-from bpnp.search.verdict import SearchResult, is_safe, judged, no_pose
+from bpnp.search.verdict import SearchResult, judged, no_pose
 from bpnp.solving.problem import Array, Problem
 
 
 def scored(problem: Problem, rotation: Array, translation: Array, deadline: Deadline) -> SearchResult:
     """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
 
-    They have no hits, since no other starts were tried: only unique matches make the best of them safe.
+    They have no hits, since no other starts were tried: only overwhelming evidence makes the best of them certain.
     """
     found = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
     if not found.any():
         return no_pose("the module found no pose")
-    scene = Scene(problem.bearings, problem.local3d, 0, DEFAULT)
+    scene = Scene(problem.sets(), 0, DEFAULT)
     starts = Candidates.unscored(*scene.enter(rotation[found], translation[found]))
     # Each starts at the scale of its own residuals: the median distance of a point to the nearest bearing.
     tree = cKDTree(problem.bearings)
@@ -33,18 +32,16 @@ def scored(problem: Problem, rotation: Array, translation: Array, deadline: Dead
         distance[i] = np.median(tree.query(camera / length)[0])
     starts = replace(starts, scale=np.maximum(distance, scene.smallest_scale))
     poses = finish(scene, starts, DEFAULT.outliers, deadline)
-    return judged(poses, scene, safe=is_safe(poses, scene), batches=len(starts))
+    return judged(in_user_frame(poses, scene), problem.sets(), batches=len(starts))
 
 
 def joined(problem: Problem, around: SearchResult, anywhere: SearchResult) -> SearchResult:
-    """The distinct poses of two searches, best first; safe if the second found the best of both and one was sure."""
-    scene = Scene(problem.bearings, problem.local3d, 0, DEFAULT)
+    """The distinct poses of two searches, best first; a pose has the hits of both."""
+    sets = problem.sets()
+    scene = Scene(sets, 0, DEFAULT)
     parts = []
     for result in (around, anywhere):
         rotation, translation = scene.enter(result.candidates.rotation, result.candidates.translation)
         parts.append(replace(result.candidates, rotation=rotation, translation=translation))
-    poses = merged(parts, scene)
-    sure = any(result.verdict == "confident" for result in (around, anywhere))
-    agree = Candidates.concatenated([poses[:1], parts[1][:1]])
-    both = len(agree) == 2 and same_pose(agree.rotation, agree.translation, 0, DEFAULT.evidence.other_deg, np.inf)[1]
-    return judged(poses, scene, safe=sure and bool(both), batches=around.batches + anywhere.batches)
+    poses = in_user_frame(merged(parts, scene), scene)
+    return judged(poses, sets, batches=around.batches + anywhere.batches)

@@ -15,7 +15,7 @@ from bpnp.models import TrainedNet
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT
-from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
@@ -62,8 +62,8 @@ def results_of(
         if isinstance(prior, TrainedNet):
             result = _searched_around(nets[id(prior)], problem, number, options)
         else:
-            search = _search(problem, number, options, Deadline.after(options.time_limit))
-            result = search(prior=_around_origin(prior, problem))
+            search = _search(number, options, Deadline.after(options.time_limit))
+            result = search(problem.sets(prior))
         yield number, result, time.perf_counter() - start
 
 
@@ -98,12 +98,10 @@ def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
         yield group
 
 
-def _search(problem: Problem, number: int, options: Options, deadline: Deadline) -> Callable[..., SearchResult]:
-    """The search of this problem, but for a prior."""
+def _search(number: int, options: Options, deadline: Deadline) -> Callable[..., SearchResult]:
+    """The search, but for the point sets."""
     return partial(
         search_poses,
-        problem.bearings,
-        problem.local3d,
         clutter=options.clutter,
         seed=options.seed,
         deadline=deadline,
@@ -114,12 +112,12 @@ def _search(problem: Problem, number: int, options: Options, deadline: Deadline)
 def _searched_around(net: nn.Module, problem: Problem, number: int, options: Options) -> SearchResult:
     """The search around the net's pose and, unless what that finds is certain, everywhere too."""
     deadline = Deadline.after(options.time_limit)
-    search = _search(problem, number, options, deadline)
+    search, sets = _search(number, options, deadline), problem.sets()
     known = _net_prior(net, problem, deadline)
     if known is None:
-        return search()
-    around = search(prior=known, settings=AROUND_NET)
-    return around if _certain(problem, around, deadline) else joined(problem, around, search())
+        return search(sets)
+    around = search(sets, around=known, settings=AROUND_NET)
+    return around if _certain(problem, around, deadline) else joined(problem, around, search(sets))
 
 
 def _certain(problem: Problem, around: SearchResult, deadline: Deadline) -> bool:
@@ -128,12 +126,6 @@ def _certain(problem: Problem, around: SearchResult, deadline: Deadline) -> bool
         return False
     rotation, translation = around.best
     return scored(problem, rotation[None], translation[None], deadline).verdict == "confident"
-
-
-def _around_origin(prior: PosePrior | GravityPrior | None, problem: Problem) -> PosePrior | GravityPrior | None:
-    if not isinstance(prior, PosePrior) or prior.translation is None:
-        return prior
-    return prior._replace(translation=np.asarray(prior.translation) + np.asarray(prior.rotation) @ problem.origin)
 
 
 def _net_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrior | None:

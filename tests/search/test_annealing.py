@@ -9,6 +9,7 @@ from planted import plant
 
 from bpnp.search.annealing import Deadline, anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
+from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, lloyd
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import draw_poses
@@ -19,7 +20,7 @@ PASSED = Deadline(0.0)
 @pytest.fixture
 def scene() -> Scene:
     planted = plant(1, 300, seed=2, noise=1e-4)
-    return Scene(planted.bearings[0].numpy(), planted.points3d[0].numpy(), 0, DEFAULT)
+    return Scene(PointSets(planted.bearings[0].numpy(), planted.points3d[0].numpy()), 0, DEFAULT)
 
 
 def starts(scene: Scene, count: int) -> Candidates:

@@ -14,6 +14,7 @@ from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
 from bpnp.models.search_solver import refine, search
 from bpnp.search.many import search_poses
+from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior, super_fibonacci
 from bpnp.types import Batch
@@ -65,14 +66,14 @@ def test_neighbours_padding_and_batch_size_do_not_matter(problem):
 
 
 def test_the_seed_decides(problem):
-    points = problem.bearings[0].numpy(), problem.points3d[0].numpy()
-    first, second = (search_poses(*points, seed=3).candidates for _ in range(2))
+    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
+    first, second = (search_poses(sets, seed=3).candidates for _ in range(2))
     for field in fields(first):
         np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
 
 
 def test_candidates_are_distinct_and_fall_in_score(problem):
-    candidates = search_poses(problem.bearings[0].numpy(), problem.points3d[0].numpy()).candidates
+    candidates = search_poses(PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())).candidates
     assert (np.diff(candidates.score) <= 0).all()
     for i in range(len(candidates)):
         for j in range(i):
@@ -203,7 +204,7 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     rays = np.concatenate([camera / np.linalg.norm(camera, axis=-1, keepdims=True) + noise, outliers])
     aside = Rotation.random(rng=rng).as_matrix()  # the view is not along the camera's axis
     rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True) @ aside.T
-    found = search_poses(rays, points)
+    found = search_poses(PointSets(rays, points))
     turned, moved = found.best
     assert found.verdict == "confident"
     assert np.degrees(Rotation.from_matrix(turned.T @ aside @ rotation).magnitude()) < 0.2
