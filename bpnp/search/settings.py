@@ -100,7 +100,7 @@ class Evidence:
     far_false_alarms: float = -60.0
     stalled: int = 4
     better: float = 0.002
-    enough_hits: int = 4
+    enough_hits: int = 8
     plausible_scale: float = 2.0
     plausible_matched: float = 0.25
 

@@ -13,18 +13,22 @@ from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
 
 Array = npt.NDArray[np.float64]
-FORMAT = 1
+FORMAT = 2  # 2 has the false alarms
 
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """A distinct pose that was found, camera = R p + t, with its score (mean log-likelihood of the bearings, nats;
-    larger is better) and its number of one-to-one inliers (paper Eq. 1)."""
+    """A distinct pose that was found, camera = R p + t.
+
+    score: mean log-likelihood of the bearings, nats; larger is better. inlier_count: one-to-one inliers (paper Eq. 1).
+    log10_false_alarms: how likely unrelated points fit as well, see `Solution`; smaller is better.
+    """
 
     rotation: Array
     translation: Array
     score: float
     inlier_count: int
+    log10_false_alarms: float
 
     @property
     def centre(self) -> Array:
@@ -53,8 +57,10 @@ class Solution:
     inlier_threshold, reprojection_error: in `unit`, pixels with a camera, else normalised image units, or radians for
         bearings; the error is the mean over the matches. reprojection_error_deg: the mean angle.
     candidates: the distinct poses that were found, best first; the first is this one.
-    verdict: "confident"; "ambiguous", other poses explain the points about as well; "failed", this pose, if there is
-        one, is a guess. reason: why, in words.
+    verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits
+        better than chance, and this one, if there is one, is a guess. reason: why, in words.
+    log10_false_alarms: how many poses are expected to fit as well if the image had nothing to do with the scene
+        (docs/verdict.md), as a logarithm to base 10; infinite without a pose.
     seconds: for this pair; a share of the time where many were solved together.
     view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
         the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
@@ -73,6 +79,7 @@ class Solution:
     candidates: tuple[Candidate, ...]
     verdict: Verdict
     reason: str
+    log10_false_alarms: float
     stats: SolutionStats
     seconds: float
     points2d: Array = field(repr=False)
@@ -122,7 +129,13 @@ class Solution:
             if known["point_ids"] is not None:
                 known["point_ids"] = np.array(known["point_ids"], np.int64)
             candidates = tuple(
-                Candidate(_array(c["rotation"], 3, 3), _array(c["translation"], 3), c["score"], c["inlier_count"])
+                Candidate(
+                    _array(c["rotation"], 3, 3),
+                    _array(c["translation"], 3),
+                    c["score"],
+                    c["inlier_count"],
+                    _infinite(c["log10_false_alarms"]),
+                )  # fmt: skip
                 for c in known["candidates"]
             )
             if known["verdict"] not in get_args(Verdict):
@@ -131,6 +144,7 @@ class Solution:
                 **known
                 | {"candidates": candidates, "stats": SolutionStats(**_numbers(known["stats"]))}
                 | {key: _array(known[key], *shape) for key, shape in SHAPES.items()}
+                | {"log10_false_alarms": _infinite(known["log10_false_alarms"])}
                 | {"matches": np.array(known["matches"], np.int64).reshape(-1, 2)}
                 | _numbers(
                     {key: known[key] for key in ("inlier_threshold", "reprojection_error", "reprojection_error_deg")}
@@ -155,6 +169,10 @@ def _plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def _infinite(value: float | None) -> float:
+    return math.inf if value is None else value
 
 
 def _array(values: Any, *shape: int) -> Array:

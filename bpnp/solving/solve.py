@@ -161,11 +161,14 @@ def _finished(
         reprojection_error_deg=error_deg,
         unit=problem.unit,
         candidates=tuple(
-            Candidate(r, t, float(score), count)
-            for r, t, score, count in zip(rotations, translations, found.score, counts, strict=True)
+            Candidate(*values)
+            for values in zip(
+                rotations, translations, found.score.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
+            )
         ),
         verdict=result.verdict,
         reason=result.reason,
+        log10_false_alarms=result.log10_false_alarms,
         stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", dropped),
         seconds=seconds + time.perf_counter() - start,
         points2d=problem.points2d,
@@ -224,6 +227,7 @@ def _failed(problem: Problem, reason: str, inlier_threshold: float | None, dropp
         candidates=(),
         verdict="failed",
         reason=reason,
+        log10_false_alarms=math.inf,
         stats=SolutionStats(dropped2d=dropped),
         seconds=0.0,
         points2d=problem.points2d,
