@@ -14,9 +14,9 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 quickstart: install
-	$(BIN)/bpnp test --config configs/quickstart.yaml --results.folder $(RUN)/untrained
-	$(BIN)/bpnp fit --config configs/quickstart.yaml
-	$(BIN)/bpnp test --config configs/quickstart.yaml --ckpt_path $(RUN)/checkpoints/best.ckpt
+	$(BIN)/bpnp test --config quickstart --results.folder $(RUN)/untrained
+	$(BIN)/bpnp fit --config quickstart
+	$(BIN)/bpnp test --config quickstart --ckpt_path $(RUN)/checkpoints/best.ckpt
 	$(BIN)/bpnp report $(RUN)/test --untrained $(RUN)/untrained
 
 lint: install

@@ -1,11 +1,13 @@
-"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, the other commands are plain ones."""
+"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, the others are typed functions."""
 
+import difflib
 import logging
 import os
 import sys
 import warnings
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -15,39 +17,33 @@ from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from bpnp.commands import convert_weights, prepare
-from bpnp.datamodules.colmap.photos import photo_finder
-from bpnp.localization import localize_command, solve_command
-from bpnp.report import report_command, view_command
-from bpnp.report.dashboards import wandb_command
-from bpnp.table import table_command
+from bpnp.commands import COMMANDS
+from bpnp.commands.parser import OneLineParser, first_line, run_command
+from bpnp.configs import config_names, packaged_config
+from bpnp.files import claimed
 from bpnp.training.plugins import SafeCheckpointIO
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
-DESCRIPTION = """Camera pose from 2D and 3D points that nobody has matched.
-
-Find a pose:             bpnp solve POINTS2D POINTS3D, bpnp localize --model sparse/0
-Train and evaluate:      bpnp {fit,validate,test,predict} --config configs/quickstart.yaml
-Read results:            bpnp report RUN..., bpnp view RUN PAIR, bpnp wandb RUN...
-Compare methods:         bpnp table --data configs/psb.yaml --methods METHOD...
-Prepare data:            bpnp prepare DATASET SOURCE
-Released weights:        bpnp convert-weights FILE OUT
-"""
-COMMANDS: dict[str, Callable[[list[str]], None]] = {
-    "solve": solve_command,
-    "localize": localize_command,
-    "report": partial(report_command, photos=photo_finder),
-    "view": partial(view_command, photos=photo_finder),
-    "wandb": wandb_command,
-    "table": table_command,
-    "prepare": prepare,
-    "convert-weights": convert_weights,
+LIGHTNING = {
+    "fit": "Train a solver.",
+    "validate": "Evaluate a solver on the validation pairs.",
+    "test": "Evaluate a solver on the test pairs and write their results.",
+    "predict": "Write the poses of pairs whose true pose need not be known.",
 }
+
+
+class _Parser(OneLineParser, LightningArgumentParser):
+    """Lightning's parser with errors of one line."""
 
 
 class BpnpCLI(LightningCLI):
     """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir."""
+
+    def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
+        parser = _Parser(**kwargs)
+        parser.add_argument("-c", "--config", action="config", help="configuration file, or the name of a packaged one")
+        return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
         parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
@@ -70,7 +66,10 @@ class BpnpCLI(LightningCLI):
         """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
         if self._get(self.config, "trainer.enable_progress_bar") is False:
             self.trainer_defaults["callbacks"] = []
-        trainer = super().instantiate_trainer(**kwargs)
+        # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
+        plugins = self._get(self.config_init, "trainer.plugins") or []
+        own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
+        trainer = super().instantiate_trainer(**{"plugins": own} | kwargs)
         wanted = self._get(self.config, "trainer.logger") is not False
         if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
             trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
@@ -88,6 +87,12 @@ class BpnpCLI(LightningCLI):
     def _parse_ckpt_path(self) -> None:
         """Nothing to do: our checkpoints hold no settings of the trainer's. The trainer reads them, once."""
 
+    def _run_subcommand(self, subcommand: str) -> None:
+        """In a run folder that no other training holds."""
+        training = subcommand == "fit" and self.trainer.global_rank == 0
+        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext():
+            super()._run_subcommand(subcommand)
+
 
 def _checkpoint_folder(root: str) -> str:
     return str(Path(root) / "checkpoints")
@@ -99,18 +104,76 @@ def main(args: Sequence[str] | None = None) -> None:
     logging.captureWarnings(True)
     _quieten()
     try:
-        if arguments and arguments[0] in COMMANDS:
-            COMMANDS[arguments[0]](arguments[1:])
-        else:
-            _lightning(arguments)
+        _run(arguments)
     except (ValueError, OSError, TrainingDivergedError, MisconfigurationException) as error:
         if os.environ.get("BPNP_TRACEBACK"):
             raise
-        print(f"bpnp: error: {error}", file=sys.stderr)
+        # Names of files that are not UTF-8 reach us as surrogates, which a terminal cannot show.
+        print(f"bpnp: error: {error}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("bpnp: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _run(arguments: list[str]) -> None:
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(help_text())
+    elif arguments[0] == "--version":
+        print(f"bpnp {version('bpnp')}")
+    elif arguments[0] in LIGHTNING:
+        _lightning(_with_packaged_configs(arguments))
+    else:
+        name, *rest = arguments
+        command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]
+        if isinstance(command, Mapping):
+            if not rest or rest[0] in ("-h", "--help"):
+                lines = (f"  {word:<14}{first_line(own)}" for word, own in command.items())
+                print("\n".join([f"usage: bpnp {name} WHAT [options]", "", *lines]))
+                return
+            word, *rest = rest
+            name, command = f"{name} {word}", command[_known(word, list(command), f"one of bpnp {name}")]
+        run_command(name, command, rest)
+
+
+def _known(name: str, names: Sequence[str], what: str) -> str:
+    if name in names:
+        return name
+    close = difflib.get_close_matches(name, names, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"try {', '.join(names)}"
+    raise ValueError(f"expected {what}, got {name!r}; {hint}")
+
+
+def help_text() -> str:
+    """What `bpnp --help` shows: every command in a line."""
+    own = {
+        name: "Pack a data set, once: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
+        for name, command in COMMANDS.items()
+    }
+    lines = [f"  {name:<17}{text}" for name, text in (own | LIGHTNING).items()]
+    return "\n".join(
+        [
+            "usage: bpnp COMMAND [options]",
+            "",
+            "Camera pose from 2D and 3D points that nobody has matched.",
+            "",
+            *lines,
+            "",
+            "bpnp COMMAND --help shows the options of a command, bpnp --version the version.",
+            f"Packaged configurations, for --config: {', '.join(config_names())}.",
+        ]
+    )
+
+
+def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
+    """The arguments with the file in place of the name of a packaged configuration."""
+    found = list(arguments)
+    for i, text in enumerate(arguments):
+        if text in ("-c", "--config") and i + 1 < len(arguments):
+            found[i + 1] = packaged_config(arguments[i + 1])
+        elif text.startswith("--config="):
+            found[i] = f"--config={packaged_config(text.removeprefix('--config='))}"
+    return found
 
 
 def _lightning(arguments: list[str]) -> None:
@@ -120,13 +183,8 @@ def _lightning(arguments: list[str]) -> None:
         subclass_mode_data=True,
         seed_everything_default=0,
         save_config_kwargs={"overwrite": True},
-        trainer_defaults={
-            "callbacks": [RichProgressBar()],
-            "plugins": [SafeCheckpointIO()],
-            "max_epochs": 200,
-            "num_sanity_val_steps": 0,
-        },
-        parser_kwargs={"description": DESCRIPTION, "prog": "bpnp", "allow_abbrev": False},
+        trainer_defaults={"callbacks": [RichProgressBar()], "max_epochs": 200, "num_sanity_val_steps": 0},
+        parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
         args=arguments,
     )
 

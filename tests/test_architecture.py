@@ -16,6 +16,7 @@ GROUND = {
     "geometry",
     "cameras",
     "files",
+    "configs",
     "metrics",
     "compilation",
     "thread_pool",
@@ -37,8 +38,8 @@ MAY_IMPORT = {
     "training": {"robust", "layers", "models", "report"},
     "localization": {"search", "solving", "datamodules", "report"},
     "table": {"models", "solving", "datamodules", "report", "training"},
-    "commands": {"models", "training", "datamodules", "report"},
-    "cli": {"commands", "training", "datamodules", "report", "localization", "table"},
+    "commands": {"models", "search", "solving", "training", "datamodules", "report", "localization", "table"},
+    "cli": {"commands", "training"},
     "__main__": {"cli"},
     "": {"maps", "models", "search", "solving"},
 }  # fmt: skip

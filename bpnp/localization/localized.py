@@ -8,8 +8,6 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from rich import box
-from rich.table import Table
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
@@ -17,7 +15,7 @@ from bpnp.datamodules.colmap.reconstruction import ImagePoints
 from bpnp.datamodules.loader import Pair
 from bpnp.metrics.errors import centre_error, rotation_error
 from bpnp.report.pictures import VERDICTS
-from bpnp.report.tables import number
+from bpnp.report.tables import FittedTable, number
 from bpnp.solving.solution import Solution
 
 RIGHT_DEG = 1.0
@@ -100,18 +98,17 @@ def images_text(done: Sequence[Localized]) -> str:
     return f"{HEADER}# Number of images: {len(lines)}\n{''.join(lines)}"
 
 
-def localized_table(done: Sequence[Localized]) -> Table:
+def localized_table(done: Sequence[Localized]) -> FittedTable:
     """A row per image."""
-    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-    table.add_column("image", overflow="fold", min_width=12)
-    for header in ("2D", "3D", "verdict", "rot\ndeg", "centre\nunits", "inlier\n%", "right\n%", "error\npx", "sec"):
-        table.add_column(header, justify="left" if header == "verdict" else "right", no_wrap=True)
+    headers = ("2D", "3D", "verdict", "rot\ndeg", "centre\nunits", "inlier\n%", "right\n%", "error\npx", "sec")
+    rows = []
     for r in done:
         errors = (number(r.rotation_error_deg), number(r.centre_error))
         shares = (f"{100 * r.inlier_ratio:.0f}", f"{100 * r.right_matches:.0f}")
-        rest = (*errors, *shares, number(r.reprojection_error_px), number(r.seconds))
-        table.add_row(Text(r.image), str(r.count2d), str(r.count3d), Text(r.verdict, VERDICTS[r.verdict]), *rest)
-    return table
+        cells = (*errors, *shares, number(r.reprojection_error_px), number(r.seconds))
+        verdict = Text(r.verdict, VERDICTS[r.verdict])
+        rows.append((Text(r.image), [Text(str(r.count2d)), Text(str(r.count3d)), verdict, *map(Text, cells)]))
+    return FittedTable("", headers, [rows])
 
 
 def summary(done: Sequence[Localized]) -> str:

@@ -1,6 +1,5 @@
 """Results on disk and on screen."""
 
-from bpnp.report.commands import report_command, view_command
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
 from bpnp.report.folder import read_results, table, write_results
 from bpnp.report.page.write import write_page
@@ -25,14 +24,12 @@ __all__ = [
     "recall_curve",
     "recall_table",
     "report",
-    "report_command",
     "results_table",
     "rows_from",
     "save_figure",
     "select_views",
     "summarise",
     "table",
-    "view_command",
     "view_of",
     "views_from",
     "write_page",

@@ -4,7 +4,6 @@ Offline unless WANDB_MODE says otherwise. An offline run is a folder; `wandb syn
 here only, when it is used.
 """
 
-import argparse
 import os
 from collections.abc import Sequence
 from dataclasses import astuple, fields
@@ -12,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
 
 from bpnp.report.figures import plot_pair, recall_curve
-from bpnp.report.folder import named_runs, read_results
+from bpnp.report.folder import read_results
 from bpnp.report.results import CAUSES, PairRow, Results, cause_shares
 from bpnp.report.samples import FEW, PairView, read_views
 
@@ -112,32 +110,6 @@ def workspace(entity: str, project: str) -> Any:
             spaces.Section(name="Training", panels=curves, is_open=True),
         ],
     )
-
-
-def wandb_command(arguments: Sequence[str], console: Console | None = None) -> None:
-    """`bpnp wandb RUN... [--project P] [--directory D] [--workspace ENTITY]`.
-
-    Raises ValueError for what cannot be read.
-    """
-    parser = argparse.ArgumentParser(
-        prog="bpnp wandb",
-        description="Log results to Weights & Biases: to folders for `wandb sync` unless WANDB_MODE=online.",
-    )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folder that `bpnp test` wrote, or its run")
-    parser.add_argument("--project", default="bpnp")
-    parser.add_argument("--directory", type=Path, default=Path("runs"), help="where the folders of offline runs go")
-    parser.add_argument(
-        "--workspace", metavar="ENTITY", help="also save the dashboard of the project there; goes online"
-    )
-    chosen = parser.parse_args(arguments)
-    console = console or Console()
-    for name, folder in named_runs(chosen.runs).items():
-        written = log_results(folder, project=chosen.project, name=name, directory=chosen.directory)
-        console.print(f"logged {name} to {written}", markup=False, highlight=False, soft_wrap=True)
-    if chosen.workspace is not None:
-        saved = workspace(chosen.workspace, chosen.project)
-        saved.save()
-        console.print(f"saved {saved.url}", markup=False, highlight=False, soft_wrap=True)
 
 
 def _tables(results: Results) -> dict[str, Any]:

@@ -3,7 +3,6 @@
 import base64
 import io
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +23,6 @@ class Box(NamedTuple):
 
 
 PhotoFinder = Callable[[str, Box], Array | None]  # (id of a pair, box) to (h, w, 3) uint8 that fills the box, or None
-Photos = Callable[[Path], PhotoFinder]  # from a folder of scenes
 
 
 def box_of(view: PairView) -> Box:

@@ -1,5 +1,1 @@
-"""The paper's tables on any data: several methods, pair by pair, resumable and in parallel."""
-
-from bpnp.table.command import table_command
-
-__all__ = ["table_command"]
+"""What `bpnp table` is made of: several methods on the same pairs, in the form of the paper's tables."""

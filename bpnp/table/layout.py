@@ -5,12 +5,10 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from rich import box
-from rich.table import Table
 from rich.text import Text
 
-from bpnp.report.published import NAMES, PUBLISHED, Paper
-from bpnp.report.tables import QUARTILES, RESULT_COLUMNS, Column, cell
+from bpnp.report.published import NAMES, PUBLISHED, Paper, published_rows
+from bpnp.report.tables import QUARTILES, RESULT_COLUMNS, Column, FittedTable, cell
 
 CAPTION = (
     "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of pairs with "
@@ -42,33 +40,26 @@ def headers() -> list[str]:
     return ["pairs", *(column.header for column in RESULT_COLUMNS)]
 
 
-def published_lines(paper: Paper | None) -> list[tuple[str, list[str]]]:
-    """Names and cells of the paper's rows; "-" for what it does not print."""
-    if paper is None:
-        return []
-    return [
-        (label, ["-", *(printed.get(column.key, "-") for column in RESULT_COLUMNS)])
-        for label, printed in PUBLISHED[paper].items()
-    ]
-
-
 def note(paper: Paper | None) -> str:
     return "" if paper is None else f"published, on {NAMES[paper]}: another data set than ours"
 
 
-def terminal(lines: Sequence[Line], paper: Paper | None) -> Table:
+def terminal(lines: Sequence[Line], paper: Paper | None) -> FittedTable:
+    """The table of the report, with the number of pairs and the share of outliers."""
     caption = CAPTION if paper is None else f"{CAPTION} paper: {note(paper)}."
-    table = Table(title="Pose errors", caption=caption, box=box.SIMPLE_HEAD, padding=0, caption_justify="left")
-    table.add_column("", overflow="fold", min_width=9)
-    for header in headers():
-        table.add_column(header, justify="right", no_wrap=True)
-    for line in lines:
-        table.add_row(Text(line.name), *line.cells)
-    if paper is not None:
-        table.add_section()
-        for name, cells in published_lines(paper):
-            table.add_row(Text(f"paper: {name}", "dim"), *(Text(shown, "dim") for shown in cells))
-    return table
+    here = [(Text(line.name), [Text(shown) for shown in line.cells]) for line in lines]
+    there = [
+        (Text(name, "dim"), [Text(shown, "dim") for shown in cells]) for name, cells in published_cells(paper).items()
+    ]
+    return FittedTable("Pose errors", headers(), [here, there], caption)
+
+
+def published_cells(paper: Paper | None) -> dict[str, list[str]]:
+    """Names and cells of the paper's rows; "-" for what it does not print."""
+    return {
+        name: ["-", *(printed.get(column.key, "-") for column in RESULT_COLUMNS)]
+        for name, printed in published_rows(paper).items()
+    }
 
 
 def as_csv(lines: Sequence[Line], paper: Paper | None) -> str:
@@ -101,7 +92,7 @@ def as_markdown(lines: Sequence[Line], paper: Paper | None) -> str:
     body.insert(1, "|---" + "|---:" * len(headers()) + "|")
     if paper is not None:
         body.append(f"| *{note(paper)}* |" + " |" * len(headers()))
-        body += [f"| *{name}* | {' | '.join(cells)} |" for name, cells in published_lines(paper)]
+        body += [f"| *{name}* | {' | '.join(cells)} |" for name, cells in published_cells(paper).items()]
     return "\n".join([*body, "", CAPTION, ""])
 
 
@@ -117,7 +108,7 @@ def as_latex(lines: Sequence[Line], paper: Paper | None) -> str:
     text += [_latex_row(line.name, [line.cells[i] for i in place]) for line in lines]
     if paper is not None:
         text += [r"\midrule", rf"\multicolumn{{{len(columns) + 1}}}{{l}}{{{_latex(note(paper))}}}\\"]
-        text += [_latex_row(name, [cells[i] for i in place]) for name, cells in published_lines(paper)]
+        text += [_latex_row(name, [cells[i] for i in place]) for name, cells in published_cells(paper).items()]
     return "\n".join([*text, r"\bottomrule", r"\end{tabular}", ""])
 
 

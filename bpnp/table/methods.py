@@ -9,8 +9,9 @@ from typing import Any
 import yaml
 from torch import nn
 
+from bpnp.configs import packaged_config
 from bpnp.models import load_network
-from bpnp.table.settings import build
+from bpnp.table.pairs import build
 
 SHORT_NAMES = {
     "softposit": "bpnp.models.baselines.SoftPOSIT",
@@ -89,6 +90,7 @@ def _parse(text: str, time_limit: float | None) -> Method:
 def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
     if what in SHORT_NAMES:
         return SHORT_NAMES[what], {}
+    what = packaged_config(what)
     if what.endswith((".yaml", ".yml")):
         if not Path(what).is_file():
             raise FileNotFoundError(f"expected a recipe with a solver, got no file {what}")

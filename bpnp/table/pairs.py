@@ -1,14 +1,15 @@
-"""The test pairs of a recipe, one at a time and in any order."""
+"""The test pairs of a recipe, one at a time and in any order; objects from class paths and settings."""
 
-from collections.abc import Sequence
+import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
 import yaml
+from jsonargparse import ArgumentParser
 from lightning import LightningDataModule
 
-from bpnp.table.settings import build, checked
 from bpnp.types import Batch
 
 ORDER_SEED = 0  # of the order in which `--limit` takes pairs: the same for every method, and longer tables only add
@@ -20,10 +21,10 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
     Raises ValueError for a file without it, or for what its class does not accept.
     """
     if not recipe.is_file():
-        raise FileNotFoundError(f"expected a recipe with `data`, got no file {recipe}; try configs/psb.yaml")
+        raise FileNotFoundError(f"expected a recipe with `data`, got no file {recipe}; try --data psb")
     data = (yaml.safe_load(recipe.read_text(encoding="utf-8")) or {}).get("data")
     if not data:
-        raise ValueError(f"expected `data` in {recipe}, got none; try configs/psb.yaml")
+        raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
     return checked(LightningDataModule, "data", data if isinstance(data, dict) else {"class_path": data}, overrides)
 
 
@@ -50,3 +51,30 @@ class TestPairs:
     def __getitem__(self, index: int) -> Batch:
         """A batch of the one pair at this position of the data set."""
         return cast(Batch, self._dataset[[(0, index)]])
+
+
+def checked(base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """`class_path` and all `init_args` of a subclass of `base`, after `--NAME.SETTING=VALUE` overrides.
+
+    Raises ValueError, naming the class, for one that cannot be imported and for settings that it does not accept.
+    """
+    try:
+        chosen = _parser(base, name).parse_args([f"--{name}={json.dumps(settings)}", *overrides])
+    except Exception as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise ValueError(f"expected settings of {settings.get('class_path')}, got {reason}") from error
+    return dict(chosen.as_dict()[name])
+
+
+def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
+    """The object; raises as `checked` does, and as its constructor."""
+    known = checked(base, name, settings)
+    parser = _parser(base, name)
+    instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
+    return instantiate(parser.parse_object({name: known}))[name]
+
+
+def _parser(base: type, name: str) -> ArgumentParser:
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(base, name)
+    return parser

@@ -1,7 +1,6 @@
 """`bpnp table`: what it runs, keeps, resumes and prints."""
 
 import csv
-import json
 from pathlib import Path
 
 import pytest
@@ -9,13 +8,15 @@ import torch
 from small_data import small_net
 
 from bpnp.cli import main
+from bpnp.files import claimed
 from bpnp.report import read_results
+from bpnp.report.folder import append_rows
 from bpnp.report.published import PUBLISHED
 from bpnp.report.results import PairRow
-from bpnp.table.finished import Finished
 from bpnp.table.layout import Line, as_latex, as_markdown
 from bpnp.table.methods import parse_methods
 from bpnp.table.pairs import TestPairs, read_data
+from bpnp.table.run import Block, Worker
 from bpnp.training.task import BlindPnPTask
 
 RECIPE = """
@@ -68,17 +69,55 @@ def test_a_table_of_two_methods_and_what_it_leaves(
     main(["report", str(tmp_path / "out" / "blind")])
 
 
-def test_it_goes_on_where_it_was_and_solves_no_pair_twice(recipes: list[str], tmp_path: Path) -> None:
+def test_it_goes_on_where_it_was_and_solves_no_pair_twice(
+    recipes: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     main([*recipes, "--limit=2"])
-    kept = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("pairs/*.json")}
-    assert len(kept) == 4
-    lost = sorted(kept)[0]
-    lost.unlink()  # as if it had been killed in this pair
-    (lost.parent / f".{lost.name}.123").write_text('[{"ind')  # and in the middle of writing
+    first = {name: read_results(tmp_path / "out" / name).rows for name in ("blind", "softposit")}
+    # As if the second of four pairs had been killed while its row was written.
+    folder = tmp_path / "out" / "blind"
+    append_rows(folder, first["blind"])
+    unfinished = (folder / "unfinished.csv").read_bytes()
+    (folder / "pairs.csv").unlink()
+    (folder / "unfinished.csv").write_bytes(unfinished[:-5])
+    solved: list[int] = []
+    solve = Worker.solve
+
+    def counted(worker: Worker, block: Block, index: int) -> list[PairRow]:
+        solved.append(index)
+        return solve(worker, block, index)
+
+    monkeypatch.setattr(Worker, "solve", counted)
     main([*recipes, "--limit=4"])
-    now = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").rglob("pairs/[0-9]*.json")}
-    assert len(now) == 8
-    assert all(now[path] == time for path, time in kept.items() if path != lost)
+    assert len(solved) == 1 + 2 + 2
+    for name, rows in first.items():
+        now = read_results(tmp_path / "out" / name).rows
+        assert len(now) == 4
+        errors = {row.index: row.rotation_error_deg for row in now}
+        assert all(errors[row.index] == row.rotation_error_deg for row in rows)
+        kept = {row.index: row.seconds for row in now}
+        times = [kept[row.index] == row.seconds for row in rows]
+        assert sum(times) == (2 if name == "softposit" else 1)
+
+
+def test_a_shorter_table_shows_its_pairs_and_keeps_the_others(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main([*recipes, "--limit=3"])
+    main([*recipes, "--limit=1"])
+    assert len(read_results(tmp_path / "out" / "blind").rows) == 3
+    rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
+    assert {row["pairs"] for row in rows if row["source"] == "here"} == {"1"}
+    capsys.readouterr()
+
+
+def test_two_tables_do_not_write_to_one_folder(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with claimed(tmp_path / "out" / "blind"), pytest.raises(SystemExit):
+        main([*recipes, "--limit=1"])
+    assert "expected a folder that no other process writes to" in capsys.readouterr().err
+    main([*recipes, "--limit=1"])
 
 
 def test_several_processes_find_the_same_poses_as_one(recipes: list[str], tmp_path: Path) -> None:
@@ -102,7 +141,7 @@ def test_an_outlier_sweep_adds_points_and_draws_its_curves(recipes: list[str], t
 
 def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
-    data = read_data(tmp_path / "data.yaml", ["--data.test_shapes=30", "--data.seed", "3"])
+    data = read_data(tmp_path / "data.yaml", ["--data.test_shapes=30", "--data.seed=3"])
     assert data["init_args"]["test_shapes"] == 30
     pairs = TestPairs(data)
     assert sorted(pairs.order) == list(range(30))
@@ -119,7 +158,10 @@ def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> Non
         (["--methods", "bpnpnet@nothing.ckpt"], "got no file nothing.ckpt"),
         (["--methods", "bpnp.models.baselines.Nothing"], "bpnp.models.baselines.Nothing"),
         (["--data.nonsense=3"], "nonsense"),
-        (["--seed=3"], "got --seed=3"),
+        (["--seed=3"], "nrecognized arguments: --seed=3"),
+        (["--limit=x"], "expected limit as int, got 'x'"),
+        (["--limit=0"], "expected --limit of 1 or more, got 0"),
+        (["--rho", "0", "-1"], "expected --rho of 0 or more, got -1"),
         (["--data=nowhere.yaml"], "got no file nowhere.yaml"),
     ],
 )
@@ -143,17 +185,6 @@ def test_other_settings_in_the_same_folder_are_refused(
     with pytest.raises(SystemExit):
         main([*recipes, "--limit=1"])
     assert "got other method" in capsys.readouterr().err
-
-
-def test_rows_survive_the_disk_with_their_infinities(tmp_path: Path) -> None:
-    row = PairRow(
-        3, "a\nb", "x", 180.0, float("inf"), float("inf"), float("nan"), 0, 4, 5, 4, 7, float("inf"), False, False, 0.5
-    )
-    finished = Finished(tmp_path)
-    finished.add(3, [row])
-    assert finished.indices() == {3}
-    assert str(finished.rows([3, 4])) == str([row])
-    json.loads((tmp_path / "pairs" / "3.json").read_text(), parse_constant=pytest.fail)
 
 
 def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:

@@ -1,9 +1,14 @@
+import contextlib
+import inspect
+from importlib.metadata import version
 from pathlib import Path
 
+import docstring_parser
 import pytest
 from small_data import SMALL_MESHES, SMALL_NET, write_mesh_tree
 
-from bpnp.cli import main
+from bpnp.cli import COMMANDS, main
+from bpnp.files import claimed
 
 MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 
@@ -14,15 +19,16 @@ def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
     assert stop.value.code == 2
     error = capsys.readouterr().err
     assert "Traceback" not in error
+    assert len(error.strip().splitlines()) <= 2
     return error
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main(["--help"])
-    assert stop.value.code == 0
+    main(["--help"])
     text = capsys.readouterr().out
-    assert all(command in text for command in ("fit", "validate", "test", "predict", "report"))
+    listed = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
+    assert listed == [*COMMANDS, "fit", "validate", "test", "predict"]
+    assert "quickstart" in text
 
 
 @pytest.mark.parametrize(
@@ -43,7 +49,12 @@ def test_options_of_the_network_and_its_parts_are_explained(
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["bogus"], "invalid choice: 'bogus'"),
+        (["slove"], "expected a command, got 'slove'; did you mean solve?"),
+        (["bogus"], "expected a command, got 'bogus'; try fit"),
+        (["prepare", "megadpth", "."], "did you mean megadepth?"),
+        (["prepare", "megadepth", ".", "--min_points=3"], "min_points"),
+        (["localize", "--modle=x"], "did you mean --model?"),
+        (["fit", *MESHES, "--trainer.max_epoch=3"], "did you mean --trainer.max_epochs?"),
         (["fit"], "required: fit.data"),
         (["fit", *MESHES, "--model.learning_rat=3"], "unrecognized arguments: --model.learning_rat"),
         (["fit", *MESHES, "--model.learning_rate=fast"], "learning_rate"),
@@ -61,6 +72,48 @@ def test_a_users_mistake_is_one_clear_error(
     if arguments[:1] in (["fit"], ["test"]) and len(arguments) > 1:
         arguments = [*arguments, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     assert message in fails(arguments, capsys)
+
+
+def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["--version"])
+    assert capsys.readouterr().out == f"bpnp {version('bpnp')}\n"
+
+
+@pytest.mark.parametrize("name", [*COMMANDS, "prepare megadepth"])
+def test_help_explains_every_option(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with contextlib.suppress(SystemExit):
+        main([*name.split(), "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: bpnp {name}")
+    command = COMMANDS.get(name)
+    if callable(command):
+        options = [p.name for p in inspect.signature(command).parameters.values() if p.name != "overrides"]
+        told = {parameter.arg_name for parameter in docstring_parser.parse(command.__doc__ or "").params}
+        assert told == set(options)
+        assert all(option in text for option in options)
+
+
+def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = f"--trainer.default_root_dir={tmp_path}/run"
+    small = ["--data.train_pairs=2", "--data.train_shapes=2", "--data.val_shapes=2", f"--data.cache_dir={tmp_path}"]
+    with contextlib.suppress(SystemExit):
+        main(["fit", "--config=quickstart", *small, root, "--trainer.max_epochs=1", "--print_config"])
+    printed = tmp_path / "printed.yaml"
+    printed.write_text(capsys.readouterr().out)
+    main(["fit", f"--config={printed}", "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=1"])
+    (kept,) = (tmp_path / "run").rglob("config.yaml")
+    copy = tmp_path / "again.yaml"
+    copy.write_text(kept.read_text())
+    main(["fit", f"--config={copy}", f"--trainer.default_root_dir={tmp_path}/again"])
+    assert (tmp_path / "again" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
+    with claimed(tmp_path):
+        assert "expected a folder that no other process writes to" in fails(arguments, capsys)
 
 
 def test_an_unknown_key_in_a_file_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

@@ -6,10 +6,11 @@ from planted_model import plant_model
 from small_data import SMALL_NET, write_mesh_tree
 from torch import Tensor, nn
 
+import bpnp
 from bpnp import BPnPNet
 from bpnp.cli import main
 
-CONFIGS = Path(__file__).parents[2] / "configs"
+CONFIGS = Path(bpnp.__file__).parent / "configs"
 RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
 
@@ -32,7 +33,7 @@ def data_for(recipe: str, folder: Path) -> list[str]:
 def test_every_recipe_trains_and_tests(recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.chdir(tmp_path)
-    arguments = [f"--config={CONFIGS / recipe}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
+    arguments = [f"--config={Path(recipe).stem}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
     matcher = "bpnp.models.Matcher" in (CONFIGS / recipe).read_text()
     arguments += ["--model.solver.channels=16", "--model.solver.depth=2"] if matcher else SMALL_NET[1:]
     main(["fit", *arguments, "--trainer.fast_dev_run=true"])
@@ -77,6 +78,6 @@ def test_a_part_is_swapped_in_the_recipe(
 @pytest.mark.parametrize("preset", sorted(path.name for path in (CONFIGS / "presets").glob("*.yaml")))
 def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    configs = [f"--config={CONFIGS / 'quickstart.yaml'}", f"--config={CONFIGS / 'presets' / preset}"]
+    configs = ["--config=quickstart", f"--config=presets/{Path(preset).stem}"]
     arguments = [*configs, *data_for("quickstart", tmp_path), *SMALL_NET[1:]]
     main(["fit", *arguments, f"--trainer.default_root_dir={tmp_path}"])

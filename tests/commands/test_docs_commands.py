@@ -57,7 +57,6 @@ def test_the_commands_run_as_written(
     monkeypatch.setenv("WANDB_MODE", "disabled")
     monkeypatch.chdir(tmp_path)
     plant(tmp_path)  # type: ignore[operator]
-    (tmp_path / "configs").symlink_to(ROOT / "configs")
     (tmp_path / "short.yaml").write_text(yaml.safe_dump(SHORT))
     found = commands(heading)
     assert [words[0] for words in found] in (["prepare", "fit", "test"], ["prepare", "fit", "convert-weights", "test"])

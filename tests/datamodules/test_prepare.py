@@ -13,7 +13,7 @@ import torch
 import trimesh
 from planted_model import plant_model
 
-from bpnp.commands import prepare
+from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule
 from bpnp.datamodules import prepare as preparing
 from bpnp.datamodules.manifest import StoreError, is_store
@@ -263,7 +263,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
     broken = tmp_path / "MegaDepth_v1_SfM" / "0003" / "sparse" / "manhattan" / "0" / "points3D.bin"
     broken.write_bytes(broken.read_bytes()[:-9])
     arguments = [str(tmp_path / "MegaDepth_v1_SfM"), "--output", str(tmp_path / "store"), "--clutter", "0.5"]
-    prepare(["megadepth", *arguments, "--processes", "1", "--min-points", "31"])
+    main(["prepare", "megadepth", *arguments, "--processes", "1", "--min-points", "31"])
     assert "4 scenes, 12 pairs" in capsys.readouterr().out
     (tmp_path / "test.txt").write_text("0005\n\n0001\n")
     options = {"test_scenes": str(tmp_path / "test.txt"), "clutter": 0.4, "eval_max_points": 32, "min_points": 31}

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bpnp.commands import prepare
+from bpnp.cli import main
 from bpnp.datamodules.manifest import StoreError
 from bpnp.datamodules.outliers import Outliers
 from bpnp.datamodules.pair_store import PairStore
@@ -64,7 +64,7 @@ def check(store: PairStore, samples: list[Sample]) -> None:
 def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     samples = [sample(i) for i in range(8)]
     write(tmp_path / "data", samples)
-    prepare(["preprocessed", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
+    main(["prepare", "preprocessed", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
     assert "8 train, 8 test" in capsys.readouterr().out
     store = PairStore(tmp_path / "store")
     check(store, samples)

@@ -191,7 +191,7 @@ def test_hungarian_pairs_lead_to_the_planted_pose() -> None:
 
 
 @pytest.mark.parametrize(
-    "path", sorted((Path(__file__).parents[2] / "configs" / "baselines").glob("*.yaml")), ids=lambda p: p.stem
+    "path", sorted((Path(__file__).parents[2] / "bpnp" / "configs" / "baselines").glob("*.yaml")), ids=lambda p: p.stem
 )
 def test_every_recipe_names_a_solver_and_its_settings(path: Path) -> None:
     from bpnp.table.methods import parse_methods

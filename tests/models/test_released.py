@@ -12,7 +12,7 @@ from lightning import Trainer
 from torch import Tensor, nn
 
 from bpnp import Batch, BPnPNet
-from bpnp.commands import convert_weights
+from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
 from bpnp.models.released import load_released, tensor_maps
 from bpnp.training.task import BlindPnPTask
@@ -146,7 +146,7 @@ def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: b
 def test_convert_weights_writes_our_checkpoint(reference: Released, tmp_path: Path) -> None:
     file, out = tmp_path / "released.pth.tar", tmp_path / "sub" / "out.ckpt"
     torch.save(checkpoint(reference), file)
-    convert_weights([str(file), str(out)])
+    main(["convert-weights", str(file), str(out)])
     assert list(out.parent.iterdir()) == [out]
     (p2, p3), net = pairs()[0], BPnPNet.from_checkpoint(out)
     assert not net.training

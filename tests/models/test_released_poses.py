@@ -13,7 +13,7 @@ from test_released import Released, checkpoint, plan
 from torch import nn
 
 from bpnp import Batch, BPnPNet
-from bpnp.commands import convert_weights
+from bpnp.cli import main
 
 DISTANCE = 4.0
 Array = NDArray[np.float64]
@@ -74,7 +74,7 @@ def test_poses_are_those_of_the_released_pipeline(
 ) -> None:  # fmt: skip
     torch.save(checkpoint(reference), tmp_path / "x.pth.tar")
     out = tmp_path / "out.ckpt"
-    convert_weights([str(tmp_path / "x.pth.tar"), str(out), "--ransac", ransac, "--pnp", pnp])
+    main(["convert-weights", str(tmp_path / "x.pth.tar"), str(out), "--ransac", ransac, "--pnp", pnp])
     reference = Released()
     reference.load_state_dict(torch.load(tmp_path / "x.pth.tar", weights_only=False)["state_dict"])
     reference.double().eval()

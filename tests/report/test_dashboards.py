@@ -1,13 +1,11 @@
-import io
 import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 from report_data import write_run
-from rich.console import Console
 
-from bpnp.report.dashboards import log_results, mode, scalars, wandb_command
+from bpnp.report.dashboards import log_results, mode, scalars
 
 
 @pytest.fixture(autouse=True)
@@ -64,29 +62,3 @@ def test_the_workspace_shows_what_is_logged() -> None:
     metrics = {str(metric) for panel in shown.sections[0].panels[:2] for metric in panel.metrics}
     known = {"rotation_q2_deg", "translation_q2", "reprojection_q2_deg", "recall_joint_15deg_0.5", "found"}
     assert all(any(name in metric for metric in metrics) for name in known)
-
-
-def test_the_command_saves_the_workspace_of_its_project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What would be sent: the panels, to an API that is only pretended."""
-    spaces = pytest.importorskip("wandb_workspaces.workspaces", reason="needs wandb-workspaces")
-    write_run(tmp_path / "run", 9, 0)
-    sent: list[dict[str, object]] = []
-
-    def upsert(workspace: object, *args: object, **kwargs: object) -> object:
-        sent.append(workspace._to_model().model_dump(by_alias=True))  # type: ignore[attr-defined]
-        return workspace
-
-    monkeypatch.setattr(spaces.Workspace, "save", upsert)
-    monkeypatch.setattr(spaces.Workspace, "url", "https://example.org/team/bpnp", raising=False)
-    text = io.StringIO()
-    wandb_command(
-        [str(tmp_path / "run"), "--directory", str(tmp_path / "w"), "--project", "paper", "--workspace", "team"],
-        Console(file=text, width=200),
-    )
-    (view,) = sent
-    assert (view["entity"], view["project"]) == ("team", "paper")
-    shown = json.dumps(view)
-    for name in ("rotation_q2_deg", "true_match_mass", "gradient_norm", "pairs_per_second", "worst_pairs"):
-        assert name in shown
-    assert "saved https://example.org/team/bpnp" in text.getvalue()
-    assert len(list((tmp_path / "w" / "wandb").glob("offline-run-*"))) == 1

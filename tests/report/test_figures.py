@@ -1,13 +1,9 @@
-import io
 from pathlib import Path
 
 import numpy as np
 import pytest
-from matplotlib.image import imread
 from report_data import HOSTILE, view, write_run
-from rich.console import Console
 
-from bpnp.report.commands import report_command, view_command
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
 from bpnp.report.solutions import view_of
 
@@ -73,24 +69,3 @@ def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
     assert path.read_bytes().startswith(heads[suffix])
     with pytest.raises(ValueError, match=r"expected a file name that ends in .png, .svg, .pdf, got 'pair.jpg'"):
         save_figure(plot_pair(view(0, "")), tmp_path / "pair.jpg")
-
-
-def test_commands_write_what_they_say(tmp_path: Path) -> None:
-    write_run(tmp_path / "run", 12, 0)
-    console = Console(file=io.StringIO(), width=120, color_system=None)
-    page, recall = tmp_path / "report.html", tmp_path / "recall.png"
-    with console.capture() as capture:
-        report_command([str(tmp_path / "run"), "--html", str(page), "--recall", str(recall)], console)
-    assert [line for line in capture.get().splitlines() if "wrote" in line] == [f"wrote {page}", f"wrote {recall}"]
-    assert "Pose errors, 12 pairs" in capture.get()
-    assert imread(recall).std() > 0.05
-    with console.capture() as capture:
-        view_command([str(tmp_path / "run"), "script", "--lines", "assigned"], console)
-    written = Path(capture.get().removeprefix("wrote ").rstrip("\n"))
-    assert written.parent == tmp_path / "run" / "test" / "views"
-    assert imread(written).std() > 0.05
-    with pytest.raises(ValueError, match="got 'nothing'; try one of"):
-        view_command([str(tmp_path / "run"), "nothing"], console)
-    (tmp_path / "run" / "test" / "points.npz").unlink()
-    with pytest.raises(ValueError, match=r"expected points.npz in .*run/test, got none"):
-        view_command([str(tmp_path / "run")], console)

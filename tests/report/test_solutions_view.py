@@ -10,14 +10,13 @@ import pytest
 from PIL import Image
 from planted_model import HEIGHT, WIDTH, plant_model
 from report_data import view, write_run
-from rich.console import Console
 
-from bpnp.cli import COMMANDS
+from bpnp.cli import main
 from bpnp.datamodules.colmap.photos import photo_finder
-from bpnp.report import plot_pair, view_command, write_page
+from bpnp.report import plot_pair, write_page
 from bpnp.report.photos import Box, box_of
 from bpnp.report.samples import write_views
-from bpnp.report.solutions import solution_view
+from bpnp.report.solutions import read_solution, solution_view
 
 
 @dataclass
@@ -50,7 +49,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Pat
     content = {name: np.asarray(value).tolist() for name, value in vars(solved()).items()}
     path = tmp_path / "castle.json"
     path.write_text(json.dumps(content))
-    view_command([str(path)], Console(quiet=True))
+    main(["view", str(path)])
     assert (tmp_path / "views" / "castle.png").stat().st_size > 5000
     assert solution_view(Solved(**(vars(solved()) | {"rotation": None}))).estimates["solution"][0].shape == (3, 3)
     for change, message in (
@@ -61,7 +60,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Pat
     ):
         path.write_text(json.dumps(content | change))
         with pytest.raises(ValueError, match=message):
-            view_command([str(path)], Console(quiet=True))
+            read_solution(path)
     for text, message in (
         ("", "JSON of a solution"),
         ("[]", "no points2d"),
@@ -70,7 +69,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Pat
     ):
         path.write_text(text)
         with pytest.raises(ValueError, match=message):
-            view_command([str(path)], Console(quiet=True))
+            read_solution(path)
 
 
 def photographed(folder: Path) -> Any:
@@ -117,7 +116,7 @@ def test_the_page_and_the_figure_carry_the_photo(tmp_path: Path) -> None:
     write_views(tmp_path / "run" / "test", [own, view(1, "castle/none.jpg")])
     plain = write_page([tmp_path / "run"], tmp_path / "plain.html").stat().st_size
     scenes = str(tmp_path / "scenes")
-    COMMANDS["report"]([str(tmp_path / "run"), "--html", str(tmp_path / "r.html"), "--photos", scenes])
+    main(["report", str(tmp_path / "run"), "--html", str(tmp_path / "r.html"), "--photos", scenes])
     text = (tmp_path / "r.html").read_text()
     assert text.count('"jpeg":') == 1
     assert len(text) > plain + 3000

@@ -1,0 +1,27 @@
+"""The commands beside Lightning's own: one typed function each, whose signature and docstring are its options."""
+
+from collections.abc import Callable, Mapping
+
+from bpnp.commands.dashboard import wandb_results
+from bpnp.commands.localizing import localize
+from bpnp.commands.preparing import prepare_megadepth, prepare_modelnet40, prepare_released
+from bpnp.commands.reporting import report, view
+from bpnp.commands.solving import solve
+from bpnp.commands.tables import table
+from bpnp.commands.weights import convert_weights
+
+Command = Callable[..., None]
+COMMANDS: Mapping[str, Command | Mapping[str, Command]] = {
+    "solve": solve,
+    "localize": localize,
+    "report": report,
+    "view": view,
+    "wandb": wandb_results,
+    "table": table,
+    "prepare": {
+        "modelnet40": prepare_modelnet40,
+        "megadepth": prepare_megadepth,
+        "preprocessed": prepare_released,
+    },
+    "convert-weights": convert_weights,
+}

@@ -1,0 +1,107 @@
+"""`bpnp report` and `bpnp view`: results as tables, as a page, as figures."""
+
+import re
+import webbrowser
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from bpnp.commands.output import console, say
+from bpnp.datamodules.colmap.photos import photo_finder
+from bpnp.report.figures import Lines, plot_pair, recall_curve, save_figure
+from bpnp.report.folder import named_runs
+from bpnp.report.page.write import write_page
+from bpnp.report.photos import box_of
+from bpnp.report.samples import PairView, read_views
+from bpnp.report.solutions import read_solution
+from bpnp.report.tables import Paper
+from bpnp.report.tables import report as print_tables
+
+LINES: dict[str, Lines | None] = {"true": "match3d", "assigned": "assigned3d", "none": None}
+
+
+def report(
+    runs: list[Path],
+    *,
+    paper: Paper | None = None,
+    untrained: Path | None = None,
+    html: Path | None = None,
+    photos: Path | None = None,
+    recall: Path | None = None,
+) -> None:
+    """Show results side by side: tables here, and on request a page and recall curves.
+
+    Args:
+        runs: folders that `bpnp test` wrote, or their runs.
+        paper: the paper's rows beneath, for orientation.
+        untrained: results of the untrained weights, to compare.
+        html: write a page that needs no network.
+        photos: the COLMAP scenes, to put the images under the page's 2D views.
+        recall: write the recall curves as .png, .svg or .pdf.
+    """
+    paths = list(named_runs(runs).values())
+    if html is not None:
+        say(write_page(paths, html, paper=paper, photo=None if photos is None else photo_finder(photos)))
+    if recall is not None:
+        say(save_figure(recall_curve(paths), recall))
+    print_tables(paths, console(), paper=paper, untrained=untrained)
+
+
+def view(
+    run: Path,
+    pairs: list[str] | None = None,
+    *,
+    output: Path | None = None,
+    estimate: str | None = None,
+    lines: Literal["true", "assigned", "none"] = "true",
+    photos: Path | None = None,
+    open: bool = False,
+) -> None:
+    """Draw a pair of a test, or a solution: points and cameras in space, and what is seen in the image.
+
+    Args:
+        run: folder that `bpnp test` wrote, or its run; or the JSON of a solution.
+        pairs: name of a pair, or part of it; the worst by default.
+        output: .png, .svg or .pdf; RUN/views/PAIR.png by default.
+        estimate: whose pose reprojects the 3D points; the first by default.
+        lines: which matches to draw.
+        photos: the COLMAP scenes, with the images beside them.
+        open: show the file with the system's viewer.
+    """
+    wanted = pairs or []
+    if output is not None and len(wanted) > 1:
+        raise ValueError(f"expected one pair with --output, got {len(wanted)}; try without --output")
+    if not run.exists():
+        raise ValueError(f"expected the folder of a test or the JSON of a solution, got {run}, which is not there")
+    if run.is_file() and wanted:
+        raise ValueError(f"expected no pair beside the solution {run}, got {wanted[0]!r}")
+    photo = None if photos is None else photo_finder(photos)
+    if run.is_file():
+        views, folder = [read_solution(run)], run.absolute().parent
+    else:
+        (folder,) = named_runs([run]).values()
+        views = chosen_views(folder, wanted)
+    for own in views:
+        name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", own.id) or str(own.index)
+        figure = plot_pair(own, estimate=estimate, lines=LINES[lines], photo=photo and photo(own.id, box_of(own)))
+        written = save_figure(figure, output or folder / "views" / f"{name}.png")
+        say(written)
+        if open:
+            webbrowser.open(written.absolute().as_uri())
+
+
+def chosen_views(folder: Path, wanted: Sequence[str]) -> list[PairView]:
+    """The views of the named pairs; the worst if none is named. Raises ValueError for a name of none or of several."""
+    views = {view.id: view for view in read_views(folder)}
+    if not views:
+        raise ValueError(f"expected points.npz in {folder}, got none; try `bpnp test` again, which keeps points")
+    if not wanted:
+        return [max(views.values(), key=lambda view: view.error)]
+    found = []
+    for name in wanted:
+        named = [id for id in views if id == name] or [id for id in views if name in id]
+        if len(named) != 1:
+            some = ", ".join((named or list(views))[:20])
+            raise ValueError(f"expected the name of one pair kept in {folder}, got {name!r}; try one of {some}")
+        found.append(views[named[0]])
+    return found

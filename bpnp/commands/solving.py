@@ -1,0 +1,93 @@
+"""`bpnp solve`: the pose of a camera from a file of image points and a file of scene points."""
+
+from pathlib import Path
+
+from rich.console import Console
+
+from bpnp.commands.output import console, say
+from bpnp.localization.point_files import read_camera, read_points
+from bpnp.localization.priors import read_prior
+from bpnp.localization.slow_progress import SlowProgress
+from bpnp.localization.solved import solution_table, write_text
+from bpnp.report.figures import SUFFIXES, save_figure
+from bpnp.report.pictures import solution_picture
+from bpnp.solving.solve import solve as find_pose
+
+
+def solve(
+    points2d: Path,
+    points3d: Path,
+    *,
+    camera: str | None = None,
+    output: Path | None = None,
+    picture: Path | None = None,
+    json: bool = False,
+    surface: int | None = None,
+    prior: Path | None = None,
+    prior_degrees: float = 10.0,
+    prior_distance: float | None = None,
+    clutter: float | None = None,
+    solver: str = "search",
+    inlier_threshold: float | None = None,
+    time_limit: float | None = None,
+    seed: int = 0,
+    device: str | None = None,
+) -> None:
+    """Find the pose of a camera from image points and scene points that nobody has matched.
+
+    The verdict is confident, ambiguous (the other candidates fit about as well), or failed: then the pose is a guess.
+    Files: docs/solve.md.
+
+    Args:
+        points2d: .npy, .csv or .txt; pixels with --camera, else x/z y/z.
+        points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb).
+        camera: file with a 3x3 matrix, or COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy.
+        output: write the solution as JSON.
+        picture: draw it as .png, .svg or .pdf.
+        json: print JSON instead of a table.
+        surface: points to draw from a mesh; its vertices by default.
+        prior: rough pose, the JSON of a solution; or a checkpoint.
+        prior_degrees: standard deviation of its rotation.
+        prior_distance: standard deviation of its translation, scene units; unknown by default.
+        clutter: share of the points without a partner, if known.
+        solver: search, or the checkpoint of a BPnPNet.
+        inlier_threshold: largest error of a match, pixels with a camera.
+        time_limit: seconds.
+        seed: of the search.
+        device: such as cuda; cpu by default.
+    """
+    image_points = read_points(points2d)
+    scene_points = read_points(points3d, 3, surface=surface, seed=seed)
+    _prepare(output, picture)
+    with SlowProgress("searching the pose") as progress:
+        solution = find_pose(
+            image_points,
+            scene_points,
+            None if camera is None else read_camera(camera),
+            solver=solver,
+            prior=None if prior is None else read_prior(prior, prior_degrees, prior_distance),
+            inlier_threshold=inlier_threshold,
+            clutter=clutter,
+            seed=seed,
+            time_limit=time_limit,
+            device=device,
+            progress=lambda _, batch, __: progress.describe(f"searching the pose, round {batch}"),
+        )
+    if json:
+        console().print(solution.to_json(), markup=False, highlight=False, soft_wrap=True)
+    else:
+        console().print(solution_table(solution))
+    said = Console(stderr=True) if json else console()
+    if output is not None:
+        say(write_text(output, solution.to_json() + "\n"), to=said)
+    if picture is not None:
+        say(save_figure(solution_picture(solution, title=points2d.stem), picture), to=said)
+
+
+def _prepare(output: Path | None, picture: Path | None) -> None:
+    """Raise before the search where its result could not be written."""
+    if picture is not None and picture.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
+    for path in (output, picture):
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)

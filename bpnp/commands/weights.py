@@ -1,0 +1,45 @@
+"""`bpnp convert-weights`: the authors' released weights as a checkpoint."""
+
+import logging
+from pathlib import Path
+from typing import Any, Literal
+
+import lightning
+import torch
+
+from bpnp.files import written_whole
+from bpnp.models.released import load_released
+from bpnp.training.task import BlindPnPTask
+
+logger = logging.getLogger(__name__)
+
+
+def convert_weights(
+    file: Path,
+    out: Path,
+    *,
+    ransac: Literal["poselib", "opencv"] = "poselib",
+    pnp: Literal["newton", "lbfgs"] = "newton",
+) -> None:
+    """Convert the weights that the authors of BPnPNet released into a checkpoint of bpnp.
+
+    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. Raises ValueError or OSError as
+    `load_released` does, and leaves no file that is half written.
+
+    Args:
+        file: the authors' file, *.pth.tar.
+        out: checkpoint to write, *.ckpt.
+        ransac: backend of the RANSAC step; opencv is the paper's.
+        pnp: solver of the weighted PnP; lbfgs is the paper's.
+    """
+    task = BlindPnPTask(load_released(file, backend=ransac, method=pnp))
+    checkpoint: dict[str, Any] = {
+        "epoch": 0,
+        "global_step": 0,
+        "pytorch-lightning_version": lightning.__version__,
+        "state_dict": task.state_dict(),
+    }
+    task.on_save_checkpoint(checkpoint)
+    with written_whole(out) as temporary:
+        torch.save(checkpoint, temporary)
+    logger.info("wrote %s", out)
