@@ -3,9 +3,11 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from bpnp.search.annealing import Deadline, finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.few.search import is_few, search_few
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -32,11 +34,13 @@ def search_poses(
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
     A the solid angle of the view, by annealing s from starts over all rotations, or around `sets.prior`.
 
+    Few points (`bpnp.search.few`) are enumerated first, and annealed only if that leaves a doubt.
+
     around: where to start instead, if that is no more than a guess from the same points. seed: of all that is random.
     clutter: share of the points without a partner to expect, from 0 to below 1; it is then the only one
         that is tried, which saves time at the end. None for that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
-        depends on the machine. progress: called after each batch.
+        depends on the machine. progress: called after each batch, and with 0 after the enumeration of few points.
 
     With fewer than 4 points of a side, or all bearings or all points on one line or in one place, there are no
     candidates. Raises ValueError for `clutter` out of range.
@@ -44,6 +48,15 @@ def search_poses(
     if clutter is not None and not 0 <= clutter < 1:
         raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
     start, end = time.monotonic(), deadline or Deadline()
+    few = Candidates.none()
+    if is_few(sets) and not end.passed():
+        few, exhausted = search_few(sets, end, settings)
+        result = judged(few, sets, batches=0, exhaustive=True, rule=settings.evidence)
+        if progress is not None:
+            progress(0, time.monotonic() - start)
+        small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
+        if result.verdict == "confident" or exhausted or small:
+            return result
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
@@ -51,6 +64,9 @@ def search_poses(
     known = None if prior is None else scene.enter_prior(prior)
     share = settings.outliers if clutter is None else max(clutter, settings.least_outliers)
     candidates = Candidates.none()
+    if len(few):
+        rotation, translation = scene.enter(few.rotation, few.translation)
+        candidates = replace(few, rotation=rotation, translation=translation)
     batches, stalled, best = 0, 0, -math.inf
     over = False
     while batches < settings.max_batches and not (over or end.passed()):

@@ -111,6 +111,8 @@ class SearchSettings:
 
     max_batches: of starts. starts: a batch; 1200 rotations leave no gap over 25 degrees.
     recipes: of the batches, in turn.
+    least_annealed: points of the smaller side; fewer are only enumerated (`bpnp.search.few`), since the soft assignment
+        of so few has no smooth optimum.
     outliers: share of the points without a partner that the assignment expects where the caller gives none.
     end_outliers: shares that the two best poses are annealed with in the last stage too, and the likelihood chooses.
     least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
@@ -131,6 +133,7 @@ class SearchSettings:
     shaking: Shaking = Shaking()
     refine: RefineSettings = RefineSettings()
     evidence: Evidence = Evidence()
+    least_annealed: int = 12
     outliers: float = 0.3
     end_outliers: tuple[float, ...] = (0.03, 0.6)
     least_outliers: float = 0.02

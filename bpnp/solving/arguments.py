@@ -34,12 +34,12 @@ def device_from(wanted: str | torch.device | None) -> torch.device | None:
     return device
 
 
-def each_set(name: str, values: Any, size: int | None) -> list[Any]:
-    """The arrays of the pairs; one array (n, 3) is shared by all where their number is known."""
+def each_set(name: str, values: Any, size: int | None, axes: int = 2) -> list[Any]:
+    """The arrays of the pairs, of `axes` axes each; one array is shared by all where their number is known."""
     if isinstance(values, (np.ndarray, torch.Tensor)):
-        if values.ndim == 2 and size is not None:
+        if values.ndim == axes and size is not None:
             return [values] * size
-        if values.ndim != 3:
+        if values.ndim != axes + 1:
             raise ValueError(f"expected `{name}` as a sequence of arrays, one a pair, got shape {tuple(values.shape)}")
     try:
         found = list(values)

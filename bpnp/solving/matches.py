@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, linear_sum_assignment
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
@@ -12,17 +12,30 @@ from scipy.spatial.transform import Rotation
 
 Array = npt.NDArray[np.float64]
 Matches = npt.NDArray[np.int64]  # (k, 2): a place in the first set and one in the second
+Allowed = Callable[[npt.NDArray[np.int64], npt.NDArray[np.int64]], npt.NDArray[np.bool_]]
+DENSE = 4096  # pairs up to which all of them are compared
 NEIGHBOURS = 8  # of a point that can be its match; more only where the radius is far too large
 
 
-def one_to_one(image: Array, projected: Array, radius: float) -> Matches:
+def anyone(i: npt.NDArray[np.int64], j: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+    """Every pair of places may be matched."""
+    return np.ones(np.shape(i), np.bool_)
+
+
+def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Matches:
     """As many pairs (i, j) with |image_i - projected_j| <= radius as there can be with no point in two of them (paper
     Eq. 1), and of such sets one with the least sum of squared distances. Ordered by i; NaN is no one's match.
 
-    A minimum-weight matching on the graph of each point's `NEIGHBOURS` nearest, in which leaving an image point out
-    costs more than all distances together.
+    allowed: which pairs, given as places i and j, may be matched. A minimum-weight matching, in which leaving an image
+    point out costs more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
     """
-    pairs, distance = _edges(image, projected, radius)
+    if len(image) * len(projected) <= DENSE:
+        within = _within(image, projected, radius, allowed)
+        cost = np.where(np.isfinite(within), (within / radius) ** 2, min(within.shape) + 2.0)
+        i, j = linear_sum_assignment(cost)
+        real = np.isfinite(within[i, j])
+        return np.stack([i[real], j[real]], -1).astype(np.int64)
+    pairs, distance = _edges(image, projected, radius, allowed)
     if not len(pairs):
         return np.empty((0, 2), np.int64)
     # Only points of an edge take part. Column `count + i` stands for leaving row i out.
@@ -38,17 +51,25 @@ def one_to_one(image: Array, projected: Array, radius: float) -> Matches:
     return np.stack([rows[i[real]], columns[j[real]]], -1).astype(np.int64)
 
 
-def count_one_to_one(image: Array, projected: Array, radius: float) -> int:
+def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:
     """How many pairs `one_to_one` has: a maximum matching, faster than one of least cost."""
-    pairs, _ = _edges(image, projected, radius)
+    if len(image) * len(projected) <= DENSE:
+        return len(one_to_one(image, projected, radius, allowed))
+    pairs, _ = _edges(image, projected, radius, allowed)
     if not len(pairs):
         return 0
     graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
-def mutual_nearest(image: Array, projected: Array, radius: float) -> Matches:
+def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Matches:
     """Pairs within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
+    if len(image) * len(projected) <= DENSE:
+        within = _within(image, projected, radius, allowed)
+        i = np.flatnonzero(np.isfinite(within).any(1))
+        j = within[i].argmin(1)
+        mutual = within[:, j].argmin(0) == i
+        return np.stack([i[mutual], j[mutual]], -1)
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if not len(seen):
         return np.empty((0, 2), np.int64)
@@ -56,7 +77,8 @@ def mutual_nearest(image: Array, projected: Array, radius: float) -> Matches:
     _, backward = cKDTree(image).query(projected[seen])
     i = np.flatnonzero(np.isfinite(distance))
     i = i[backward[forward[i]] == i]
-    return np.stack([i, seen[forward[i]]], -1).astype(np.int64)
+    j = seen[forward[i]]
+    return np.stack([i, j], -1)[allowed(i, j)]
 
 
 def fit_pose(
@@ -79,7 +101,15 @@ def fit_pose(
     return pose(found.x)
 
 
-def _edges(image: Array, projected: Array, radius: float) -> tuple[Matches, Array]:
+def _within(image: Array, projected: Array, radius: float, allowed: Allowed) -> Array:
+    """All distances (m, n), infinite beyond `radius` and for pairs that are not allowed."""
+    distance = np.sqrt(((image[:, None] - projected[None]) ** 2).sum(-1))
+    i, j = np.indices(distance.shape).reshape(2, -1)
+    possible = (distance <= radius) & allowed(i, j).reshape(distance.shape)
+    return np.where(possible, distance, np.inf)
+
+
+def _edges(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Matches, Array]:
     """Pairs within `radius` (e, 2) without repetition, among the nearest of either side, and their distances."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if not len(seen):
@@ -96,4 +126,5 @@ def _edges(image: Array, projected: Array, radius: float) -> tuple[Matches, Arra
         distances.append(distance[own, nth])
     joined, first = np.unique(np.concatenate(pairs), axis=0, return_index=True)
     joined[:, 1] = seen[joined[:, 1]]
-    return joined.astype(np.int64), np.concatenate(distances)[first]
+    possible = allowed(*joined.T)
+    return joined[possible].astype(np.int64), np.concatenate(distances)[first][possible]

@@ -12,6 +12,7 @@ from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.solving.annotations import checked_labels, checked_normals
 
 Array = npt.NDArray[np.float64]
 Unit = Literal["px", "normalised", "rad"]
@@ -31,7 +32,7 @@ class Problem:
     are measured, in `unit`: pixels with a camera, else the normalised image plane, or the unit sphere for bearings.
     points2d: (m, 2) normalised, NaN for a point that has no such coordinates. points3d: (n, 3) as given. origin: where
     solvers put the scene's origin, for scenes so far from it that float32 would lose digits. degenerate: why no pose
-    can follow from these points, if so.
+    can follow from these points, if so. normals3d: (n, 3) unit; labels2d: (k,) and labels3d: (n,), -1 for any.
     """
 
     bearings: Array
@@ -43,6 +44,9 @@ class Problem:
     origin: Array
     camera: Camera | None
     degenerate: str | None
+    normals3d: Array | None = None
+    labels2d: npt.NDArray[np.int64] | None = None
+    labels3d: npt.NDArray[np.int64] | None = None
 
     @cached_property
     def local3d(self) -> Array:
@@ -63,7 +67,24 @@ class Problem:
             moved = np.asarray(prior.translation) + np.asarray(prior.rotation) @ self.origin
             prior = prior._replace(translation=moved)
         floor = None if self.camera is None else FLOOR_PIXELS / self.per_radian
-        return PointSets(self.bearings, self.local3d, floor=floor, prior=prior)
+        return PointSets(
+            self.bearings, self.local3d, self.normals3d, self.labels2d, self.labels3d, floor=floor, prior=prior
+        )
+
+    def view(self, rotation: Array, translation: Array) -> Array:
+        """Where all points are seen (n, d), NaN if they cannot be, or face away."""
+        seen = self.project(rotation, translation, self.local3d)
+        if self.normals3d is not None:
+            camera = self.local3d @ rotation.T + translation
+            seen[((self.normals3d @ rotation.T) * camera).sum(-1) >= 0] = np.nan
+        return seen
+
+    def allowed(self, i: npt.NDArray[np.int64], j: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
+        """Whether usable 2D points i and 3D points j can be partners by their labels."""
+        if self.labels2d is None or self.labels3d is None:
+            return np.ones(len(i), np.bool_)
+        one, other = self.labels2d[i], self.labels3d[j]
+        return (one == other) | (one < 0) | (other < 0)
 
     def project(self, rotation: Array, translation: Array, points: Array) -> Array:
         """Where points (p, 3) around `origin` are seen, in the coordinates of `image`; NaN if they cannot be."""
@@ -76,13 +97,24 @@ class Problem:
         return np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
 
 
-def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: str = "") -> Problem:
+def problem_from(
+    points2d: Any,
+    points3d: Any,
+    camera: Camera | None,
+    *,
+    normals3d: Any = None,
+    labels2d: Any = None,
+    labels3d: Any = None,
+    fewest: int = MIN_POINTS,
+    where: str = "",
+) -> Problem:
     """Check the arrays of one pair.
 
     points2d: (m, 2) pixels with a camera, normalised coordinates or (m, 3) unit bearings without; points3d (n, 3).
-    where: added to the errors, to name the pair. Pixels that cannot be undistorted are left out of `usable`.
-    Raises ValueError that names the argument: wrong shape, swapped, fewer than 4 points, NaN, pixels without a camera
-    or the reverse.
+    fewest: points of each side that fix a pose, 3 where gravity is known. where: added to the errors, to name the pair.
+    Pixels that cannot be undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape,
+    swapped, fewer than `fewest` points, NaN, pixels without a camera or the reverse, normals or labels that do not go
+    with the points.
     """
     given2d, given3d = _numbers("points2d", points2d, where), _numbers("points3d", points3d, where)
     if given2d.ndim == 2 and given2d.shape[1] == 3 and (camera is not None or given3d.shape[-1:] == (2,)):
@@ -91,8 +123,8 @@ def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: 
         )
         wrong = given2d if camera is not None else given3d
         raise ValueError(f"expected {what}{where}, got {wrong.shape} (are points2d and points3d swapped?)")
-    _check_points("points2d", given2d, (2, 3) if camera is None else (2,), where)
-    _check_points("points3d", given3d, (3,), where)
+    _check_points("points2d", given2d, (2, 3) if camera is None else (2,), fewest, where)
+    _check_points("points3d", given3d, (3,), fewest, where)
     if given2d.shape[1] == 3:
         image, unit = _unit(given2d, where), "rad"
         bearings, plane = image, in_front(image)[:, :2]
@@ -102,10 +134,11 @@ def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: 
         rays = np.column_stack([plane, np.ones(len(plane))])
         bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
-    if len(usable) < MIN_POINTS:
+    if len(usable) < fewest:
         raise ValueError(
-            f"expected {MIN_POINTS} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
+            f"expected {fewest} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
         )
+    labels = checked_labels(labels2d, labels3d, (len(given2d), len(given3d)), where)
     return Problem(
         bearings=bearings[usable],
         usable=usable,
@@ -115,7 +148,10 @@ def problem_from(points2d: Any, points3d: Any, camera: Camera | None, *, where: 
         points3d=given3d,
         origin=_origin(given3d),
         camera=camera,
-        degenerate=_degenerate(bearings[usable], given3d),
+        degenerate=_degenerate(bearings[usable], given3d, fewest),
+        normals3d=checked_normals(normals3d, len(given3d), where),
+        labels2d=None if labels is None else labels[0][usable],
+        labels3d=None if labels is None else labels[1],
     )
 
 
@@ -131,16 +167,14 @@ def _numbers(name: str, values: Any, where: str) -> Array:
         raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
 
 
-def _check_points(name: str, points: Array, widths: tuple[int, ...], where: str) -> None:
+def _check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int, where: str) -> None:
     if points.ndim != 2 or points.shape[1] not in widths:
         shapes = " or ".join(f"(k, {width})" for width in widths)
         swapped = points.ndim == 2 and points.shape[1] in (2, 3)
         hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
         raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
-    if len(points) < MIN_POINTS:
-        raise ValueError(
-            f"expected {MIN_POINTS} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose"
-        )
+    if len(points) < fewest:
+        raise ValueError(f"expected {fewest} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
     bad = np.flatnonzero(~np.isfinite(points).all(-1))
     if len(bad):
         raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
@@ -180,11 +214,11 @@ def _origin(points3d: Array) -> Array:
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
 
 
-def _degenerate(bearings: Array, points3d: Array) -> str | None:
+def _degenerate(bearings: Array, points3d: Array, fewest: int) -> str | None:
     for name, points in (("2D", bearings), ("3D", points3d)):
         count = len(np.unique(points, axis=0))
-        if count < MIN_POINTS:
-            return f"only {count} different {name} point{'s' if count > 1 else ''}: {MIN_POINTS} or more fix a pose"
+        if count < fewest:
+            return f"only {count} different {name} point{'s' if count > 1 else ''}: {fewest} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)
     if extents[1] <= FLAT * extents[0]:
         return "the 3D points lie on one line: the camera can turn about it"

@@ -120,7 +120,7 @@ def test_a_rough_pose_saves_batches(problem):
         problem.bearings[:1], problem.points3d[:1], prior=prior, settings=SearchSettings(max_batches=1)
     )
     assert rotation_error(r, problem.rotation[:1]) < 0.5
-    assert stats.iterations.item() == 1
+    assert stats.iterations.item() <= 1
 
 
 def test_gravity_leaves_one_angle(problem):

@@ -9,8 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.search.few.matching import build_grid
-from bpnp.search.few.neighbourhoods import list_triples, orientations, sphere
-from bpnp.search.few.triangles import triangle_table
+from bpnp.search.few.triangles import list_triples, orientations, sphere, triangle_table
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -22,7 +22,7 @@ def sweep(
     against scene triples from `old_scene` on.
 
     Ends after an image triple when the best pose's evidence is `stop` nats, or `budget` hypotheses were solved.
-    scene_triples: triples, sides, frames, middles, orientations of `neighbourhoods`. witnesses: (n, w) near points, of
+    scene_triples: triples, sides, frames, middles, orientations of `triangles`. witnesses: (n, w) near points, of
     which `need` must be matched within `reach` radii for a pose to be looked at further. found: the kept poses.
     Returns the next image triple and the number of hypotheses.
     """

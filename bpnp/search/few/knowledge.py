@@ -34,6 +34,12 @@ class Knowledge:
     log_share: float
 
 
+def pairs_that_fix(prior: Prior | None) -> int:
+    """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
+    turned = isinstance(prior, PosePrior) and prior.rotation_sigma_deg <= TURNED_DEG
+    return 2 if turned or isinstance(prior, GravityPrior) else 3
+
+
 def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) -> Knowledge:
     """The prior, around the centre of the scene and in its unit, and in the frame of the image's rays."""
     directions, place, turned = np.empty((0, 8)), np.array([0, 0, 0, math.inf]), np.zeros(11)
@@ -59,7 +65,7 @@ def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) ->
     allowed = min(SIGMAS * sigma, math.pi)
     log_share = math.log((allowed - math.sin(allowed)) / math.pi)
     return Knowledge(
-        directions, place, turned, upright, 2 if prior.rotation_sigma_deg <= TURNED_DEG else 3, log_share
+        directions, place, turned, upright, pairs_that_fix(prior), log_share
     )  # fmt: skip
 
 

@@ -29,8 +29,9 @@ class FewSettings(NamedTuple):
     stages: what is tried, one after the other; those of two pairs only where a prior lets two pairs fix a pose.
     kept: distinct poses. witnesses: near points that reject a pose first. other_deg: poses farther apart answer
     differently. safe: nats beyond chance and ahead of any other pose at which the search ends at once; after
-    `patience` hypotheses none are asked for. look, chunk: hypotheses between looks at the best pose, when it exceeds
-    chance and before. most: hypotheses in all. widest: radii within which points are matched to a predicted pose.
+    `patience` hypotheses none are asked for, and after twice as many it ends with any pose that exceeds chance. look,
+    chunk: hypotheses between looks at the best pose, when it exceeds chance and before. most: hypotheses in all.
+    widest: radii within which points are matched to a predicted pose.
     """
 
     stages: tuple[Stage, ...] = (
@@ -43,7 +44,7 @@ class FewSettings(NamedTuple):
     witnesses: int = 10
     other_deg: float = 10.0
     safe: float = math.log(1e6)
-    patience: int = 30_000
+    patience: int = 25_000
     look: int = 3_000
     chunk: int = 20_000
     most: int = 200_000
@@ -116,7 +117,8 @@ def enumerate_poses(
         run.vary_best()
         found = _found(run, exhausted=False)
         needed = settings.safe * (1 - run.solved / settings.patience)
-        return found if margin(found, settings) >= needed and (is_safe is None or is_safe(found)) else None
+        doubtful = margin(found, settings) < needed or not (is_safe is None or is_safe(found))
+        return None if doubtful and run.solved < 2 * settings.patience else found
 
     if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
         run.refine(run.enter(np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)), lookup)

@@ -1,0 +1,69 @@
+"""The enumeration as a search: candidates with their likelihood, and an end when the verdict on them is certain."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.annealing import Deadline
+from bpnp.search.candidates import Candidates
+from bpnp.search.few.knowledge import pairs_that_fix
+from bpnp.search.few.poses import FewPoses, enumerate_poses
+from bpnp.search.point_sets import PointSets, solid_angle
+from bpnp.search.settings import SearchSettings
+from bpnp.search.verdict import is_certain, weighed
+
+Array = NDArray[np.float64]
+FEW_PAIRS = 4000  # pairs of an image point and a scene point up to which near triples are enumerated: 60 x 60
+KNOWN_PAIRS = 250_000  # the same where a prior lets two pairs fix a pose
+FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels where that is a tenth of one
+RADIUS = 3e-3  # radians, where no scale is known
+NEAR_NATS = 25.0  # of evidence: a pose that has so much less than the best is no rival
+
+
+def is_few(sets: PointSets) -> bool:
+    """Whether the points have so few hypotheses that they are enumerated."""
+    pairs = len(sets.bearings) * len(sets.points3d)
+    return pairs <= (FEW_PAIRS if pairs_that_fix(sets.prior) == 3 else KNOWN_PAIRS)
+
+
+def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
+    """Candidates in the user's coordinates, likeliest first, and whether every hypothesis was tried."""
+
+    def is_safe(found: FewPoses) -> bool:
+        candidates = weighed(_candidates(found, sets, settings), sets, settings.evidence)
+        return is_certain(candidates, sets, settings.evidence, exhaustive=True)
+
+    radius = RADIUS if sets.floor is None else FLOORS * sets.floor
+    found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe)
+    return _candidates(found, sets, settings), found.exhausted
+
+
+def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
+    """The poses that are not far less likely than the best one; scale and likelihood as the annealing defines them."""
+    rivals = found.evidence >= (found.evidence.max() if len(found.evidence) else 0.0) - NEAR_NATS
+    rivals &= np.arange(len(rivals)) < settings.kept
+    rotation, translation, residual = (x[rivals] for x in (found.rotation, found.translation, found.residual))
+    count = np.isfinite(residual).sum(-1)
+    free = np.maximum(2 * count - 2 * found.used, 1)  # numbers that were measured, less those that were fitted
+    scale = np.sqrt(np.where(np.isfinite(residual), residual, 0.0) ** 2 @ np.ones(len(sets.bearings)) / free)
+    scale = np.maximum(scale, sets.floor or 1e-5)
+    return Candidates(
+        rotation=rotation,
+        translation=translation,
+        score=_log_likelihood(sets, rotation, translation, scale, settings.outliers),
+        matched=count / min(len(sets.bearings), len(sets.points3d)),
+        scale=scale,
+        hits=np.zeros(len(rotation), np.int64),
+        log10_false_alarms=np.full(len(rotation), math.nan),
+    )
+
+
+def _log_likelihood(sets: PointSets, rotation: Array, translation: Array, scale: Array, outliers: float) -> Array:
+    """Mean log-likelihood of the bearings under the mixture of `search_poses`, for each pose (c,), nats."""
+    camera = sets.points3d @ rotation.transpose(0, 2, 1) + translation[:, None]
+    seen = camera / np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
+    variance = (scale**2)[:, None, None]
+    exponent = (np.einsum("mk,cnk->cmn", sets.bearings, seen) - 1) / variance
+    density = (np.exp(exponent) / (2 * math.pi * variance)).sum(-1) * (1 - outliers) / len(sets.points3d)
+    return np.asarray(np.log(density + outliers / solid_angle(sets.bearings)).mean(-1))

@@ -1,0 +1,122 @@
+"""From what a search found to a `Solution`: a last fit, matches, and the inliers of every candidate."""
+
+import math
+import time
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from bpnp.geometry import MIN_POINTS
+from bpnp.search.verdict import SearchResult
+from bpnp.solving.matches import count_one_to_one, fit_pose, mutual_nearest, one_to_one
+from bpnp.solving.problem import Array, Problem
+from bpnp.solving.solution import Candidate, Solution, SolutionStats, no_pose
+
+SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
+FIT_ROUNDS = 5
+SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
+
+
+def finished(
+    problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None, dropped: int
+) -> Solution:
+    """Matches, a last fit to them, and the inliers of every candidate."""
+    start, found = time.perf_counter(), result.candidates
+    if not len(found):
+        return without_pose(problem, result.reason, inlier_threshold, dropped)
+    threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+    rotation, translation = _fitted(problem, *result.best, threshold)
+    projected = problem.view(rotation, translation)
+    matches = one_to_one(problem.image, projected, threshold, problem.allowed)
+    counts = [len(matches)] + [
+        count_one_to_one(problem.image, problem.view(r, t), threshold, problem.allowed)
+        for r, t in zip(found.rotation[1:], found.translation[1:], strict=True)
+    ]
+    rotations = [rotation, *found.rotation[1:]]
+    translations = [
+        t - r @ problem.origin for r, t in zip(rotations, [translation, *found.translation[1:]], strict=True)
+    ]
+    error, error_deg = _errors(problem, rotation, translation, projected, matches)
+    return Solution(
+        rotation=rotation,
+        translation=translations[0],
+        matches=np.stack([problem.usable[matches[:, 0]], matches[:, 1]], -1),
+        inlier_count=len(matches),
+        inlier_ratio=len(matches) / min(len(problem.points2d), len(problem.points3d)),
+        inlier_threshold=threshold,
+        reprojection_error=error,
+        reprojection_error_deg=error_deg,
+        unit=problem.unit,
+        candidates=tuple(
+            Candidate(*values)
+            for values in zip(
+                rotations, translations, found.score.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
+            )
+        ),
+        verdict=result.verdict,
+        reason=result.reason,
+        log10_false_alarms=result.log10_false_alarms,
+        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", dropped),
+        seconds=seconds + time.perf_counter() - start,
+        points2d=problem.points2d,
+        points3d=problem.points3d,
+    )
+
+
+def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:
+    """Least squares on mutually nearest pairs, where that explains them significantly better than the search's pose.
+
+    The search weighs all pairs by their probability, which is the better estimate unless its steps in float32 were too
+    coarse for the data. At an optimum of the same precision n log(S / S_min), S the sum of n squared residuals, is
+    distributed as chi-squared with 6 degrees of freedom.
+    """
+    for _ in range(FIT_ROUNDS):
+        pairs = mutual_nearest(problem.image, problem.view(rotation, translation), threshold, problem.allowed)
+        if len(pairs) < MIN_POINTS:
+            break
+        target, points = problem.image[pairs[:, 0]], problem.local3d[pairs[:, 1]]
+        project = partial(problem.project, points=points)
+        trial = fit_pose(project, target, rotation, translation, scale=threshold)
+        before, after = (float(((project(*pose) - target) ** 2).sum()) for pose in ((rotation, translation), trial))
+        if not before > after * math.exp(SIGNIFICANT / target.size):
+            break
+        rotation, translation = trial
+    return rotation, translation
+
+
+def _errors(
+    problem: Problem, rotation: Array, translation: Array, projected: Array, matches: Any
+) -> tuple[float, float]:
+    """Mean reprojection error of the matches, in the problem's unit and in degrees; NaN without a match."""
+    if not len(matches):
+        return math.nan, math.nan
+    i, j = matches.T
+    distance = np.linalg.norm(problem.image[i] - projected[j], axis=-1)
+    camera = problem.local3d[j] @ rotation.T + translation
+    sine = np.linalg.norm(np.cross(problem.bearings[i], camera), axis=-1)
+    angle = np.degrees(np.arctan2(sine, (problem.bearings[i] * camera).sum(-1)))
+    return float(distance.mean()), float(angle.mean())
+
+
+def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, dropped: int) -> Solution:
+    rotation, translation = no_pose()
+    return Solution(
+        rotation=rotation,
+        translation=translation,
+        matches=np.empty((0, 2), np.int64),
+        inlier_count=0,
+        inlier_ratio=0.0,
+        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
+        reprojection_error=math.nan,
+        reprojection_error_deg=math.nan,
+        unit=problem.unit,
+        candidates=(),
+        verdict="failed",
+        reason=reason,
+        log10_false_alarms=math.inf,
+        stats=SolutionStats(dropped2d=dropped),
+        seconds=0.0,
+        points2d=problem.points2d,
+        points3d=problem.points3d,
+    )
