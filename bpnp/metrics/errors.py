@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from bpnp.geometry import angle_between, bearings, camera_centre, is_finite, rotation_angle, transform
@@ -69,7 +69,6 @@ def reprojection_error(
     points2d: Float[Tensor, "b m 2"],
     points3d: Float[Tensor, "b n 3"],
     match3d: Int[Tensor, "b n"],
-    mask3d: Bool[Tensor, "b n"] | None = None,
 ) -> Float[Tensor, " b"]:
     """Mean angle in degrees between f_i and R p_j + t over the true pairs i = match3d[j] >= 0.
 
@@ -77,7 +76,7 @@ def reprojection_error(
     and does not depend on the sizes of the sets. A point at the camera centre counts as 180. A sample without a pose
     is 180; else a sample without a true pair is NaN.
     """
-    true = (match3d >= 0) if mask3d is None else (match3d >= 0) & mask3d
+    true = match3d >= 0
     seen = points2d.double().gather(1, match3d.clamp(min=0).unsqueeze(-1).expand(-1, -1, 2))
     points = transform(rotation.double(), translation.double(), points3d.double())
     angle = angle_between(bearings(seen), points).where((points != 0).any(-1), math.pi)
@@ -99,8 +98,7 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
     translation = pose.translation.where(pose.found[:, None], math.nan)
     reprojection = torch.full_like(translation[:, 0], math.nan, dtype=torch.float64)
     if batch.match3d is not None:
-        points = (batch.points2d, batch.points3d, batch.match3d, batch.mask3d)
-        reprojection = reprojection_error(rotation, translation, *points)
+        reprojection = reprojection_error(rotation, translation, batch.points2d, batch.points3d, batch.match3d)
     return PoseErrors(
         rotation_deg=rotation_error(rotation, batch.rotation),
         translation=translation_error(translation, batch.translation),

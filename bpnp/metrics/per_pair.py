@@ -11,14 +11,15 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from bpnp.metrics.errors import PoseErrors, pose_errors
-from bpnp.types import Batch, Pose
+from bpnp.metrics.errors import PoseErrors
+
+NO_PAIR = "expected at least one pair, got none; try update() before compute()"
 
 
 def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
     """Name, unit and values of each error that at least one pair has."""
     if len(errors.rotation_deg) == 0:
-        raise ValueError("expected at least one pair, got none; try update() before compute()")
+        raise ValueError(NO_PAIR)
     for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
         error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
         known = error[~error.isnan()].double()
@@ -53,7 +54,9 @@ class PairMetric(Metric):
 
     def _columns(self) -> tuple[Tensor, ...]:
         """The columns so far, with the first occurrence of each pair."""
-        records = dim_zero_cat(self.records) if len(self.records) else torch.empty(0, self.width + 1)
+        records = dim_zero_cat(self.records)
+        if len(records) == 0:
+            raise ValueError(NO_PAIR)
         values, index = records[:, :-1], records[:, -1]
         order = torch.argsort(index, stable=True)
         again = index[order].diff() == 0  # never true of NaN, the index of pairs that have none
@@ -71,16 +74,14 @@ class PoseMetric(PairMetric):
 
     width = 4
 
-    def update(self, pose: Pose | PoseErrors, batch: Batch | None = None) -> None:
-        """Add a batch's poses, or errors computed before (all of them are counted if their index is None)."""
-        if isinstance(pose, Pose):
-            if batch is None:
-                raise ValueError("expected the `batch` that the pose belongs to, got None; or give PoseErrors")
-            pose = pose_errors(pose, batch)
-        self._append(pose.rotation_deg, pose.translation, pose.centre, pose.reprojection_deg, index=pose.index)
+    def update(self, errors: PoseErrors) -> None:
+        """Add the errors of a batch; all of them are counted if their index is None."""
+        self._append(
+            errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg, index=errors.index
+        )
 
     def errors(self) -> PoseErrors:
-        """The errors so far, each pair once: its first occurrence."""
+        """The errors so far, each pair once."""
         return PoseErrors(*self._columns())
 
 
@@ -101,7 +102,4 @@ class MeanOverPairs(PairMetric):
         self._append(values, index=index)
 
     def compute(self) -> Float[Tensor, ""]:
-        (values,) = self._columns()
-        if len(values) == 0:
-            raise ValueError("expected at least one pair, got none; try update() before compute()")
-        return values.mean()
+        return self._columns()[0].mean()

@@ -4,8 +4,9 @@ A pair without a pose counts as 180 deg and infinity. A pair without a true matc
 out of the reprojection quartiles only, and counted as "without_true_pairs".
 """
 
+import math
+
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from bpnp.metrics.errors import PoseErrors
@@ -19,30 +20,23 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
     with a pose; "without_true_pairs", the number of pairs without a reprojection error. Linear interpolation between
     order statistics (numpy's default); a quartile that leans on an infinite neighbour is infinite. The reprojection
     quartiles are absent if no pair has that error. Raises ValueError if there is no pair.
-
-    >>> errors = PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]]))
-    >>> float(pose_quartiles(errors)["rotation_q2_deg"])
-    3.0
     """
     values: dict[str, Tensor] = {}
     for name, unit, error in known_errors(errors):
-        keys = (f"{name}_q{number}_{unit}".rstrip("_") for number in (1, 2, 3))
-        values.update(zip(keys, _quartiles(error), strict=True))
+        ordered = error.sort().values
+        for number in (1, 2, 3):
+            position = number / 4 * (len(ordered) - 1)
+            below, above = ordered[math.floor(position)], ordered[math.ceil(position)]
+            # Between two infinities the interpolation is NaN.
+            value = torch.lerp(below, above, position % 1).where(above.isfinite(), above)
+            values[f"{name}_q{number}_{unit}".rstrip("_")] = value
     values["found"] = errors.translation.isfinite().double().mean()
     values["without_true_pairs"] = errors.reprojection_deg.isnan().double().sum()
     return values
 
 
-def _quartiles(values: Float[Tensor, " k"]) -> Float[Tensor, " 3"]:
-    ordered = values.sort().values
-    position = torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64, device=values.device) * (len(values) - 1)
-    below, above = ordered[position.floor().long()], ordered[position.ceil().long()]
-    # Between two infinities the interpolation is NaN.
-    return torch.lerp(below, above, position.frac()).where(above.isfinite(), above)
-
-
 class PoseQuartiles(PoseMetric):
-    """Quartiles of the pose errors over all pairs, as `pose_quartiles` returns them.
+    """`pose_quartiles` over all pairs.
 
     >>> metric = PoseQuartiles()
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))

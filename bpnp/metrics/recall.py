@@ -14,7 +14,6 @@ from bpnp.metrics.errors import PoseErrors
 from bpnp.metrics.per_pair import PoseMetric, known_errors
 
 Limits = Sequence[float | int]
-JointLimits = Sequence[tuple[float | int, float | int]]
 
 
 @dataclass(frozen=True)
@@ -25,7 +24,7 @@ class RecallThresholds:
     translation: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
     centre: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
     reprojection_deg: Limits = (0.25, 0.5, 1.0, 2.0)
-    joint: JointLimits = ((15.0, 0.5), (10.0, 1.0))
+    joint: Sequence[tuple[float | int, float | int]] = ((15.0, 0.5), (10.0, 1.0))
 
     def __post_init__(self) -> None:
         given = (self.rotation_deg, self.translation, self.centre, self.reprojection_deg, *self.joint)
@@ -38,11 +37,6 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
 
     Keys: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5", "recall_reprojection_1deg", and
     "recall_joint_15deg_0.5" for rotation and translation both. Raises ValueError if there is no pair.
-
-    >>> import torch
-    >>> errors = PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]]))
-    >>> round(float(pose_recalls(errors)["recall_rotation_2deg"]), 3)
-    0.333
     """
     thresholds = thresholds or RecallThresholds()
     values: dict[str, Tensor] = {}
@@ -56,13 +50,9 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
 
 
 class PoseRecall(PoseMetric):
-    """Recall at error thresholds over all pairs, as `pose_recalls` returns them.
+    """`pose_recalls` over all pairs.
 
-    Args:
-        rotation_deg, translation, centre, reprojection_deg, joint: as in `RecallThresholds`.
-
-    >>> import torch
-    >>> metric = PoseRecall(rotation_deg=(4,))
+    >>> metric = PoseRecall(RecallThresholds(rotation_deg=(4,)))
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
     >>> round(float(metric.compute()["recall_rotation_4deg"]), 3)
     0.667
@@ -70,18 +60,9 @@ class PoseRecall(PoseMetric):
 
     higher_is_better = True
 
-    def __init__(
-        self,
-        *,
-        rotation_deg: Limits = RecallThresholds.rotation_deg,
-        translation: Limits = RecallThresholds.translation,
-        centre: Limits = RecallThresholds.centre,
-        reprojection_deg: Limits = RecallThresholds.reprojection_deg,
-        joint: JointLimits = RecallThresholds.joint,
-        **kwargs: Any,
-    ) -> None:
+    def __init__(self, thresholds: RecallThresholds | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
-        self.thresholds = RecallThresholds(rotation_deg, translation, centre, reprojection_deg, joint)
+        self.thresholds = thresholds
 
     def compute(self) -> dict[str, Tensor]:
         return pose_recalls(self.errors(), self.thresholds)

@@ -4,12 +4,13 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
+from bpnp.models.composition import AnyModule, chosen
 from bpnp.models.evaluation import Refinement, match_again, round_widths
 from bpnp.models.nets.features import ImageFeatures, SceneFeatures
 from bpnp.models.pose_head import pnp_pose, ransac_pose
@@ -46,21 +47,21 @@ class BPnPNet(TrainedNet):
 
     def __init__(
         self,
-        features2d: ImageFeatures | nn.Module | None = None,
-        features3d: SceneFeatures | nn.Module | None = None,
-        transport: Sinkhorn | nn.Module | None = None,
-        ransac: RansacPnP | nn.Module | None = None,
-        pnp: WeightedPnP | nn.Module | None = None,
+        features2d: ImageFeatures | AnyModule | None = None,
+        features3d: SceneFeatures | AnyModule | None = None,
+        transport: Sinkhorn | AnyModule | None = None,
+        ransac: RansacPnP | AnyModule | None = None,
+        pnp: WeightedPnP | AnyModule | None = None,
         *,
         refinement: Refinement | None = None,
         rounds: int = 0,
     ) -> None:
         super().__init__()
-        self.features2d = ImageFeatures() if features2d is None else features2d
-        self.features3d = SceneFeatures() if features3d is None else features3d
-        self.transport = Sinkhorn() if transport is None else transport
-        self.ransac = RansacPnP() if ransac is None else ransac
-        self.pnp = WeightedPnP() if pnp is None else pnp
+        self.features2d = chosen(features2d, ImageFeatures)
+        self.features3d = chosen(features3d, SceneFeatures)
+        self.transport = chosen(transport, Sinkhorn)
+        self.ransac = chosen(ransac, RansacPnP)
+        self.pnp = chosen(pnp, WeightedPnP)
         self.refinement = Refinement() if refinement is None else refinement
         self.rounds = rounds
         self.widths = round_widths(rounds, self.ransac)

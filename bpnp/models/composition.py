@@ -7,11 +7,27 @@ and numbers only. Building one imports nothing: the classes are looked up by nam
 
 import inspect
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 from torch import nn
 
 PLAIN = (bool, int, float, str, type(None))
+
+
+@runtime_checkable
+class AnyModule(Protocol):
+    """The type of an option that takes any `nn.Module`: the help of `nn.Module` itself would list all of torch's."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any: ...
+
+
+def chosen(given: AnyModule | None, default: type[nn.Module]) -> nn.Module:
+    """The module that was given, or the default class with its default options."""
+    if given is None:
+        return default()
+    if not isinstance(given, nn.Module):
+        raise ValueError(f"expected a module, got {given!r:.80}; try a subclass of torch.nn.Module")
+    return given
 
 
 def described(module: nn.Module) -> dict[str, Any]:

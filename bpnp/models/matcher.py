@@ -13,6 +13,7 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.models.composition import AnyModule, chosen
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.nets.normalisation import centred
@@ -63,8 +64,8 @@ class Matcher(TrainedNet):
         neighbours: int = 8,
         mu: float = 0.1,
         tolerance: float = 1e-6,
-        ransac: RansacPnP | nn.Module | None = None,
-        pnp: WeightedPnP | nn.Module | None = None,
+        ransac: RansacPnP | AnyModule | None = None,
+        pnp: WeightedPnP | AnyModule | None = None,
         refinement: Refinement | None = None,
     ) -> None:
         super().__init__()
@@ -84,8 +85,8 @@ class Matcher(TrainedNet):
         self.leave = nn.Linear(channels, 1)
         self.bin_cost = nn.Parameter(torch.ones(()))
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))
-        self.ransac = RansacPnP() if ransac is None else ransac
-        self.pnp = WeightedPnP() if pnp is None else pnp
+        self.ransac = chosen(ransac, RansacPnP)
+        self.pnp = chosen(pnp, WeightedPnP)
         self.refinement = Refinement() if refinement is None else refinement
 
     @property

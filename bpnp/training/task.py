@@ -11,11 +11,11 @@ from torch import Tensor, nn
 from torchmetrics import MetricCollection
 
 from bpnp.layers.implicit import BackwardStats
-from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall
+from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.models.composition import described
+from bpnp.models.composition import AnyModule, chosen, described
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.weights import check_solver, solver_state
+from bpnp.models.weights import TrainedNet, check_solver, solver_state
 from bpnp.training.losses import RELEASED_BOUNDS
 from bpnp.training.supervision import Losses, MatchingLoss, correspondence_losses, matching_losses, pose_losses
 from bpnp.types import Batch, Prediction
@@ -51,7 +51,7 @@ class BlindPnPTask(LightningModule):
 
     def __init__(
         self,
-        solver: nn.Module | None = None,
+        solver: TrainedNet | AnyModule | None = None,
         *,
         learning_rate: float = 1e-5,
         weight_decay: float = 0.0,
@@ -64,7 +64,7 @@ class BlindPnPTask(LightningModule):
         refine_validation: bool = False,
     ) -> None:
         super().__init__()
-        self.solver = BPnPNet() if solver is None else solver
+        self.solver = chosen(solver, BPnPNet)
         self.learning_rate = learning_rate
         self.weight_decay = weight_decay
         self.pose_weight = pose_weight
@@ -126,13 +126,14 @@ class BlindPnPTask(LightningModule):
         values = pose_losses(pose, batch, bounds=self.pose_bounds)
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
-    def on_after_backward(self) -> None:
-        """The share of this step's samples whose gradient a layer could not solve for."""
+    def on_train_epoch_end(self) -> None:
+        """The share of the epoch's samples whose gradient a layer could not solve for."""
         stats = [module.backward_stats for module in self.solver.modules() if hasattr(module, "backward_stats")]
         counts = [each for each in stats if isinstance(each, BackwardStats)]
         samples = sum(each.samples for each in counts)
         if samples:
-            self._log_train(backward_failed=sum(each.unconverged for each in counts) / samples)
+            share = sum(each.unconverged for each in counts) / samples
+            self.log("train/backward_failed", share, on_epoch=True, sync_dist=True)
         for each in counts:
             each.reset()
 
@@ -177,7 +178,7 @@ class BlindPnPTask(LightningModule):
         with refinement_enabled(self.solver, stage == "test" or self.refine_validation):
             prediction, seconds = self._timed(batch)
         for name in self.estimates[stage]:
-            self._pose_metrics(stage, name).update(prediction.poses[name], batch)
+            self._pose_metrics(stage, name).update(pose_errors(prediction.poses[name], batch))
         losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
             self._loss_metric(stage).update(losses, batch.index)

@@ -9,9 +9,9 @@ import pytest
 import torch
 import yaml
 from planted_model import plant_model
+from released_network import Released, checkpoint
+from released_pickles import sample, write
 from small_data import SMALL_NET, write_mesh_tree
-from test_preprocessed import sample, write
-from test_released import Released, checkpoint
 
 from bpnp.cli import main
 

@@ -13,6 +13,7 @@ from bpnp.metrics import (
     PoseQuartiles,
     PoseRecall,
     RecallThresholds,
+    pose_errors,
     pose_quartiles,
     pose_recalls,
 )
@@ -31,7 +32,7 @@ def select(errors: PoseErrors, rows: list[int]) -> PoseErrors:
 
 def test_metrics_over_batches_are_the_functions_over_everything() -> None:
     errors = random_errors(0, 23)
-    metrics = MetricCollection([PoseQuartiles(), PoseRecall(rotation_deg=(4, 8), joint=[(15, 5)])])
+    metrics = MetricCollection([PoseQuartiles(), PoseRecall(RecallThresholds(rotation_deg=(4, 8), joint=[(15, 5)]))])
     for rows in (range(0, 10), range(10, 20), range(20, 23)):
         metrics.update(select(errors, list(rows)))
     values = metrics.compute()
@@ -45,13 +46,13 @@ def test_metrics_over_batches_are_the_functions_over_everything() -> None:
     assert metrics.compute()["rotation_q1_deg"] == errors.rotation_deg[3]
 
 
-def test_a_metric_takes_poses_without_keeping_their_graph() -> None:
+def test_a_metric_does_not_keep_the_graph_of_the_errors() -> None:
     points2d, points3d = torch.zeros(2, 5, 2), torch.ones(2, 5, 3)
     batch = Batch.from_arrays(points2d, points3d, torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))
     translation = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, math.nan]]).requires_grad_()
     stats = SolveStats(torch.ones(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
     metric = PoseQuartiles()
-    metric.update(Pose(torch.eye(3).expand(2, 3, 3), translation, stats), batch)
+    metric.update(pose_errors(Pose(torch.eye(3).expand(2, 3, 3), translation, stats), batch))
     assert not metric.records[0].requires_grad
     values = metric.compute()
     assert (values["found"], values["rotation_q2_deg"]) == (0.5, 90)

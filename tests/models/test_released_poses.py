@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from released_network import Released, checkpoint, plan
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
-from test_released import Released, checkpoint, plan
 from torch import nn
 
 from bpnp import Batch, BPnPNet

@@ -4,8 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from lightning import Trainer
-from planted import plant
+from lightning import Callback, Trainer
 from small_data import SMALL_MESHES, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -92,20 +91,28 @@ def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("kind", ["BPnPNet", "Matcher"])
-def test_gradients_that_a_layer_could_not_solve_for_are_counted_step_by_step(
-    kind: str, monkeypatch: pytest.MonkeyPatch
+def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the_epoch(
+    kind: str, tmp_path: Path
 ) -> None:
     solver = small_net() if kind == "BPnPNet" else Matcher(channels=8, depth=1, heads=2)
-    task, logged = BlindPnPTask(solver), []
-    monkeypatch.setattr(task, "log_dict", lambda values, **_: logged.append(values))
-    batch = plant(4, 12, dtype=torch.float32).batch()
+    task, shares = BlindPnPTask(solver), []
     counts = solver.transport.backward_stats if kind == "BPnPNet" else solver.backward_stats
-    for failed in (0, 3):
-        task.losses(solver.match(batch), batch).total.mean().backward()
-        assert counts.samples == 4  # of this step alone
-        counts.unconverged += failed
-        task.on_after_backward()
-    assert logged == [{"train/backward_failed": 0.0}, {"train/backward_failed": 0.75}]
+
+    class Failing(Callback):
+        """Three samples of the first epoch fail."""
+
+        def on_train_batch_end(self, trainer: Trainer, task: BlindPnPTask, *_: object) -> None:
+            counts.unconverged += 1 if trainer.current_epoch == 0 else 0
+
+        def on_train_epoch_start(self, trainer: Trainer, task: BlindPnPTask) -> None:
+            assert counts.samples == counts.unconverged == 0
+            shares.append(trainer.callback_metrics.get("train/backward_failed"))
+
+    run = trainer(tmp_path, max_epochs=2, limit_train_batches=3, limit_val_batches=0, enable_checkpointing=False,
+                  callbacks=[Failing()])  # fmt: skip
+    run.fit(task, datamodule=data(tmp_path))
+    assert shares == [None, 3 / 12]
+    assert run.callback_metrics["train/backward_failed"] == 0
 
 
 def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path) -> None:
