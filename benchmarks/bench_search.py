@@ -16,21 +16,19 @@ import numpy as np
 import pandas as pd
 import torch
 
-from bpnp.datamodules import ColmapDataModule, MeshDataModule
-from bpnp.datamodules.loader import PairSource
-from bpnp.datamodules.outliers import Outliers
+from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
+from bpnp.datamodules.loader import PairDataset
 from bpnp.geometry import bearings
 from bpnp.metrics.errors import rotation_error, translation_error
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
-from bpnp.types import Batch
 
 EVERYTHING = 1e6
 
 
-def source(name: str, data: Path, limit: int) -> PairSource:
+def source(name: str, data: Path, limit: int) -> PairDataset:
     """The pairs of a set."""
     if name.startswith("psb"):
         rho = 0.0 if name in ("psb", "psb-so3") else float(name.removeprefix("psb-"))
@@ -48,18 +46,17 @@ def source(name: str, data: Path, limit: int) -> PairSource:
         ratio = EVERYTHING if clutter == "all" else float(clutter or 0)
         module = ColmapDataModule(str(data / "colmap" / scene), test_fraction=1.0, rotate=True, clutter=ratio, seed=1)
     module.setup("test")
-    return module.sources["test"]
+    return module.datasets["test"]
 
 
 def run(
     name: str, data: Path, limit: int, seed: int, settings: SearchSettings, time_limit: float | None = None
 ) -> list[dict]:
     pairs = source(name, data, limit)
-    count = len(pairs.sizes)
+    count = len(pairs)
     rows = []
     for i in sorted({int(k * count / limit) for k in range(limit)}) if count > limit else range(count):
-        pair = pairs.pair(i, 0)
-        batch = Batch.from_arrays(pair.points2d, pair.points3d, pair.rotation, pair.translation)
+        batch = pairs.pair(i)
         start, cpu = time.perf_counter(), time.process_time()
         found = search_poses(
             PointSets(bearings(batch.points2d)[0].double().numpy(), batch.points3d[0].double().numpy()),
@@ -73,7 +70,7 @@ def run(
         turn, shift = (torch.as_tensor(values)[None] for values in found.best)
         rows.append(
             {
-                "pair": pair.name,
+                "pair": batch.ids[0],
                 "rotation_deg": float(rotation_error(turn, batch.rotation.double())),
                 "translation": float(translation_error(shift, batch.translation.double())),
                 "verdict": found.verdict,
@@ -83,7 +80,7 @@ def run(
                 "batches": found.batches,
                 "seconds": seconds,
                 "cpu_seconds": cpu,
-                "points": [len(pair.points2d), len(pair.points3d)],
+                "points": [int(batch.count2d), int(batch.count3d)],
             }
         )
     return rows

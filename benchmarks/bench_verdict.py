@@ -46,10 +46,9 @@ def shuffled(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tupl
     for size in SHUFFLED_SIZES:
         for _ in range(trials // 2 if size < LARGE // 2 else max(trials // 20, 3)):
             first, second = (sources[name] for name in rng.choice(SHUFFLED, 2, replace=False))
-            points2d = first.pair(int(rng.integers(len(first.sizes))), 0).points2d
-            points3d = second.pair(int(rng.integers(len(second.sizes))), 0).points3d
-            points2d, points3d = (rng.permutation(np.asarray(x, float))[:size] for x in (points2d, points3d))
-            yield f"{size}", solve(points2d, points3d), np.nan
+            image = first.pair(int(rng.integers(len(first)))).points2d[0].double().numpy()
+            scene = second.pair(int(rng.integers(len(second)))).points3d[0].double().numpy()
+            yield f"{size}", solve(rng.permutation(image)[:size], rng.permutation(scene)[:size]), np.nan
 
 
 def twins(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:

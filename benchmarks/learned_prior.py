@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bpnp import Batch, solve
-from bpnp.datamodules import ColmapDataModule, MeshDataModule
-from bpnp.datamodules.outliers import Outliers
+from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.metrics import rotation_error
 from bpnp.models import TrainedNet, load_network, load_pretrained
 from bpnp.models.weights import LEARNED

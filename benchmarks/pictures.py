@@ -8,7 +8,6 @@ import argparse
 import warnings
 from pathlib import Path
 
-import numpy as np
 import torch
 from bench_search import source
 
@@ -28,10 +27,11 @@ def main() -> None:
     warnings.simplefilter("ignore")
     for name in options.pairs:
         data, _, number = name.rpartition(":")
-        pair = source(data, options.data, 100).pair(int(number), 0)
-        solution = solve(pair.points2d, pair.points3d, seed=options.seed)
-        error = float(rotation_error(torch.as_tensor(solution.rotation), torch.as_tensor(np.asarray(pair.rotation))))
-        figure = solution_picture(solution, title=f"{pair.name}: {error:.3g} deg off")
+        pair = source(data, options.data, 100).pair(int(number))
+        assert pair.rotation is not None
+        solution = solve(pair.points2d[0], pair.points3d[0], seed=options.seed)
+        error = float(rotation_error(torch.as_tensor(solution.rotation), pair.rotation[0]))
+        figure = solution_picture(solution, title=f"{pair.ids[0]}: {error:.3g} deg off")
         path = save_figure(figure, options.output / f"solve-{data}-{number}.png")
         count, seconds = solution.inlier_count, solution.seconds
         print(f"{path}: {solution.verdict}, {error:.3g} deg off, {count} matches, {seconds:.1f} s")

@@ -11,6 +11,7 @@ import zlib  # noqa: F401
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -118,6 +119,16 @@ def colmap_camera(model: str, params: Any) -> Lens:
     if not np.isfinite(values).all():
         raise ValueError(f"expected finite parameters of a {model} camera, got {values.tolist()}")
     return _checked(Lens(_pycolmap().Camera(model=model, params=values.tolist())), f"{values.tolist()}")
+
+
+def read_text_model(folder: Path) -> Any:
+    """The pycolmap.Reconstruction of a COLMAP model in text files. Raises ValueError with pycolmap's reason."""
+    model = _pycolmap().Reconstruction()
+    try:
+        model.read_text(str(folder))
+    except (ValueError, IndexError, RuntimeError) as error:
+        raise ValueError(str(error)) from error
+    return model
 
 
 def camera_models() -> Mapping[int, tuple[str, int]]:

@@ -1,17 +1,22 @@
-"""Files that are written whole or not at all, and folders that one process at a time writes to."""
+"""Files and folders that are written whole or not at all, locks, the checksum of bytes, and the user's cache."""
 
 import fcntl
+import hashlib
+import json
 import os
-from collections.abc import Iterator
+import shutil
+import zlib
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 
 @contextmanager
 def written_whole(path: Path) -> Iterator[Path]:
-    """A name beside `path` to write to, which becomes `path` when the block ends well and is gone otherwise.
+    """A temporary name beside `path` for a file or a folder; renamed to `path` on success, deleted on error.
 
-    Makes the folders above it. An error of the disk names the file.
+    Makes the folders above it. An error of the disk names `path`.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
@@ -23,22 +28,58 @@ def written_whole(path: Path) -> Iterator[Path]:
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     finally:
-        temporary.unlink(missing_ok=True)
+        if temporary.is_dir():
+            shutil.rmtree(temporary)
+        else:
+            temporary.unlink(missing_ok=True)
 
 
 @contextmanager
-def claimed(folder: Path) -> Iterator[None]:
+def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder for this process; it is made if it is not there.
 
-    Raises ValueError if another process holds it. The lock ends with the process, however it ends.
+    Raises ValueError if another process holds it, unless told to wait. The lock ends with the process, however it ends.
     """
-    folder.mkdir(parents=True, exist_ok=True)
-    with (folder / ".lock").open("w") as file:
+    while True:
+        folder.mkdir(parents=True, exist_ok=True)
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise ValueError(f"expected a folder that no other process writes to, got {folder}; try another") from None
-        try:
-            yield
-        finally:
-            (folder / ".lock").unlink(missing_ok=True)
+            file = (folder / ".lock").open("w")
+        except FileNotFoundError:
+            continue  # another process has just removed the folder
+        with file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+            except BlockingIOError:
+                message = f"expected a folder that no other process writes to, got {folder}; try another, or later"
+                raise ValueError(message) from None
+            if os.fstat(file.fileno()).st_nlink:  # else the process that held it has removed it
+                try:
+                    yield
+                finally:
+                    (folder / ".lock").unlink(missing_ok=True)
+                return
+
+
+def checksum(*parts: bytes | memoryview) -> int:
+    """CRC-32 of the bytes of all parts, one after the other: it tells damaged data from what was written."""
+    value = 0
+    for part in parts:
+        value = zlib.crc32(part, value)
+    return value
+
+
+def fingerprint(content: Any) -> str:
+    """A name for JSON content, 32 hexadecimal digits: different content has a different one."""
+    return hashlib.blake2b(json.dumps(content, sort_keys=True).encode(), digest_size=16).hexdigest()
+
+
+def files_as_they_are(files: Iterable[Path]) -> list[tuple[str, int, int]]:
+    """Names, sizes and times of files, for a `fingerprint` that changes when one of them does."""
+    return [(file.name, (stat := file.stat()).st_size, stat.st_mtime_ns) for file in files]
+
+
+def cache_folder() -> Path:
+    """Where data that can be made again is kept: BPNP_CACHE, else the user's cache, ``~/.cache/bpnp``."""
+    if chosen := os.environ.get("BPNP_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bpnp"

@@ -130,7 +130,7 @@ def test_files_are_short_and_folders_small() -> None:
         assert len(file.read_text().splitlines()) <= 250, named(file)
         assert not VAGUE & set(file.stem.split("_")), named(file)
     for folder in FOLDERS:
-        if folder.name != "datamodules" and folder.name != "report":
+        if folder.name != "report":
             assert len([file for file in folder.glob("*.py") if file.stem != "__init__"]) <= 12, named(folder)
 
 

@@ -7,8 +7,10 @@ from typing import Literal
 from rich.console import Console
 
 from bpnp.commands.parser import at_least
-from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
-from bpnp.datamodules.released.module import prepare_preprocessed
+from bpnp.datamodules.colmap.prepare import prepare_colmap
+from bpnp.datamodules.meshes.prepare import prepare_meshes
+from bpnp.datamodules.prepare import Prepared
+from bpnp.datamodules.released.prepare import prepare_preprocessed
 
 PROCESSES = os.cpu_count() or 1
 

@@ -1,19 +1,22 @@
 """Sources of pairs: meshes and SfM-like scenes seen by virtual cameras, COLMAP models, and published pairs."""
 
+from bpnp.datamodules.augment import Outliers
 from bpnp.datamodules.colmap.module import ColmapDataModule
 from bpnp.datamodules.facades.module import SfmSceneDataModule
-from bpnp.datamodules.loader import Pair, PairSource, pair_loader
 from bpnp.datamodules.meshes.module import MeshDataModule
-from bpnp.datamodules.outliers import Outliers
+from bpnp.datamodules.module import PairDataModule
+from bpnp.datamodules.pair import Pair, PairSource
 from bpnp.datamodules.released.module import PreprocessedDataModule
+from bpnp.datamodules.stored_pairs import write_pairs
 
 __all__ = [
     "ColmapDataModule",
     "MeshDataModule",
     "Outliers",
     "Pair",
+    "PairDataModule",
     "PairSource",
     "PreprocessedDataModule",
     "SfmSceneDataModule",
-    "pair_loader",
+    "write_pairs",
 ]

@@ -1,80 +1,84 @@
-"""From pairs of point sets to padded batches: what a source must offer, and how its pairs are put together."""
+"""From a source of pairs to batches: which pairs are in a batch, in any number of processes, and exact resuming."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Int
 from numpy.typing import NDArray
-from torch import distributed
+from torch import Tensor, distributed
 from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
+from bpnp.datamodules.augment import Augmentation, augment
+from bpnp.datamodules.keyed_random import row_keys
+from bpnp.datamodules.pair import PairSource
 from bpnp.types import Batch
 
-Key = tuple[int, int]  # (epoch, index): with the source's seed, all that a pair depends on
-
-STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("test",)}  # their splits
+Key = tuple[int, int]  # (epoch, index): with the seed, all that a pair depends on
 POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 
 @dataclass(frozen=True)
-class Pair:
-    """One image's points and the scene's points; see `bpnp.types` for the conventions.
+class PairKeys:
+    """A batch to be made: the position of each pair in its data set, and its name."""
 
-    points2d (m, 2) normalised, points3d (n, 3), rotation (3, 3), translation (3,), match3d (n,) index into points2d
-    or -1, focal pixels per unit of normalised coordinates. origin (3,): what was subtracted from the scene's
-    coordinates, for scenes so far from theirs that float32 would lose digits; None for nothing.
-    """
-
-    name: str
-    points2d: NDArray[np.float32]
-    points3d: NDArray[np.float32]
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    match3d: NDArray[np.int64]
-    focal: float
-    origin: NDArray[np.float64] | None = None
-
-
-@runtime_checkable
-class PairSource(Protocol):
-    """An indexed set of pairs. `pair` is a pure function of its arguments and the source's seed."""
-
-    @property
-    def sizes(self) -> NDArray[np.int64]:
-        """Points of the larger side of each pair, one entry a pair: what padding costs."""
-
-    def pair(self, index: int, epoch: int) -> Pair: ...
-
-
-def collate(pairs: Sequence[Pair], index: Sequence[int]) -> Batch:
-    """Pad and mask pairs into one float32 batch; `index` is the position of each in its data set."""
-    batch = Batch.from_arrays(
-        [pair.points2d for pair in pairs],
-        [pair.points3d for pair in pairs],
-        [pair.rotation for pair in pairs],
-        [pair.translation for pair in pairs],
-        [pair.match3d for pair in pairs],
-        focal=[pair.focal for pair in pairs],
-        index=index,
-        ids=[pair.name for pair in pairs],
-    )
-    origins = np.stack([np.zeros(3) if pair.origin is None else pair.origin for pair in pairs])
-    return replace(batch, origin=torch.as_tensor(origins))
-
-
-class PairDataset(Dataset[Batch]):
-    """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing."""
-
-    def __init__(self, source: PairSource) -> None:
-        self.source = source
+    epoch: int
+    index: Int[Tensor, " b"]
+    ids: tuple[str, ...]
 
     def __len__(self) -> int:
-        return len(self.source.sizes)
+        return len(self.ids)
 
-    def __getitem__(self, keys: Sequence[Key]) -> Batch:
-        return collate([self.source.pair(index, epoch) for epoch, index in keys], [index for _, index in keys])
+    def to(self, *args: Any, **kwargs: Any) -> "PairKeys":
+        return replace(self, index=self.index.to(*args, **kwargs))
+
+    def pin_memory(self) -> "PairKeys":
+        return replace(self, index=self.index.pin_memory())
+
+
+class PairDataset(Dataset[Any]):
+    """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
+
+    augmentation: what is done to the pairs of `source`. seed: a pair is a function of (seed, index), and of the epoch
+    too if `fresh`. keys_only: give `PairKeys`, for `batch` to be called where the batch is needed.
+    """
+
+    def __init__(
+        self,
+        source: PairSource,
+        augmentation: Augmentation | None = None,
+        *,
+        seed: Sequence[int] = (0,),
+        fresh: bool = False,
+    ) -> None:
+        self.source, self.augmentation = source, augmentation or Augmentation()
+        self.seed, self.fresh, self.keys_only = tuple(seed), fresh, False
+        self.sizes = self.augmentation.sizes(source.counts)
+
+    def __len__(self) -> int:
+        return len(self.sizes)
+
+    def __getitem__(self, keys: Sequence[Key]) -> Batch | PairKeys:
+        index = [index for _, index in keys]
+        chosen = PairKeys(keys[0][0], torch.tensor(index), self.source.names(index))
+        return chosen if self.keys_only else self.batch(chosen)
+
+    def batch(self, keys: PairKeys) -> Batch:
+        """The pairs of `keys`, made on the device of its index."""
+        epoch = keys.epoch if self.fresh else 0
+        pairs = replace(self.source.batch(keys.index, epoch), ids=keys.ids)
+        pairs = augment(pairs, self.augmentation, row_keys(keys.index, *self.seed, epoch))
+        rotation, translation = pairs.rotation, pairs.translation
+        assert rotation is not None
+        assert translation is not None
+        return replace(pairs, rotation=rotation.float(), translation=translation.float())
+
+    def pair(self, index: int, epoch: int = 0) -> Batch:
+        """One pair alone."""
+        keys = torch.tensor([index])
+        return self.batch(PairKeys(epoch, keys, self.source.names([index])))
 
 
 def training_batches(
@@ -157,7 +161,7 @@ class BucketSampler(DistributedSampler[list[Key]]):
         if shuffle and max_cells is not None:
             raise ValueError("expected `max_cells` with `shuffle=False` only, got both; try a smaller `batch_size`")
         super().__init__(dataset, num_replicas=num_replicas, rank=rank, shuffle=shuffle, seed=seed)
-        self.sizes = np.asarray(dataset.source.sizes)
+        self.sizes = dataset.sizes
         self.batch_size = batch_size
         self.first_batch = 0  # the next pass starts here: an epoch that is resumed
         self.max_cells = max_cells
@@ -213,7 +217,7 @@ class PairLoader(DataLoader[Batch]):
 
 
 def pair_loader(
-    source: PairSource | PairDataset,
+    dataset: PairDataset,
     *,
     batch_size: int,
     shuffle: bool,
@@ -221,14 +225,11 @@ def pair_loader(
     num_workers: int = 0,
     max_cells: int | None = None,
 ) -> DataLoader[Batch]:
-    """A loader of padded batches, buckets by size, for this process of the process group if there is one.
+    """A loader of padded batches for this process of the process group, if there is one.
 
-    batch_size: pairs of one step over all processes.
-    shuffle: True for training, False for evaluation; see `BucketSampler`, also for the errors.
-    max_cells: evaluation only; bounds b * m * n of the padded batch over all processes, and so the memory.
+    See `BucketSampler` for the options; shuffle is True for training. max_cells bounds b * m * n of a padded batch.
     """
     group = distributed.is_available() and distributed.is_initialized()
-    dataset = source if isinstance(source, PairDataset) else PairDataset(source)
     sampler = BucketSampler(
         dataset,
         batch_size=batch_size,

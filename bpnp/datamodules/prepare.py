@@ -1,27 +1,27 @@
-"""From a data set as it was published to one of our stores, in parallel; a killed run goes on where it was."""
+"""From a data set as it was published to a data store: in parts, by several processes, resumed after a kill."""
 
+import multiprocessing
+import os
+import shutil
+import signal
+import threading
 import warnings
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
+from multiprocessing.connection import wait
 from pathlib import Path
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from bpnp.datamodules.colmap.model_files import FILES, ColmapError
-from bpnp.datamodules.colmap.pairs import ColmapSource
-from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.datamodules.colmap.scenes import find_scenes
-from bpnp.datamodules.loader import Pair
-from bpnp.datamodules.manifest import StoreError, fingerprint
-from bpnp.datamodules.meshes.archives import MeshArchive, open_archive
-from bpnp.datamodules.meshes.surface_store import open_surfaces, write_surfaces
-from bpnp.datamodules.meshes.surfaces import MeshError, Normalisation
-from bpnp.datamodules.pair_store import PairStore, write_pairs
-from bpnp.datamodules.parts import make_once, make_parts
+from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store, read_manifest
+from bpnp.files import cache_folder, claimed, fingerprint
 
-MESHES_A_PART = 64
+Work = Callable[[Any, Path], None]  # writes the store of one part
 
 
 @dataclass(frozen=True)
@@ -33,101 +33,159 @@ class Prepared:
     skipped: Mapping[str, str]
 
 
-def prepare_meshes(
-    source: Path, output: Path, *, points: int, normalisation: Normalisation, processes: int
-) -> Prepared:  # fmt: skip
-    """Keep `points` surface samples of every mesh of `source` (see `open_archive`), for `MeshDataModule(root=output)`.
+@dataclass(frozen=True)
+class Recipe:
+    """How a store is made: part after part, each by `work(job, folder)`, then all of them in one.
 
-    Meshes that cannot be used are left out and listed. If `output` has been made from the same source in the same way
-    it is left as it is. Raises ValueError, StoreError or OSError: unusable source, no usable mesh, another `output`.
+    kind, widths: as in `new_store`. parameters: kept in the store; what was made with others is another store.
+    work and the jobs must be picklable if there are several processes. what, source: for messages.
     """
-    archive = open_archive(source)
-    parameters = {"points": points, "normalisation": normalisation, "source": fingerprint(archive.files)}
 
-    def make(folder: Path) -> None:
-        names = archive.names
-        batches = [names[i : i + MESHES_A_PART] for i in range(0, len(names), MESHES_A_PART)]
-        jobs = [(archive.part(batch), points, normalisation) for batch in batches]
-        parts = make_parts(folder, jobs, sample_part, processes=processes, label="sampling meshes")
-        skipped = {name: reason for part in parts for name, reason in open_surfaces(part).skipped.items()}
-        if len(skipped) == len(names):
-            raise nothing_usable("mesh", source, skipped)
-        write_surfaces(folder / "store", _meshes_of(parts), parameters=parameters, skipped=skipped)
-
-    make_once(output, parameters, make)
-    store = open_surfaces(output)
-    return Prepared(output, Counter(name.split("/")[-2] for name in store.names), store.skipped)
+    kind: str
+    widths: Mapping[str, int]
+    parameters: Mapping[str, Any]
+    jobs: Sequence[Any]
+    work: Work
+    what: str
+    source: str
 
 
-def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: float, processes: int) -> Prepared:
-    """The pairs of every image of every COLMAP model below `source`, for `ColmapDataModule(root=output)`.
+def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
+    """The store `output`, made unless it is there already. A run that was stopped goes on after its finished parts.
 
-    Images with fewer than `min_points` true pairs, and models that cannot be read, are left out and listed. `clutter`:
-    natural clutter to keep on both sides, as a ratio to the true pairs. Output and errors as `prepare_meshes`.
+    Raises StoreError if `output` is something else or was made with other parameters, or if no part gives a row;
+    ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.
     """
-    scenes = find_scenes(source)
-    models = [(scene, name, folder) for scene in scenes for name, folder in scenes[scene].items()]
-    found = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))
-    inputs = fingerprint(file for file in found if file.is_file())
-    parameters = {"min_points": min_points, "clutter": clutter, "source": inputs}
+    if not is_store(output):
+        if output.exists():
+            raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
+        with _workplace(output, recipe, wait_for_others) as folder:
+            if not is_store(output):  # another process may have made it
+                paths = make_parts(folder, recipe, processes=processes)
+                with new_store(output, recipe.kind, recipe.widths) as writer:
+                    writer.parameters |= recipe.parameters
+                    for path in paths:
+                        writer.extend(open_store(path, recipe.kind))
+                    if not len(writer):
+                        first = next(iter(writer.skipped.values()), "none found")
+                        raise StoreError(
+                            f"expected at least one usable {recipe.what} in {recipe.source}, got {len(writer.skipped)} "
+                            f"that are not; the first: {first}"
+                        )
+    shutil.rmtree(_parts_folder(output), ignore_errors=True)  # of a run that was killed when it had all but finished
+    made = read_manifest(output)["parameters"]
+    if different := sorted(key for key in recipe.parameters if made.get(key) != recipe.parameters[key]):
+        raise StoreError(
+            f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
+            "try another --output, or remove it"
+        )
+    return open_store(output, recipe.kind)
 
-    def make(folder: Path) -> None:
-        jobs = [(*model, min_points, clutter) for model in models]
-        parts = make_parts(folder, jobs, read_part, processes=processes, label="reading COLMAP models")
-        skipped = {name: reason for part in parts for name, reason in PairStore(part).skipped.items()}
-        if not any(len(PairStore(part)) for part in parts):
-            raise nothing_usable("image", source, skipped)
-        write_pairs(folder / "store", _pairs_of(parts), parameters=parameters, skipped=skipped)
 
-    make_once(output, parameters, make)
-    store = PairStore(output)
-    return Prepared(output, {"scenes": len(store.scenes), "pairs": len(store)}, store.skipped)
+def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
+    """The store of a recipe in the cache folder, made if it is not there, and made again if it is damaged.
 
-
-def sample_part(job: tuple[MeshArchive, int, Normalisation], path: Path) -> None:
-    """Write the store of some meshes."""
-    archive, count, mode = job
-    usable: list[tuple[str, NDArray[np.float64]]] = []
-    skipped: dict[str, str] = {}
-    for name in archive.names:
+    Warns once about what was left out. Raises as `prepare`.
+    """
+    folder = Path(cache_dir) if cache_dir is not None else cache_folder()
+    output = folder / f"{label}-{fingerprint([recipe.kind, dict(recipe.parameters)])[:16]}"
+    if is_store(output):
         try:
-            usable.append((name, archive.samples(name, count, mode)))
-        except (MeshError, OSError) as error:
-            skipped[name] = str(error)
-    write_surfaces(path, usable, parameters={"points": count}, skipped=skipped)
+            open_store(output, recipe.kind).verify()
+        except StoreError as error:
+            warnings.warn(f"the cached store {output} is damaged ({error}); making it again", stacklevel=2)
+            shutil.rmtree(output)
+    store = prepare(recipe, output, wait_for_others=True)
+    if store.skipped:
+        some = "; ".join(list(store.skipped.values())[:3])  # the reasons name the files
+        warnings.warn(
+            f"left out {len(store.skipped)} of {len(store.skipped) + len(store)}, all listed in "
+            f"{output / 'manifest.json'}: {some}",
+            stacklevel=2,
+        )
+    return store
 
 
-def read_part(job: tuple[str, str, Path, int, float], path: Path) -> None:
-    """Write the store of one COLMAP model; an empty one if it cannot be used."""
-    scene, name, folder, min_points, clutter = job
+@contextmanager
+def _workplace(output: Path, recipe: Recipe, wait_for_others: bool) -> Iterator[Path]:
+    """The folder ``.<output>.unfinished`` for the parts, locked; parts made with other parameters are removed first.
+
+    It is removed at the end; when the body raises, or the process is killed, it stays for the next run to go on.
+    """
+    folder = _parts_folder(output)
+    with claimed(folder, wait=wait_for_others):
+        key, key_file = fingerprint(dict(recipe.parameters)), folder / "key"
+        if not key_file.exists() or key_file.read_text() != key:
+            _remove_parts(folder)
+            key_file.write_text(key)
+        for leftover in folder.glob(".[0-9]*"):  # of a part that was being written when the process was killed
+            shutil.rmtree(leftover)
+        for leftover in output.parent.glob(f".{output.name}.[0-9]*"):  # of the store
+            shutil.rmtree(leftover)
+        yield folder
+        _remove_parts(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _parts_folder(output: Path) -> Path:
+    return output.with_name(f".{output.name}.unfinished")
+
+
+def _remove_parts(folder: Path) -> None:
+    (folder / "key").unlink(missing_ok=True)  # first: without it, what a kill leaves of the rest is not used
+    for path in folder.glob("[0-9]*"):
+        shutil.rmtree(path)
+
+
+def make_parts(folder: Path, recipe: Recipe, *, processes: int) -> list[Path]:
+    """The stores of all jobs, in their order; only those that `folder` does not have yet are made."""
+    # Parts of other jobs do not count.
+    paths = [folder / f"{i:06d}-{fingerprint(repr(job))[:16]}" for i, job in enumerate(recipe.jobs)]
+    missing = [i for i, path in enumerate(paths) if not path.exists()]
+    columns = (TextColumn(f"reading {recipe.source}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task("", total=len(paths), completed=len(paths) - len(missing))
+        if processes == 1:
+            for i in missing:
+                recipe.work(recipe.jobs[i], paths[i])
+                progress.advance(task)
+            return paths
+        context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
+        context.set_forkserver_preload([recipe.work.__module__])
+        with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
+            try:
+                with _interrupts_later():
+                    futures: list[Future[None]] = [pool.submit(recipe.work, recipe.jobs[i], paths[i]) for i in missing]
+                for future in as_completed(futures):
+                    future.result()
+                    progress.advance(task)
+            except BrokenProcessPool as error:
+                raise OSError(
+                    f"a process that was reading {recipe.source} was killed, possibly out of memory; the finished "
+                    "parts are kept: try again with fewer --processes"
+                ) from error
+            finally:
+                pool.shutdown(cancel_futures=True)
+    return paths
+
+
+@contextmanager
+def _interrupts_later() -> Iterator[None]:
+    """Hold SIGINT back while workers start: they inherit the mask, so Ctrl-C reaches this process alone."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # the images left out are counted here
-            source = ColmapSource([read_reconstruction(folder, name=name)], min_points=min_points, clutter=clutter)
-    except ColmapError as error:
-        write_pairs(path, [], parameters={}, skipped={name: str(error)})
-        return
-    total = source.skipped + len(source.images)
-    skipped = {f"{name}/*": f"{source.skipped} of {total} images with fewer than {min_points} points"}
-    pairs = ((scene, source.pair(i, 0)) for i in range(len(source.images)))
-    write_pairs(path, pairs, parameters={}, skipped=skipped if source.skipped else {})
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-def _meshes_of(parts: Sequence[Path]) -> Iterator[tuple[str, NDArray[np.float32]]]:
-    for part in parts:
-        store = open_surfaces(part)
-        yield from zip(store.names, store.points, strict=True)
+def _end_with_parent() -> None:
+    """End this worker when its parent is killed; it would wait for work for ever."""
 
+    def watch() -> None:
+        parent = multiprocessing.parent_process()
+        if parent is not None:
+            wait([parent.sentinel])
+            os._exit(1)
 
-def _pairs_of(parts: Sequence[Path]) -> Iterator[tuple[str, Pair]]:
-    for part in parts:
-        store = PairStore(part)
-        for i in range(len(store)):
-            yield store.scenes[store.scene[i]], store.pair(i)
-
-
-def nothing_usable(what: str, source: Path, skipped: Mapping[str, str]) -> StoreError:
-    first = next(iter(skipped.values()), "none found")
-    return StoreError(
-        f"expected at least one usable {what} in {source}, got {len(skipped)} that are not; the first: {first}"
-    )
+    threading.Thread(target=watch, daemon=True).start()

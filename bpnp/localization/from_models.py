@@ -8,11 +8,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from bpnp.datamodules.augment import Augmentation, augment
 from bpnp.datamodules.colmap.pairs import ColmapSource
 from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.datamodules.colmap.reconstruction import Reconstruction
 from bpnp.datamodules.colmap.scenes import find_scenes
+from bpnp.datamodules.keyed_random import row_keys
 from bpnp.localization.localized import Localized, images_text, localized
 from bpnp.localization.solved import write_text
 from bpnp.report.figures import save_figure
@@ -20,6 +23,7 @@ from bpnp.report.photos import PhotoFinder
 from bpnp.report.pictures import picture_box, solution_picture
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
+from bpnp.types import Batch
 
 EVERYTHING = 1e9  # times the true pairs: all the clutter there is
 
@@ -37,15 +41,24 @@ def image_source(scene: Reconstruction, wanted: str, points: str, clutter: float
             raise ValueError(f"expected the name of one image of {scene.name}, got {wanted!r}; try one of {some}")
         images = tuple(named)
     amount = {"seen": 0.0, "clutter": clutter, "all": EVERYTHING}[points]
-    return ColmapSource([replace(scene, images=images)], clutter=amount, rotate=True, seed=seed)
+    return ColmapSource([replace(scene, images=images)], clutter=amount, seed=(seed,))
+
+
+def turned_pair(source: ColmapSource, index: int) -> Batch:
+    """The points of an image in random order, in a scene that is turned at random; a batch of one."""
+    number = torch.tensor([index])
+    return augment(source.batch(number, 0), Augmentation(rotate=True), row_keys(number, *source.seed))
 
 
 def localize_image(source: ColmapSource, index: int, **options: Any) -> tuple[Solution, Localized]:
     """Solve an image in its turned scene; what comes back is in the frame of the model. options: of `bpnp.solve`."""
-    pair, (turn, origin) = source.pair(index, 0), source.frame(index)
-    pixels = pair.focal * pair.points2d.astype(np.float64)
-    solution = solve(pixels, pair.points3d, np.diag([pair.focal, pair.focal, 1.0]), **options)
-    return solution, localized(source.images[index][1], pair, solution, turn, origin)
+    pair, image = turned_pair(source, index), source.images[index][1]
+    assert pair.rotation is not None
+    focal = float(pair.focal)
+    pixels = focal * pair.points2d[0].double().numpy()
+    solution = solve(pixels, pair.points3d[0].numpy(), np.diag([focal, focal, 1.0]), **options)
+    turn = pair.rotation[0].numpy().T @ image.rotation
+    return solution, localized(image, pair, solution, turn, source.origins[index])
 
 
 def model_photos(model: Path) -> tuple[str, PhotoFinder]:

@@ -12,11 +12,11 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.colmap.reconstruction import ImagePoints
-from bpnp.datamodules.loader import Pair
 from bpnp.metrics.errors import centre_error, rotation_error
 from bpnp.report.pictures import VERDICTS
 from bpnp.report.tables import FittedTable, number
 from bpnp.solving.solution import Solution
+from bpnp.types import Batch
 
 RIGHT_DEG = 1.0
 HEADER = """# Image list with two lines of data per image:
@@ -59,14 +59,15 @@ class Localized:
 
 
 def localized(
-    image: ImagePoints, pair: Pair, solution: Solution, turn: NDArray[np.float64], origin: NDArray[np.float64]
+    image: ImagePoints, pair: Batch, solution: Solution, turn: NDArray[np.float64], origin: NDArray[np.float64]
 ) -> Localized:
-    """From the turned scene, in which p of the model is turn (p - origin), back to the model's frame."""
+    """From the turned scene, in which p of the model is turn (p - origin), back to its frame. pair: a batch of one."""
     rotation = solution.rotation @ turn
     translation = solution.translation - rotation @ origin
     estimate = (torch.as_tensor(rotation)[None], torch.as_tensor(translation)[None])
     truth = (torch.as_tensor(image.rotation)[None], torch.as_tensor(image.translation)[None])
-    right = pair.match3d[solution.matches[:, 1]] == solution.matches[:, 0]
+    assert pair.match3d is not None
+    right = pair.match3d[0].numpy()[solution.matches[:, 1]] == solution.matches[:, 0]
     return Localized(
         image=image.name,
         image_id=image.image_id,
@@ -77,8 +78,8 @@ def localized(
         translation=translation,
         rotation_error_deg=float(rotation_error(estimate[0], truth[0])),
         centre_error=float(centre_error(*estimate, *truth)),
-        count2d=len(pair.points2d),
-        count3d=len(pair.points3d),
+        count2d=int(pair.count2d),
+        count3d=int(pair.count3d),
         inlier_count=solution.inlier_count,
         inlier_ratio=solution.inlier_ratio,
         right_matches=float(right.mean()) if len(right) else 0.0,

@@ -11,7 +11,7 @@ from planted_model import plant_model
 
 from bpnp.cli import main
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.localization.from_models import image_source
+from bpnp.localization.from_models import image_source, turned_pair
 
 
 def run(model: Path, output: Path, *more: str) -> list[dict]:
@@ -63,14 +63,15 @@ def test_one_image_by_its_name_and_clutter(tmp_path: Path) -> None:
     assert (image["count2d"], image["count3d"]) == (66, 66)
     assert image["rotation_error_deg"] < 0.1
     scene = read_reconstruction(tmp_path / "model")
-    everything = image_source(scene, "photo 1.jpg", "all", 0.0, 0).pair(0, 0)
-    assert (len(everything.points2d), len(everything.points3d)) == (80, 120)
+    everything = turned_pair(image_source(scene, "photo 1.jpg", "all", 0.0, 0), 0)
+    assert (int(everything.count2d), int(everything.count3d)) == (80, 120)
 
 
 def test_the_scene_is_turned_before_it_is_solved(tmp_path: Path) -> None:
     truth = plant_model(tmp_path)
     poses = [
-        image_source(read_reconstruction(tmp_path), "all", "seen", 0.0, seed).pair(0, 0).rotation for seed in (0, 1)
+        turned_pair(image_source(read_reconstruction(tmp_path), "all", "seen", 0.0, seed), 0).rotation[0].numpy()
+        for seed in (0, 1)
     ]
     gaps = [np.linalg.norm(a - b) for a, b in ((poses[0], poses[1]), *((pose, truth.rotations[0]) for pose in poses))]
     assert min(gaps) > 0.5

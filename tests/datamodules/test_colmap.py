@@ -1,6 +1,10 @@
+import subprocess
+import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lightning import LightningModule, Trainer
@@ -120,8 +124,43 @@ def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
     assert served["test"] == served["predict"]
     assert served["train"] | served["val"] | served["test"] == {f"s{i}" for i in range(5)}
     assert sum(len(served[part]) for part in ("train", "val", "test")) == 5
-    assert max(data.sources["train"].sizes) == 22 + round(0.2 * 22)
-    assert data.sources["predict"].pair(0, 0).rotation == pytest.approx(data.sources["predict"].images[0][1].rotation)
+    assert max(data.datasets["train"].sizes) == 22 + round(0.2 * 22)
+    predicted, tested = (data.datasets[part] for part in ("predict", "test"))
+    image = predicted.source.images[0][1]
+    np.testing.assert_allclose(predicted.pair(0).rotation[0].numpy(), image.rotation, atol=1e-6)
+    assert not np.allclose(tested.pair(0).rotation[0].numpy(), image.rotation, atol=0.1)
+
+
+WRONG: list[tuple[dict[str, Any], str]] = [
+    ({"clutter": -0.25}, "`clutter` of 0 or more, got -0.25"),
+    ({"clutter": float("nan")}, "`clutter`"),
+    ({"clutter": float("inf")}, "finite `clutter`"),
+    ({"min_points": 1}, "`min_points` of 4 or more, got 1"),
+    ({"max_points": 8, "min_points": 9}, "`max_points` of at least `min_points` = 9, got 8"),
+    ({"eval_max_points": 3}, "`max_points` of at least `min_points` = 4, got 3"),
+    ({"batch_size": 0}, "`batch_size` of 1 or more, got 0"),
+    ({"eval_batch_size": 0}, "`eval_batch_size` of 1 or more, got 0"),
+    ({"num_workers": -1}, "`num_workers` of 0 or more, got -1"),
+]
+
+
+@pytest.mark.parametrize(("options", "message"), WRONG)
+def test_wrong_options_are_named_for_models_and_stores_alike(options: dict[str, Any], message: str) -> None:
+    for root in ("models", "store"):
+        with pytest.raises(ValueError, match=message):
+            ColmapDataModule(root, **options)
+
+
+def test_a_side_of_clutter_that_there_is_not_is_named(tmp_path: Path) -> None:
+    """From the command line, where no test checks types."""
+    command = [
+        sys.executable, "-m", "bpnp", "test", "--model.solver=bpnp.models.BPnPNet",
+        "--data=bpnp.datamodules.ColmapDataModule", f"--data.root={tmp_path}", "--data.clutter_side=2D",
+    ]  # fmt: skip
+    result = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert result.returncode == 2
+    assert "clutter_side" in result.stderr
+    assert "2D" in result.stderr
 
 
 def test_only_training_draws_anew(tmp_path: Path) -> None:
@@ -129,9 +168,9 @@ def test_only_training_draws_anew(tmp_path: Path) -> None:
     data = ColmapDataModule(str(tmp_path), eval_max_points=10)
     data.setup()
     for part, changes in (("train", True), ("val", False), ("test", False)):
-        first, second = (data.sources[part].pair(0, epoch).points2d for epoch in (0, 1))
-        assert (first != second).any() == changes
-    assert max(data.sources["test"].sizes) == 10
+        first, second = (data.datasets[part].pair(0, epoch).points2d for epoch in (0, 1))
+        assert torch.equal(first, second) != changes
+    assert max(data.datasets["test"].sizes) == 10
 
 
 def test_a_stage_reads_its_scenes_only(tmp_path: Path) -> None:
@@ -151,7 +190,7 @@ def test_a_broken_model_among_others_is_skipped_and_counted(tmp_path: Path) -> N
     data = ColmapDataModule(str(tmp_path), test_fraction=1.0)
     with pytest.warns(UserWarning, match="skipped 1 of 3 COLMAP models: .*s1/sparse/0/points3D.bin"):
         data.setup("test")
-    assert {scene.name for scene, _ in data.sources["test"].images} == {"s0", "s2"}
+    assert {scene.name for scene, _ in data.datasets["test"].source.images} == {"s0", "s2"}
 
 
 def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:

@@ -1,154 +1,107 @@
+"""The pairs of COLMAP images: exact geometry, clutter that is none, and digits far from the origin."""
+
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from planted_model import plant_model
 
-from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.augment import Augmentation, augment
 from bpnp.datamodules.colmap.pairs import ColmapSource
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.datamodules.loader import Pair
+from bpnp.datamodules.keyed_random import row_keys
+from bpnp.datamodules.pair import Pair, PairSource
+from bpnp.datamodules.store import StoreError
 
 
-def source(folder: Path, *, plant: dict | None = None, **options) -> ColmapSource:
+def source(folder: Path, **options) -> ColmapSource:
     if not folder.exists():
-        plant_model(folder, **(plant or {}))
+        plant_model(folder)
     return ColmapSource([read_reconstruction(folder, name="castle")], **options)
 
 
 def residuals(pair: Pair) -> np.ndarray:
-    """Distance of each true pair's 2D point to the projection of its 3D point, normalised coordinates."""
-    points = pair.points3d.astype(np.float64) @ pair.rotation.T + pair.translation
-    true = pair.match3d >= 0
-    return np.linalg.norm(points[true, :2] / points[true, 2:] - pair.points2d[pair.match3d[true]], axis=-1)
+    """Distance of each true pair's 3D point, projected, to its 2D point."""
+    camera = pair.points3d[: pair.matched] @ pair.rotation.T + pair.translation
+    return np.linalg.norm(camera[:, :2] / camera[:, 2:] - pair.points2d[: pair.matched], axis=-1)
 
 
 def same(a: Pair, b: Pair) -> bool:
-    return all(np.array_equal(getattr(a, field), getattr(b, field)) for field in Pair.__dataclass_fields__)
+    return np.array_equal(a.points2d, b.points2d) and np.array_equal(a.points3d, b.points3d)
 
 
-def test_every_true_pair_projects_onto_its_keypoint(tmp_path: Path) -> None:
+def test_an_image_is_its_keypoints_and_the_points_it_sees(tmp_path: Path) -> None:
+    truth = plant_model(tmp_path / "m")
     pairs = source(tmp_path / "m")
-    assert pairs.sizes.tolist() == [40, 40, 40]
+    assert isinstance(pairs, PairSource)
+    assert pairs.names(range(3)) == tuple(f"castle/photo {i}.jpg" for i in range(3))
     for i in range(3):
-        pair = pairs.pair(i, 0)
-        assert pair.name == f"castle/photo {i}.jpg"
+        pair = pairs.pair(i)
         assert residuals(pair).max() < 1e-6
-        assert sorted(pair.match3d) == list(range(40))
-        assert (pair.match3d != np.arange(40)).sum() > 30  # nothing in the order gives the pairing away
+        np.testing.assert_allclose(pair.rotation, truth.rotations[i], atol=1e-12)
+        np.testing.assert_allclose(pair.translation, truth.translations[i], atol=1e-12)
+        np.testing.assert_allclose(pair.points3d, truth.points3d[truth.seen[i]], atol=1e-6)
         assert (pair.points2d.dtype, pair.points3d.dtype, pair.focal) == (np.float32, np.float32, 510.0)
 
 
 @pytest.mark.parametrize(
-    ("clutter", "side", "extra2d", "extra3d"),
-    [(0.25, "both", 10, 10), (0.25, "2d", 10, 0), (0.25, "3d", 0, 10), (1.0, "both", 12, 20), (0.0, "both", 0, 0)],
+    ("clutter", "extra2d", "extra3d"), [(0.25, 10, 10), (1.0, 12, 20), (0.0, 0, 0), (float("inf"), 12, 20)]
 )
-def test_clutter_is_what_the_image_does_not_pair(
-    clutter: float, side, extra2d: int, extra3d: int, tmp_path: Path
-) -> None:
+def test_clutter_is_what_the_image_does_not_pair(clutter: float, extra2d: int, extra3d: int, tmp_path: Path) -> None:
     """12 keypoints have no point and 20 of the 60 points are not seen: no more can be had."""
     truth = plant_model(tmp_path / "m")
-    pairs = source(tmp_path / "m", clutter=clutter, clutter_side=side)
-    pair = pairs.pair(1, 0)
-    assert (len(pair.points2d), len(pair.points3d)) == (40 + extra2d, 40 + extra3d)
-    assert pairs.sizes[1] == 40 + max(extra2d, extra3d)
-    matched = pair.match3d[pair.match3d >= 0]
-    assert len(set(matched.tolist())) == len(matched) == 40
+    pairs = source(tmp_path / "m", clutter=clutter)
+    pair = pairs.pair(1)
+    assert [len(pair.points2d), len(pair.points3d), pair.matched] == [40 + extra2d, 40 + extra3d, 40]
+    assert [int(count[1]) for count in pairs.counts] == [40, 40 + extra2d, 40 + extra3d]
     assert residuals(pair).max() < 1e-6
     unseen = np.delete(truth.points3d, truth.seen[1], axis=0).astype(np.float32)
-    drawn = {tuple(point) for point in pair.points3d[pair.match3d < 0]}
+    drawn = {tuple(point) for point in pair.points3d[40:]}
     assert len(drawn) == extra3d
     assert drawn <= {tuple(point) for point in unseen}
-    noise = np.delete(pair.points2d, matched, axis=0)
-    distance = np.linalg.norm(noise[:, None] - truth.points2d[1], axis=-1)
-    assert len(noise) == extra2d
-    assert len(noise) == 0 or distance.min() > 1e-5
+    distance = np.linalg.norm(pair.points2d[40:, None] - truth.points2d[1], axis=-1)
+    assert extra2d == 0 or distance.min() > 1e-5
 
 
-def test_a_subset_keeps_the_pairing_and_has_no_point_twice(tmp_path: Path) -> None:
-    pairs = source(tmp_path / "m", max_points=15, clutter=0.2)
-    assert pairs.sizes.tolist() == [18, 18, 18]
-    pair = pairs.pair(0, 0)
-    assert residuals(pair).max() < 1e-6
-    assert len(np.unique(pair.points3d, axis=0)) == len(np.unique(pair.points2d, axis=0)) == 18
-    assert (pair.match3d >= 0).sum() == 15
-
-
-def test_a_pair_is_a_function_of_seed_epoch_and_index(tmp_path: Path) -> None:
-    options = {"max_points": 15, "clutter": 0.2, "rotate": True}
-    fresh = source(tmp_path / "m", fresh=True, **options)
-    again = source(tmp_path / "m", fresh=True, **options)
-    fixed = source(tmp_path / "m", **options)
-    other = source(tmp_path / "m", seed=1, **options)
+def test_clutter_is_drawn_by_seed_epoch_and_index(tmp_path: Path) -> None:
+    one, again, other = (source(tmp_path / "m", clutter=0.2, seed=seed) for seed in ((0, 1), (0, 1), (1, 1)))
     again.pair(2, 5)
-    assert same(fresh.pair(0, 3), again.pair(0, 3))
-    assert not same(fresh.pair(0, 3), fresh.pair(0, 4))
-    assert same(fixed.pair(0, 3), fixed.pair(0, 4))
-    assert same(fixed.pair(0, 0), fresh.pair(0, 0))
-    assert not same(fixed.pair(0, 0), other.pair(0, 0))
+    assert same(one.pair(0, 3), again.pair(0, 3))
+    assert not same(one.pair(0, 3), one.pair(0, 4))
+    assert not same(one.pair(0, 0), other.pair(0, 0))
 
 
-def test_a_turned_scene_keeps_its_geometry_and_can_be_turned_back(tmp_path: Path) -> None:
-    truth = plant_model(tmp_path / "m")
-    pairs = source(tmp_path / "m", rotate=True)
-    turns = []
-    for i in range(3):
-        pair = pairs.pair(i, 0)
-        turn, origin = pairs.frame(i)
-        turns.append(turn)
-        assert residuals(pair).max() < 1e-6
-        np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
-        np.testing.assert_allclose(pair.rotation @ turn, truth.rotations[i], atol=1e-12)
-        np.testing.assert_allclose(pair.translation - pair.rotation @ turn @ origin, truth.translations[i], atol=1e-12)
-    assert np.linalg.det(turns[0]) == pytest.approx(1.0)
-    assert not np.allclose(turns[0], turns[1])
-
-
-def test_turns_are_uniform(tmp_path: Path) -> None:
-    """The mean of uniform rotations is the zero matrix; its entries have variance 1/3."""
-    pairs = source(tmp_path / "m", rotate=True, fresh=True)
-    mean = np.mean([pairs.frame(0, epoch)[0] for epoch in range(2000)], axis=0)
-    assert np.abs(mean).max() < 4 * np.sqrt(1 / 3 / 2000)
-
-
-def test_a_scene_far_from_its_origin_keeps_its_digits(tmp_path: Path, caplog) -> None:
+def test_a_scene_far_from_its_origin_keeps_its_digits_and_can_be_turned_back(tmp_path: Path, caplog) -> None:
     """At 5e6 units float32 steps by half a unit, as large as the scene."""
     truth = plant_model(tmp_path / "m", origin=5e6)
     pairs = source(tmp_path / "m")
     assert "3 of 3 images of castle see points that are far" in caplog.text
+    index = torch.arange(3)
+    turned = augment(pairs.batch(index, 0), Augmentation(rotate=True), row_keys(index, 0))
     for i in range(3):
-        pair = pairs.pair(i, 0)
+        pair = pairs.pair(i)
         assert residuals(pair).max() < 1e-6
         assert np.abs(pair.translation).max() < 10
-        turn, origin = pairs.frame(i)
-        np.testing.assert_allclose(pair.rotation @ turn, truth.rotations[i], atol=1e-12)
-        np.testing.assert_allclose(pair.translation - pair.rotation @ turn @ origin, truth.translations[i], atol=1e-8)
+        np.testing.assert_allclose(pair.translation - pair.rotation @ pair.origin, truth.translations[i], atol=1e-8)
+        rotation, translation, origin = (getattr(turned, f)[i].numpy() for f in ("rotation", "translation", "origin"))
+        turn = rotation.T @ truth.rotations[i]
+        np.testing.assert_allclose(turn @ pair.origin, origin, rtol=1e-12)
+        np.testing.assert_allclose(translation - rotation @ origin, truth.translations[i], atol=1e-8)
+        assert np.linalg.norm(turn - np.eye(3)) > 0.1
 
 
 def test_images_with_too_few_points_are_skipped_and_counted(tmp_path: Path) -> None:
     plant_model(tmp_path / "few", images=2, seen=5)
     plant_model(tmp_path / "many", seen=6)
     scenes = [read_reconstruction(tmp_path / name) for name in ("few", "many")]
-    with pytest.warns(UserWarning, match="skipped 2 of 5 images of few, many: fewer than 6 points"):
+    with pytest.warns(UserWarning, match="skipped 2 of 5 pairs of few, many: fewer than 6 true pairs"):
         pairs = ColmapSource(scenes, min_points=6)
-    assert (len(pairs.sizes), pairs.skipped) == (3, 2)
-    with pytest.raises(ColmapError, match="7 points or more in few, many, got none of 5"):
+    assert len(pairs.images) == 3
+    with pytest.raises(StoreError, match="7 or more matched points in few, many, got none of 5"):
         ColmapSource(scenes, min_points=7)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"min_points": 3}, "`min_points`"),
-        ({"max_points": 3}, "`max_points`"),
-        ({"clutter": -0.1}, "`clutter`"),
-        ({"clutter": float("nan")}, "`clutter`"),
-        ({"clutter_side": "left"}, "clutter_side"),
-    ],
-)
-def test_bad_options_name_themselves(options: dict, message: str, tmp_path: Path) -> None:
-    with pytest.raises((ValueError, TypeError), match=message):
-        source(tmp_path / "m", **options)
+    with pytest.raises(ValueError, match="`clutter` of 0 or more, got -0.1"):
+        ColmapSource(scenes, clutter=-0.1)
 
 
 def test_real_images_are_pairs_within_the_reconstruction_error(shared_data: Path) -> None:
@@ -156,6 +109,6 @@ def test_real_images_are_pairs_within_the_reconstruction_error(shared_data: Path
         reconstruction = read_reconstruction(shared_data / "colmap" / scene / "sparse" / "0", name=scene)
         pairs = ColmapSource([reconstruction], clutter=0.5)
         for index in range(0, len(pairs.images), 9):
-            pair = pairs.pair(index, 0)
-            assert len(pair.points2d) <= np.ceil(1.5 * len(pairs.images[index][1].seen))
+            pair = pairs.pair(index)
+            assert len(pair.points2d) <= np.ceil(1.5 * pair.matched)
             assert np.median(residuals(pair)) * pair.focal < 2.5

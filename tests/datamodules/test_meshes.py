@@ -1,31 +1,46 @@
 """The mesh data: the laws of the paper's protocol, determinism, splits by model, and real meshes."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
 import trimesh
+from lightning import LightningModule, Trainer
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.loader import PairSource
+from bpnp.datamodules.augment import Augmentation, Outliers
+from bpnp.datamodules.loader import PairDataset, PairKeys
 from bpnp.datamodules.meshes.module import MeshDataModule
-from bpnp.datamodules.meshes.pools import SurfacePools
-from bpnp.datamodules.meshes.source import MeshSource, hold_out
-from bpnp.datamodules.meshes.views import Views, draw_pair
+from bpnp.datamodules.meshes.prepare import WIDTHS
+from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, hold_out
+from bpnp.datamodules.meshes.views import Views
+from bpnp.datamodules.pair import PairSource
+from bpnp.datamodules.store import Store, new_store, open_store
+from bpnp.types import Batch
 
 
-def cloud(models: int = 5, samples: int = 400) -> SurfacePools:
+def cloud(folder: Path, models: int = 5, samples: int = 400) -> Store:
+    """Points of unit spheres."""
     points = np.random.default_rng(0).normal(size=(models, samples, 3))
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
-    return SurfacePools(points.astype(np.float32), tuple(f"m{i}" for i in range(models)), 1.0)
+    with new_store(folder / "cloud", SURFACES, WIDTHS) as writer:
+        for i, one in enumerate(points):
+            writer.add(f"c/train/m{i}", {POINTS: one}, radius=1.0)
+    return open_store(folder / "cloud", SURFACES)
 
 
-def source(views: Views | None = None, *, num_pairs: int = 200, **options) -> MeshSource:
-    options = {"num_points": 300, "seed": 0, "split": "train"} | options
-    return MeshSource(cloud(), np.arange(5), num_pairs=num_pairs, views=views or Views(), **options)
+def source(folder: Path, views: Views | None = None, *, num_pairs: int = 200, **options: Any) -> MeshSource:
+    store = open_store(folder / "cloud", SURFACES) if (folder / "cloud").exists() else cloud(folder)
+    options = {"num_points": 300, "pool_size": 400, "seed": (0, 0), "label": "train"} | options
+    return MeshSource(store, np.arange(5), num_pairs=num_pairs, views=views or Views(), **options)
+
+
+def drawn(pairs: MeshSource, count: int, epoch: int = 0) -> Batch:
+    return pairs.batch(torch.arange(count), epoch)
 
 
 def module(folder: Path, root: Path | None = None, **options) -> MeshDataModule:
@@ -43,75 +58,85 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path / "meshes"
 
 
-def test_projections_by_opencv_leave_the_noise() -> None:
-    pairs = [source().pair(i, 0) for i in range(200)]
+def test_projections_by_opencv_leave_the_noise(tmp_path: Path) -> None:
+    batch = drawn(source(tmp_path), 200)
+    assert batch.points3d.shape == (200, 300, 3)
     residuals = []
-    for pair in pairs:
-        assert pair.points3d.shape == (300, 3)
-        assert sorted(pair.match3d) == list(range(300))
-        assert (pair.match3d == np.arange(300)).mean() < 0.1
+    for row in range(200):
         image, _ = cv2.projectPoints(
-            pair.points3d.astype(float), cv2.Rodrigues(pair.rotation)[0], pair.translation, np.eye(3), None
-        )
-        residuals.append(pair.points2d[pair.match3d] - image[:, 0])
+            batch.points3d[row].double().numpy(), cv2.Rodrigues(batch.rotation[row].numpy())[0],
+            batch.translation[row].numpy(), np.eye(3), None,
+        )  # fmt: skip
+        residuals.append(batch.points2d[row].numpy() - image[:, 0])
     scaled = np.concatenate(residuals).ravel() * 800 / 2
     assert stats.kstest(scaled, stats.norm.cdf).pvalue > 1e-3
 
 
-def test_poses_have_the_distributions_of_the_paper() -> None:
-    pairs = [source(num_pairs=1000).pair(i, 0) for i in range(1000)]
-    angles = Rotation.from_matrix([pair.rotation for pair in pairs]).as_euler("xyz", degrees=True)
-    offsets = np.array([pair.translation for pair in pairs]) - [0, 0, 4.5]
+def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
+    batch = drawn(source(tmp_path, num_pairs=1000, num_points=4), 1000)
+    angles = Rotation.from_matrix(batch.rotation).as_euler("xyz", degrees=True)
+    offsets = batch.translation.numpy() - [0, 0, 4.5]
     for axis in range(3):
         assert stats.kstest(angles[:, axis], stats.uniform(0, 45).cdf).pvalue > 1e-3
         assert stats.kstest(offsets[:, axis], stats.uniform(-0.5, 1).cdf).pvalue > 1e-3
+    assert np.abs(np.corrcoef(np.hstack([angles, offsets]).T)[np.triu_indices(6, 1)]).max() < 0.13
     # R = Rz Ry Rx, written out for one pair
-    (a, b, c), turn = np.deg2rad(angles[0]), pairs[0].rotation
+    (a, b, c), turn = np.deg2rad(angles[0]), batch.rotation[0].numpy()
     assert turn[2] == pytest.approx([-np.sin(b), np.cos(b) * np.sin(a), np.cos(b) * np.cos(a)])
     assert turn[:2, 0] == pytest.approx([np.cos(b) * np.cos(c), np.cos(b) * np.sin(c)])
 
 
-def test_so3_is_uniform() -> None:
+def test_so3_is_uniform(tmp_path: Path) -> None:
     """The angle of a uniform rotation has the distribution function (a - sin a) / pi, its axes are uniform too."""
-    uniform = source(Views(rotation="so3"), num_pairs=1000)
-    rotations = Rotation.from_matrix([uniform.pair(i, 0).rotation for i in range(1000)])
+    batch = drawn(source(tmp_path, Views(rotation="so3"), num_pairs=1000, num_points=4), 1000)
+    rotations = Rotation.from_matrix(batch.rotation)
     assert stats.kstest(rotations.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
     assert stats.kstest(rotations.as_matrix()[:, 2, 2], stats.uniform(-1, 2).cdf).pvalue > 1e-3
 
 
-@pytest.mark.parametrize("fresh", [False, True])
-def test_a_pair_depends_on_seed_epoch_and_index_alone(fresh: bool) -> None:
-    one, other, reseeded = (source(fresh_views=fresh, seed=seed) for seed in (0, 0, 1))
+def test_a_pair_depends_on_seed_epoch_and_index_alone(tmp_path: Path) -> None:
+    one, reseeded, split = (source(tmp_path, seed=seed) for seed in ((0, 0), (1, 0), (0, 1)))
     assert isinstance(one, PairSource)
-    other.pair(3, 0)
-    pair, same = one.pair(7, 2), other.pair(7, 2)
-    for name in ("points2d", "points3d", "rotation", "translation", "match3d"):
-        np.testing.assert_array_equal(getattr(pair, name), getattr(same, name))
-        assert not np.array_equal(getattr(pair, name), getattr(reseeded.pair(7, 2), name))
-        assert np.array_equal(getattr(pair, name), getattr(one.pair(7, 3), name)) is not fresh
-        assert not np.array_equal(getattr(pair, name), getattr(one.pair(12, 2), name))
-    assert (pair.name, one.pair(12, 2).name) == ("m2#1", "m2#2")
-    assert {tuple(p) for p in pair.points3d} <= {tuple(p) for p in one.pools.points[2]}
+    index = torch.tensor([3, 7, 12])
+    whole, alone = one.batch(index, 2), one.batch(index[1:2], 2)
+    others = [reseeded.batch(index[1:2], 2), split.batch(index[1:2], 2), one.batch(index[1:2], 3)]
+    for name in ("points2d", "points3d", "rotation", "translation"):
+        assert torch.equal(getattr(whole, name)[1], getattr(alone, name)[0])
+        assert not any(torch.equal(getattr(alone, name), getattr(other, name)) for other in others)
+        assert not torch.equal(getattr(whole, name)[1], getattr(whole, name)[2])  # another view of the same mesh
+    assert one.names([7, 12]) == ("c/train/m2#1", "c/train/m2#2")
+    samples = {tuple(p) for p in one.store.row(2)[POINTS].tolist()}
+    assert len({tuple(p) for p in alone.points3d[0].tolist()} & samples) == 300
 
 
-def test_points_behind_the_camera_have_no_image() -> None:
+def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="reach 1 from their origin"):
-        inside = source(Views(distance=0.0, noise_px=0.0), num_pairs=5)
-    for i in range(5):
-        pair = inside.pair(i, 0)
-        depth = (pair.points3d @ pair.rotation.T + pair.translation)[:, 2]
-        assert ((pair.match3d >= 0) == (depth > 0.1)).all()
-        assert sorted(pair.match3d[pair.match3d >= 0]) == list(range(len(pair.points2d)))
-    behind = np.full((50, 3), [0, 0, -9], np.float32)
-    with pytest.raises(ValueError, match=r"4 points in front of the camera, got 0 in a#0"):
-        draw_pair("a#0", behind, num_points=50, views=Views(), rng=np.random.default_rng(0))
+        inside = source(tmp_path, Views(distance=0.0, noise_px=0.0), num_pairs=5)
+    batch = PairDataset(inside, Augmentation(outliers=Outliers(ratio=0.2))).batch(
+        PairKeys(0, torch.arange(5), inside.names(range(5)))
+    )
+    natural = drawn(inside, 5)
+    depth = (natural.points3d.double() @ natural.rotation.mT + natural.translation[:, None])[..., 2]
+    assert torch.equal(natural.match3d >= 0, depth > 0.1)
+    true = batch.match3d >= 0
+    assert torch.equal(true.sum(-1), (depth > 0.1).sum(-1))
+    assert torch.equal(batch.count2d, true.sum(-1) + (0.2 * true.sum(-1)).long())
+    assert torch.equal(batch.count3d, 300 + (0.2 * true.sum(-1)).long())
+    seen = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
+    camera = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
+    torch.testing.assert_close((camera[..., :2] / camera[..., 2:])[true], seen[true], rtol=1e-4, atol=1e-4)
+    blind = Views(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
+    with pytest.warns(UserWarning, match="reach 1"):
+        pairs = source(tmp_path, blind, num_points=4, pool_size=4, num_pairs=1)
+    with pytest.raises(ValueError, match=r"4 points in front of the camera, got \d in c/.*#0"):
+        drawn(pairs, 1)
 
 
 def test_splits_are_by_model(folder: Path, tmp_path: Path) -> None:
     data = module(tmp_path, folder, val_fraction=0.2, val_pairs=4, test_pairs=3)
     data.prepare_data()
     data.setup()
-    names = {split: [one.pair(i, 0).name for i in range(one.num_pairs)] for split, one in data.sources.items()}
+    names = {split: list(one.source.names(range(len(one)))) for split, one in data.datasets.items()}
     models = {split: {name.split("#")[0] for name in some} for split, some in names.items()}
     assert [len(models[split]) for split in ("train", "val", "test")] == [8, 2, 3]
     assert [len(names[split]) for split in ("train", "val", "test")] == [20, 4, 3]
@@ -132,24 +157,70 @@ def test_stages_open_what_they_need(folder: Path, tmp_path: Path) -> None:
         path.unlink()
     data = module(tmp_path, folder)
     data.setup("fit")
-    assert set(data.sources) == {"train", "val"}
+    assert set(data.datasets) == {"train", "val"}
     with pytest.raises(ValueError, match=r"expected `setup` before the test loader"):
         data.test_dataloader()
     with pytest.raises(ValueError, match=rf"<class>/.train,test./.*in {folder}, got none for 'test'"):
         data.setup("test")
-    with pytest.raises(ValueError, match=rf"got {folder}x, which is no folder"):
+    with pytest.raises(ValueError, match=rf"got {folder}x, which is not there"):
         module(tmp_path, folder.with_name("meshesx")).setup("fit")
 
 
 def test_a_bad_mesh_is_left_out_and_a_changed_one_read_again(folder: Path, tmp_path: Path) -> None:
     bad = folder / "box1" / "test" / "box1_0099.off"
     bad.write_text("OFF\n8 12 0\n0 0 0\n")
-    with pytest.warns(UserWarning, match=rf"left out 1 of 5 meshes.*{bad.name}: expected 8 vertices"):
-        module(tmp_path, folder).setup("test")
+    for _ in range(2):  # made, then opened
+        with pytest.warns(UserWarning, match=rf"left out 1 of 15,.*{bad.name}: expected 8 vertices"):
+            module(tmp_path, folder).setup("test")
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     data = module(tmp_path, folder)
     data.setup("test")
-    assert "box1/test/box1_0099" in data.sources["test"].pools.names
+    source = data.datasets["test"].source
+    assert "box1/test/box1_0099#0" in source.names(range(len(data.datasets["test"])))
+
+
+class Recorder(LightningModule):
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.zeros(()))
+        self.batches: list[Batch] = []
+
+    def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
+        self.batches.append(batch)
+        return self.weight**2
+
+    def configure_optimizers(self) -> torch.optim.Optimizer:
+        return torch.optim.SGD(self.parameters(), lr=0.1)
+
+
+def train(folder: Path, **options: object) -> list[Batch]:
+    """The batches of two epochs."""
+    outliers = Outliers(ratio=(0.0, 1.0), side="random")
+    data = module(folder, train_pairs=12, batch_size=4, fresh_views=True, train_outliers=outliers, **options)
+    recorder = Recorder()
+    flags = dict.fromkeys(("logger", "enable_progress_bar", "enable_checkpointing", "enable_model_summary"), False)
+    trainer = Trainer(default_root_dir=folder, max_epochs=2, accelerator="cpu", limit_val_batches=0, **flags)
+    trainer.fit(recorder, data)
+    return recorder.batches
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_views_made_on_the_device_are_those_of_the_loader(tmp_path: Path) -> None:
+    batches = train(tmp_path, views_on_device=True)
+    assert [len(batch) for batch in batches] == [4] * 6
+    epochs = [torch.cat([b.index for b in batches[:3]]), torch.cat([b.index for b in batches[3:]])]
+    assert all(torch.equal(epoch.sort().values, torch.arange(12)) for epoch in epochs)
+    poses = {tuple(r.flatten().tolist()) for batch in batches for r in batch.rotation}
+    assert len(poses) == 24
+    for others in (
+        train(tmp_path, views_on_device=True, num_workers=1),
+        train(tmp_path),
+        train(tmp_path, num_workers=2),
+    ):
+        for one, other in zip(batches, others, strict=True):
+            assert one.ids == other.ids
+            assert one.rotation.dtype == torch.float32
+            assert all(torch.equal(getattr(one, f), getattr(other, f)) for f in ("points2d", "points3d", "match3d"))
 
 
 def test_wrong_arguments_are_named(tmp_path: Path) -> None:
@@ -163,7 +234,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         module(tmp_path, train_pairs=0).setup("fit")
     with pytest.raises(ValueError, match="`val_fraction` between 0 and 1, got 1"):
         hold_out(10, 1.0, seed=0)
-    with pytest.raises(ValueError, match="at least 2 training meshes"):
+    with pytest.raises(ValueError, match="at least 2 training rows"):
         hold_out(1, 0.1, seed=0)
 
 
@@ -187,7 +258,7 @@ def test_psb(shared_data: Path, tmp_path: Path) -> None:
         (root / name).symlink_to(shared_data / "psb" / name)
     data = module(tmp_path, root, num_points=1000, pool_size=1000, eval_batch_size=8)
     data.setup("test")
-    assert len(data.sources["test"].pools) == len(list(root.glob("*/test/*.off")))
+    assert len(data.datasets["test"]) == len(list(root.glob("*/test/*.off")))
     for batch in data.test_dataloader():
         camera = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
         matched = torch.take_along_dim(batch.points2d, batch.match3d[..., None], 1)

@@ -1,10 +1,13 @@
 """Preparing data sets: every form of the same data gives the same store, and no kill leaves a wrong one."""
 
+import multiprocessing
 import os
 import shutil
 import signal
 import time
 import zipfile
+import zlib
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +17,14 @@ import trimesh
 from planted_model import plant_model
 
 from bpnp.cli import main
-from bpnp.datamodules import ColmapDataModule, MeshDataModule
-from bpnp.datamodules import prepare as preparing
-from bpnp.datamodules.manifest import StoreError, is_store
-from bpnp.datamodules.meshes.folder import folder_pools
-from bpnp.datamodules.meshes.surface_store import SurfaceStore, open_surfaces, write_surfaces
-from bpnp.datamodules.outliers import Outliers
-from bpnp.datamodules.pair_store import PairStore
-from bpnp.datamodules.prepare import Prepared, prepare_colmap, prepare_meshes
+from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
+from bpnp.datamodules.colmap.prepare import prepare_colmap
+from bpnp.datamodules.meshes.archives import MeshFiles
+from bpnp.datamodules.meshes.prepare import prepare_meshes
+from bpnp.datamodules.meshes.source import POINTS, SURFACES
+from bpnp.datamodules.meshes.surfaces import normalise, read_mesh, sample_surface
+from bpnp.datamodules.prepare import Prepared
+from bpnp.datamodules.store import Store, StoreError, is_store, open_store
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
@@ -53,29 +56,36 @@ def run(source: Path, output: Path, **changes: object) -> Prepared:
     return prepare_meshes(source, output, **options)
 
 
-def zipped(root: Path) -> Path:
+def opened(folder: Path) -> Store:
+    return open_store(folder, SURFACES)
+
+
+def names(store: Store) -> list[str]:
+    return [store.name(row) for row in range(len(store))]
+
+
+def zipped(root: Path, *, folders: Callable[[str], str] = str) -> Path:
     path = root.with_suffix(".zip")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(root.rglob("*.off")):
-            archive.write(file, Path("ModelNet40") / file.relative_to(root))
+            archive.write(file, Path("ModelNet40") / folders(str(file.relative_to(root))))
             archive.writestr(f"__MACOSX/ModelNet40/{file.relative_to(root).parent}/._{file.name}", b"junk")
         archive.writestr("ModelNet40/README.txt", "read me")
     return path
 
 
-def check(store: SurfaceStore, root: Path, tmp_path: Path) -> None:
-    """The store holds what the folder of meshes gives when it is read without preparing it."""
+def check(store: Store, root: Path) -> None:
+    """Samples of each mesh, by its name, training meshes first; the bad ones are listed."""
     assert {name.removeprefix("box0/") for name in store.skipped} == set(BAD)
-    for split, count in (("train", 8), ("test", 4)):
-        with pytest.warns(UserWarning, match="left out"):
-            pools = folder_pools(
-                root, split, pool_size=32, normalisation="unit_sphere", cache_dir=tmp_path / "cache"
-            )  # fmt: skip
-        ours = store.pools(split, pool_size=32)
-        assert ours.names == pools.names
-        assert len(ours) == count
-        assert np.array_equal(ours.points, pools.points)
-        assert ours.radius == pytest.approx(pools.radius)
+    splits = [name.split("/")[1] for name in names(store)]
+    assert splits == ["train"] * 8 + ["test"] * 4
+    for row, name in enumerate(names(store)):
+        mesh = read_mesh(root / f"{name}.off")
+        samples = normalise(
+            sample_surface(mesh, 32, np.random.default_rng(zlib.crc32(name.encode()))), "unit_sphere"
+        )  # fmt: skip
+        np.testing.assert_array_equal(store.row(row)[POINTS], samples.astype("f4"))
+        assert store.columns["radius"][row] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("form", ["folder", "parent", "zip"])
@@ -83,16 +93,30 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
     source = {"folder": lambda: meshes, "parent": lambda: meshes.parent, "zip": lambda: zipped(meshes)}[form]()
     prepared = run(source, tmp_path / "out" / "store")
     assert prepared.counts == {"train": 8, "test": 4}
-    check(open_surfaces(tmp_path / "out" / "store"), meshes, tmp_path)
+    check(opened(tmp_path / "out" / "store"), meshes)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["store"]
+
+
+@pytest.mark.parametrize("form", ["folder", "zip"])
+def test_split_folders_in_capitals_are_the_same_splits(meshes: Path, tmp_path: Path, form: str) -> None:
+    """What has been prepared can be opened, whether the folder is `train` or `Train`."""
+    source = zipped(meshes, folders=lambda name: name.replace("train", "Train").replace("test", "TEST"))
+    if form == "folder":
+        source = tmp_path / "unpacked"
+        zipfile.ZipFile(meshes.with_suffix(".zip")).extractall(source)
+    assert run(source, tmp_path / "store").counts == {"train": 8, "test": 4}
+    data = MeshDataModule(str(tmp_path / "store"), num_points=16, pool_size=32, train_pairs=8, val_fraction=0.2)
+    data.setup()
+    assert len(data.datasets["train"].source.rows) == 6
+    assert len(data.datasets["test"]) == 4
 
 
 def test_several_processes_give_the_same_bytes(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(meshes, tmp_path / "one")
-    monkeypatch.setattr(preparing, "MESHES_A_PART", 3)
+    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 3)
     run(meshes, tmp_path / "two", processes=2)
-    for name in ("points.bin", "names.txt", "radii.bin"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
+    for path in (tmp_path / "one").iterdir():
+        assert (tmp_path / "two" / path.name).read_bytes() == path.read_bytes()
 
 
 def hdf5(folder: Path) -> dict[str, np.ndarray]:
@@ -114,9 +138,10 @@ def hdf5(folder: Path) -> dict[str, np.ndarray]:
 def test_sampled_hdf5_files(tmp_path: Path) -> None:
     expected = hdf5(tmp_path / "modelnet40_ply_hdf5_2048")
     run(tmp_path / "modelnet40_ply_hdf5_2048", tmp_path / "store", normalisation="none")
-    store = open_surfaces(tmp_path / "store")
-    assert set(store.names) == set(expected)
-    for name, points in zip(store.names, store.points, strict=True):
+    store = opened(tmp_path / "store")
+    assert set(names(store)) == set(expected)
+    for row, name in enumerate(names(store)):
+        points = store.row(row)[POINTS]
         assert {tuple(p) for p in points} <= {tuple(p) for p in expected[name]}
         assert len(np.unique(points, axis=0)) == 32
     with pytest.raises(StoreError, match="at least one usable mesh.*expected 99 finite points"):
@@ -197,7 +222,7 @@ def killed(work: object, seconds: float) -> bool:
 def test_no_kill_leaves_a_wrong_store(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:  # fmt: skip
-    monkeypatch.setattr(preparing, "MESHES_A_PART", 2)
+    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
     scenes(tmp_path / "scenes", 8)
 
     def work(output: str = "store") -> None:
@@ -224,32 +249,53 @@ def test_no_kill_leaves_a_wrong_store(
     assert {path.name for path in tmp_path.iterdir() if "unfinished" in path.name} == set()
 
 
+class Stopping:
+    """Samples meshes of any archive until `left` have been sampled; counts them by name."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, left: int = 1000) -> None:
+        self.names: list[str] = []
+        whole = MeshFiles.samples
+
+        def samples(archive: MeshFiles, name: str, count: int, mode: str) -> np.ndarray:
+            if len(self.names) == left:
+                raise KeyboardInterrupt
+            self.names.append(name)
+            return whole(archive, name, count, mode)
+
+        monkeypatch.setattr(MeshFiles, "samples", samples)
+
+
 def test_finished_parts_are_kept(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(preparing, "MESHES_A_PART", 2)
-    done: list[Path] = []
-    sample = preparing.sample_part
-
-    def stop_at_four(job: tuple, path: Path) -> None:
-        if len(done) == 4:
-            raise KeyboardInterrupt
-        sample(job, path)
-        done.append(path)
-
-    monkeypatch.setattr(preparing, "sample_part", stop_at_four)
-    with pytest.raises(KeyboardInterrupt):
-        run(meshes, tmp_path / "store")
-    monkeypatch.setattr(preparing, "sample_part", lambda job, path: (done.append(path), sample(job, path)))
+    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
+    with monkeypatch.context() as patch:
+        first = Stopping(patch, 9)
+        with pytest.raises(KeyboardInterrupt):
+            run(meshes, tmp_path / "store")
+    rest = Stopping(monkeypatch)
     run(meshes, tmp_path / "store")
-    assert len(done) == len(set(done)) == 10
-    check(open_surfaces(tmp_path / "store"), meshes, tmp_path)
+    assert len(first.names) + len(rest.names) == 19 + 1  # the ninth mesh was sampled twice
+    assert set(first.names) & set(rest.names) == {first.names[-1]}
+    check(opened(tmp_path / "store"), meshes)
+
+
+def test_parts_of_another_preparation_are_not_used(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:  # fmt: skip
+    run(meshes, tmp_path / "whole")
+    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
+    with monkeypatch.context() as patch:
+        Stopping(patch, 9)
+        with pytest.raises(KeyboardInterrupt):
+            run(meshes, tmp_path / "store", normalisation="none")
+    assert len([path for path in (tmp_path / ".store.unfinished").iterdir() if path.is_dir()]) == 4
+    run(meshes, tmp_path / "store")
+    for path in (tmp_path / "whole").iterdir():
+        assert (tmp_path / "store" / path.name).read_bytes() == path.read_bytes()
 
 
 def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def again(job: tuple, path: Path) -> None:
-        run(meshes, tmp_path / "store")
-
-    monkeypatch.setattr(preparing, "sample_part", again)
-    with pytest.raises(StoreError, match="another at work"):
+    monkeypatch.setattr(MeshFiles, "samples", lambda *_: run(meshes, tmp_path / "store"))
+    with pytest.raises(ValueError, match="no other process writes to"):
         run(meshes, tmp_path / "store")
 
 
@@ -283,7 +329,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
         camera = stored.points3d[i, true] @ stored.rotation[i].mT + stored.translation[i]
         seen = stored.points2d[i, stored.match3d[i, true]]
         torch.testing.assert_close(camera[:, :2] / camera[:, 2:], seen, rtol=0, atol=2e-5)
-    assert set(PairStore(tmp_path / "store").skipped) == {"0003", "0000"}
+    assert set(open_store(tmp_path / "store", "pairs").skipped) == {"0003", "0000"}
     with pytest.raises(StoreError, match="clutter.*0.5.*--clutter 0.6"):
         ColmapDataModule(str(tmp_path / "store"), **(options | {"clutter": 0.6})).setup("test")
 
@@ -318,51 +364,70 @@ def test_what_is_left_of_removed_parts_is_not_used(
 ) -> None:  # fmt: skip
     """A kill while the parts are removed, after the store has got its name."""
     run(meshes, tmp_path / "whole")
-    monkeypatch.setattr(preparing, "MESHES_A_PART", 2)
+    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
     with monkeypatch.context() as patch:
         patch.setattr(shutil, "rmtree", _remove_one_file_and_stop)
         with pytest.raises(KeyboardInterrupt):
             run(meshes, tmp_path / "store")
     shutil.rmtree(tmp_path / "store")
     run(meshes, tmp_path / "store")
-    assert (tmp_path / "store" / "points.bin").read_bytes() == (tmp_path / "whole" / "points.bin").read_bytes()
+    for path in (tmp_path / "whole").iterdir():
+        assert (tmp_path / "store" / path.name).read_bytes() == path.read_bytes()
 
 
 def _remove_one_file_and_stop(folder: Path, *, ignore_errors: bool = False) -> None:
     if folder.name.startswith("0"):
-        (folder / "points.bin").unlink()
+        (folder / "points.npy").unlink()
         raise KeyboardInterrupt
 
 
-@pytest.mark.parametrize("name", ["points.bin", "names.txt", "radii.bin", "manifest.json"])
-def test_a_damaged_surface_store_is_one_error(meshes: Path, tmp_path: Path, name: str) -> None:
-    run(meshes, tmp_path / "store")
-    path = tmp_path / "store" / name
-    whole = path.read_bytes()
-    flipped = bytearray(whole)
-    flipped[len(whole) // 2] ^= 1
-    for content in (whole[:-1], whole + b"0", bytes(flipped), b""):
-        path.write_bytes(content)
-        with pytest.raises(StoreError, match=str(tmp_path / "store")):
-            open_surfaces(tmp_path / "store")
-    path.write_bytes(whole)
-    assert len(open_surfaces(tmp_path / "store").names) == 12
+def module(meshes: Path, cache: Path) -> MeshDataModule:
+    data = MeshDataModule(str(meshes), num_points=16, pool_size=32, cache_dir=str(cache), val_fraction=0.2)
+    with pytest.warns(UserWarning, match="left out 7 of 19, all listed in .*manifest.json"):
+        data.setup()
+    return data
 
 
-def test_parts_of_another_preparation_are_not_used(
+def test_meshes_that_were_not_prepared_are_sampled_into_the_cache_once(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    run(meshes, tmp_path / "whole")
-    monkeypatch.setattr(preparing, "write_surfaces", _write_parts_only)
-    with pytest.raises(KeyboardInterrupt):
-        run(meshes, tmp_path / "store", normalisation="none")
-    assert len(list((tmp_path / ".store.unfinished").iterdir())) == 3
-    monkeypatch.setattr(preparing, "write_surfaces", write_surfaces)
-    run(meshes, tmp_path / "store")
-    assert (tmp_path / "store" / "points.bin").read_bytes() == (tmp_path / "whole" / "points.bin").read_bytes()
+) -> None:
+    counted = Stopping(monkeypatch)
+    module(meshes, tmp_path / "cache")
+    (folder,) = (tmp_path / "cache").iterdir()
+    check(opened(folder), meshes)
+    module(meshes, tmp_path / "cache")
+    assert len(counted.names) == 19
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    for name in ("points.npy", "radius.npy", "manifest.json"):
+        damaged = bytearray(before[name])
+        damaged[-1] ^= 1
+        (folder / name).write_bytes(damaged)
+        with pytest.warns(UserWarning, match=rf"the cached store {folder} is damaged .*; making it again"):
+            module(meshes, tmp_path / "cache")
+        assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert len(counted.names) == 4 * 19
 
 
-def _write_parts_only(folder: Path, *args: object, **options: object) -> None:
-    if folder.name == "store":
-        raise KeyboardInterrupt
-    write_surfaces(folder, *args, **options)
+def test_the_cache_is_the_users_wherever_the_work_is(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    options = {"num_points": 16, "pool_size": 32, "train_shapes": 3, "val_shapes": 3}
+    for variable, folder in (("XDG_CACHE_HOME", "a/bpnp"), ("BPNP_CACHE", "b")):
+        monkeypatch.setenv(variable, str(tmp_path / folder.split("/")[0]))
+        for place in ("x", "y"):
+            (tmp_path / place).mkdir(exist_ok=True)
+            monkeypatch.chdir(tmp_path / place)
+            MeshDataModule(**options).setup("validate")
+            assert list((tmp_path / place).iterdir()) == []
+        assert len(list((tmp_path / folder).iterdir())) == 1
+
+
+def test_two_processes_may_make_one_cache_at_once(meshes: Path, tmp_path: Path) -> None:
+    context = multiprocessing.get_context("fork")
+    children = [context.Process(target=module, args=(meshes, tmp_path / "cache")) for _ in range(2)]
+    for child in children:
+        child.start()
+    for child in children:
+        child.join()
+    assert [child.exitcode for child in children] == [0, 0]
+    assert len(list((tmp_path / "cache").iterdir())) == 1

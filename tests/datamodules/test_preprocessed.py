@@ -9,22 +9,23 @@ import pytest
 from released_pickles import Sample, sample, write
 
 from bpnp.cli import main
-from bpnp.datamodules.manifest import StoreError
-from bpnp.datamodules.outliers import Outliers
-from bpnp.datamodules.pair_store import PairStore
-from bpnp.datamodules.released.module import PreprocessedDataModule, prepare_preprocessed
+from bpnp.datamodules.augment import Outliers
+from bpnp.datamodules.released.module import PreprocessedDataModule
 from bpnp.datamodules.released.pickles import PickleError
+from bpnp.datamodules.released.prepare import prepare_preprocessed
+from bpnp.datamodules.store import Store, StoreError, open_store
+from bpnp.datamodules.stored_pairs import PAIRS, scene_rows, stored_pair
 
 
-def check(store: PairStore, samples: list[Sample]) -> None:
+def check(store: Store, samples: list[Sample]) -> None:
     assert len(store) == 2 * len(samples)
     for i in range(len(store)):
-        pair, expected = store.pair(i), samples[i % len(samples)]
+        pair, expected = stored_pair(store, i), samples[i % len(samples)]
         count = expected["num_points_2d"][0]
         assert (len(pair.points2d), len(pair.points3d)) == (count, count)
-        assert (pair.match3d >= 0).all()
+        assert pair.matched == count
         camera = pair.points3d @ pair.rotation.T + pair.translation
-        assert pair.points2d[pair.match3d] == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
+        assert pair.points2d == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
         assert pair.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
 
 
@@ -33,10 +34,10 @@ def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     write(tmp_path / "data", samples)
     main(["prepare", "preprocessed", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
     assert "8 train, 8 test" in capsys.readouterr().out
-    store = PairStore(tmp_path / "store")
+    store = open_store(tmp_path / "store", PAIRS)
     check(store, samples)
-    assert store.scenes == ("train", "test")
-    assert store.pair(0).focal == 800
+    assert list(scene_rows(store)) == ["train", "test"]
+    assert stored_pair(store, 0).focal == 800
     assert prepare_preprocessed(tmp_path / "data", tmp_path / "store").counts == {"train": 8, "test": 8}
 
 
@@ -47,7 +48,7 @@ def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
         s["W_gt"] = np.resize(np.argsort(s["W_gt"][:count]), 40)
     write(tmp_path, samples, "data61_2d3d")
     prepare_preprocessed(tmp_path, tmp_path / "store")
-    check(PairStore(tmp_path / "store"), samples)
+    check(open_store(tmp_path / "store", PAIRS), samples)
 
 
 def test_the_form_before_preprocessing(tmp_path: Path) -> None:
@@ -61,8 +62,8 @@ def test_the_form_before_preprocessing(tmp_path: Path) -> None:
                 (folder / f"{name}.pkl").write_bytes(pickle.dumps(values, 2))
             (folder / "t.pkl").write_bytes(pickle.dumps([s["t_gt"][:, None] for s in part], 2))
     prepare_preprocessed(tmp_path, tmp_path / "store")
-    store = PairStore(tmp_path / "store")
-    assert store.scenes == ("train/0001", "train/0002", "test/0001", "test/0002")
+    store = open_store(tmp_path / "store", PAIRS)
+    assert tuple(scene_rows(store)) == ("train/0001", "train/0002", "test/0001", "test/0002")
     check(store, samples)
 
 
@@ -87,6 +88,16 @@ def test_bad_samples_are_counted(tmp_path: Path) -> None:
     assert all(reason.startswith("expected") for reason in prepared.skipped.values())
 
 
+def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:
+    """Of two 3D points that share a 2D point the first is its partner."""
+    samples = [sample(i) for i in range(8)]
+    count = int(samples[0]["num_points_2d"][0])
+    samples[0]["W_gt"][1] = samples[0]["W_gt"][0]
+    prepare_preprocessed(write(tmp_path, samples), tmp_path / "store")
+    pair = stored_pair(open_store(tmp_path / "store", PAIRS), 0)
+    assert (pair.matched, len(pair.points2d), len(pair.points3d)) == (count - 1, count, count)
+
+
 class Exploit:
     def __reduce__(self) -> tuple[object, ...]:
         return os.system, ("touch hacked",)
@@ -98,7 +109,7 @@ def test_bad_sources_are_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     for content, message in (
         (pickle.dumps([Exploit()]), "system"),
         (b"", "p3d.pkl"),
-        (pickle.dumps(3), "dict or list"),
+        (pickle.dumps(3), "a bare int is refused"),
         (pickle.dumps([]), "at least one sample"),
         (pickle.dumps([np.zeros((4, 3))] * 3), "too, got"),
     ):
@@ -143,4 +154,4 @@ def test_data_module(tmp_path: Path) -> None:
     assert len(list((tmp_path / "cache").iterdir())) == 1
     again = PreprocessedDataModule(str(next((tmp_path / "cache").iterdir())), **options)
     again.setup("test")
-    assert len(again.sources["test"].sizes) == 20
+    assert len(again.datasets["test"]) == 20

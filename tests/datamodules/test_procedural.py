@@ -9,22 +9,26 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.pools import SurfacePools
-from bpnp.datamodules.meshes.procedural import procedural_pools, procedural_shape
+from bpnp.datamodules.meshes.prepare import open_procedural
+from bpnp.datamodules.meshes.procedural import procedural_shape
+from bpnp.datamodules.meshes.source import POINTS
 from bpnp.datamodules.meshes.surfaces import normalise, sample_surface
+from bpnp.datamodules.store import Store
 
 
-def pools(folder: Path, split: str, count: int, *, seed: int = 0) -> SurfacePools:
-    return procedural_pools(split, count, seed=seed, pool_size=64, normalisation="unit_sphere", cache_dir=folder)
+def shapes(folder: Path, split: str, count: int, *, seed: int = 0) -> Store:
+    return open_procedural(
+        split, count, seed=seed, points=64, normalisation="unit_sphere", cache_dir=str(folder)
+    )  # fmt: skip
 
 
 def test_a_shape_depends_on_seed_split_and_number_alone(tmp_path: Path) -> None:
-    few, many = pools(tmp_path / "0", "train", 3), pools(tmp_path / "1", "train", 6)
-    np.testing.assert_array_equal(few.points, many.points[:3])
-    assert few.names == ("procedural/train/000000", "procedural/train/000001", "procedural/train/000002")
-    others = [pools(tmp_path, "test", 3), pools(tmp_path, "val", 3), pools(tmp_path, "train", 3, seed=1)]
-    shapes = np.concatenate([many.points, *(other.points for other in others)]).reshape(15, -1)
-    assert len(np.unique(shapes, axis=0)) == 15
+    few, many = shapes(tmp_path / "0", "train", 3), shapes(tmp_path / "1", "train", 6)
+    np.testing.assert_array_equal(few.bulk[POINTS], many.bulk[POINTS][: 3 * 64])
+    assert [few.name(i) for i in range(3)] == [f"procedural/train/00000{i}" for i in range(3)]
+    others = [shapes(tmp_path, "test", 3), shapes(tmp_path, "val", 3), shapes(tmp_path, "train", 3, seed=1)]
+    drawn = np.concatenate([many.bulk[POINTS], *(other.bulk[POINTS] for other in others)]).reshape(15, -1)
+    assert len(np.unique(drawn, axis=0)) == 15
 
 
 def test_shapes_are_connected_and_varied() -> None:
@@ -58,4 +62,4 @@ def test_shapes_are_not_symmetric() -> None:
 
 def test_no_shapes_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="at least one procedural val shape, got 0"):
-        pools(tmp_path, "val", 0)
+        shapes(tmp_path, "val", 0)

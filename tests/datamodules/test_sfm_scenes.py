@@ -5,23 +5,25 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import torch
 from jsonargparse import ArgumentParser
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules import Outliers, Pair, PairSource, SfmSceneDataModule
+from bpnp.datamodules.augment import Drawn
 from bpnp.datamodules.facades.module import SfmSceneSource
 from bpnp.datamodules.facades.scenes import Walls, draw_scene
-from bpnp.datamodules.facades.views import SfmOptions, draw_camera, hidden, look
-from bpnp.datamodules.outliers import Drawn
+from bpnp.datamodules.facades.views import SfmOptions, draw_camera, draw_sfm_pair, hidden, look
 
 
-def source(*, seed: int = 0, split: str = "train", fresh: bool = True, **options: object) -> SfmSceneSource:
-    return SfmSceneSource(SfmOptions(**options), num_pairs=100, seed=seed, split=split, fresh=fresh)
+def source(*, seed: tuple[int, ...] = (0, 0), **options: object) -> SfmSceneSource:
+    return SfmSceneSource(SfmOptions(**options), num_pairs=100, seed=seed, label="train")
 
 
 def pairs(count: int, **options: object) -> list[Pair]:
-    return [source(**options).pair(i, 0) for i in range(count)]
+    rngs = (np.random.default_rng([0, 0, 0, i]) for i in range(count))
+    return [draw_sfm_pair(f"sfm/{i}", SfmOptions(**options), rng) for i, rng in enumerate(rngs)]
 
 
 def shown(pair: Pair) -> np.ndarray:
@@ -31,8 +33,8 @@ def shown(pair: Pair) -> np.ndarray:
 
 
 def matched(pair: Pair) -> tuple[np.ndarray, np.ndarray]:
-    true = np.flatnonzero(pair.match3d >= 0)
-    return true, pair.match3d[true]
+    true = np.arange(pair.matched)
+    return true, true
 
 
 def test_true_pairs_reproject_within_the_noise() -> None:
@@ -101,22 +103,16 @@ def test_a_range_of_clutter_is_drawn_for_each_pair(side: str) -> None:
         assert kinds.tolist() == [0, 0, 100, 0]
 
 
-def same(a: Pair, b: Pair) -> bool:
-    return np.array_equal(a.points2d, b.points2d) and np.array_equal(a.points3d, b.points3d) and a.focal == b.focal
-
-
-def test_a_pair_is_a_function_of_seed_split_epoch_and_index() -> None:
+def test_a_pair_is_a_function_of_seed_epoch_and_index() -> None:
     options = {"num_points": 20, "clutter": (0.0, 1.0)}
-    first = source(**options)
+    first, index = source(**options), torch.tensor([3, 4])
     assert isinstance(first, PairSource)
-    first.pair(3, 0)
-    assert same(first.pair(4, 2), source(**options).pair(4, 2))
-    others = [
-        first.pair(4, 1), first.pair(5, 2), source(seed=1, **options).pair(4, 2),
-        source(split="val", **options).pair(4, 2),
-    ]  # fmt: skip
-    assert not any(same(first.pair(4, 2), other) for other in others)
-    assert same(source(fresh=False, **options).pair(4, 0), source(fresh=False, **options).pair(4, 7))
+    pair = first.batch(index[1:], 2)
+    size = int(pair.count3d)
+    assert torch.equal(pair.points3d[0], source(**options).batch(index, 2).points3d[1, :size])
+    others = [first.batch(index[1:], 1), first.batch(index[:1], 2)]
+    others += [source(seed=seed, **options).batch(index[1:], 2) for seed in ((1, 0), (0, 1))]
+    assert not any(torch.equal(pair.points3d[0, :16], other.points3d[0, :16]) for other in others)
 
 
 def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
@@ -193,7 +189,7 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
     assert data.outliers["train"] == Outliers(ratio=(0.0, 1.0))
     batches = list(data.train_dataloader())
     assert sorted(i for batch in batches for i in batch.index.tolist()) == list(range(8))
-    assert max(batch.points3d.shape[1] for batch in batches) <= data.sources["train"].sizes[0]
+    assert max(batch.points3d.shape[1] for batch in batches) <= data.datasets["train"].sizes[0]
     assert sum(len(batch) for batch in data.test_dataloader()) == 3
 
 
@@ -212,4 +208,4 @@ def test_wrong_options_are_named(name: str, value: object) -> None:
 def test_a_camera_that_never_sees_enough_is_an_error() -> None:
     narrow: Drawn = 5.0
     with pytest.raises(ValueError, match="expected a camera that sees 500 mapped points in 50 scenes"):
-        source(num_points=500, min_points=500, field_of_view=narrow).pair(0, 0)
+        pairs(1, num_points=500, min_points=500, field_of_view=narrow)

@@ -11,8 +11,7 @@ import torch
 from small_data import small_net
 
 from bpnp import Batch, BPnPNet, Matcher, solve
-from bpnp.datamodules import MeshDataModule
-from bpnp.datamodules.outliers import Outliers
+from bpnp.datamodules import MeshDataModule, Outliers
 from bpnp.metrics import rotation_error
 from bpnp.models.composition import described
 from bpnp.models.weights import LEARNED, pack, pretrained_names, pretrained_path

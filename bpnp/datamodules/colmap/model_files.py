@@ -1,9 +1,9 @@
 """The three files of a COLMAP model, binary or text, as plain numpy arrays.
 
-Read here and not by pycolmap, because pycolmap 4.2 takes a truncated `cameras.bin` for a whole one (the parameters are
-then whatever was in memory), fills the memory on a truncated `points3D.bin` and never returns from a truncated
-`frames.bin`. Every size is checked against the file before anything is read. Poses are those of `images`, which
-COLMAP writes composed with the rig, so `rigs` and `frames` are not needed.
+Text files go to pycolmap. Binary ones do not, because pycolmap 4.2 takes a truncated `cameras.bin` for a whole one (the
+parameters are then whatever was in memory), fills the memory on a truncated `points3D.bin` and never returns from a
+truncated `frames.bin`: here every size is checked against the file before anything is read. Poses are those of
+`images`, which COLMAP writes composed with the rig, so `rigs` and `frames` are not needed.
 
 Source: https://colmap.github.io/format.html
 """
@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.datamodules.colmap.model_records import POINT, CameraRecord, ColmapError, ImageRecord, ModelRecords
-from bpnp.datamodules.colmap.text_files import text_camera, text_image, text_point, text_records
+from bpnp.datamodules.colmap.text_files import read_text
 
 __all__ = ["FILES", "CameraRecord", "ColmapError", "ImageRecord", "ModelRecords", "model_format", "read_records"]
 
@@ -54,12 +54,9 @@ def read_records(folder: Path, *, camera_models: Mapping[int, tuple[str, int]]) 
         images = list(_binary_images(_Cursor(paths[1], contents[1])))
         points = _binary_points(_Cursor(paths[2], contents[2]))
     else:
-        names = dict(camera_models.values())
-        cameras = dict(text_records(paths[0], contents[0][:], lambda line, _: text_camera(line, names)))
-        images = list(text_records(paths[1], contents[1][:], text_image))
-        points = np.array(list(text_records(paths[2], contents[2][:], text_point)), POINT)
-    for path, entries in zip(paths, (cameras, images, points), strict=True):
-        if not len(entries):
+        cameras, images, points = read_text(paths, [content[:] for content in contents])
+    for path, count in zip(paths, (len(cameras), len(images), len(points)), strict=True):
+        if not count:
             raise ColmapError(f"expected cameras, images and points in a COLMAP model, got none in {path}; try another")
     return ModelRecords(
         cameras=cameras,

@@ -2,36 +2,26 @@
 
 import warnings
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lightning import LightningDataModule
 from lightning.pytorch.trainer.states import TrainerFn
-from torch.utils.data import DataLoader
 
+from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.colmap.model_files import ColmapError
-from bpnp.datamodules.colmap.pairs import ColmapSource, Side
+from bpnp.datamodules.colmap.pairs import ColmapSource
 from bpnp.datamodules.colmap.reconstruction import Reconstruction, read_reconstruction
 from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
-from bpnp.datamodules.loader import PairSource, pair_loader
-from bpnp.datamodules.manifest import is_store
-from bpnp.datamodules.outliers import Outliers, harder
-from bpnp.datamodules.pair_store import PairStore
-from bpnp.datamodules.store_source import StoreSource
-from bpnp.types import Batch
-
-PARTS = {
-    "fit": ("train", "val"),
-    "validate": ("val",),
-    "test": ("test",),
-    "predict": ("predict",),
-    None: ("train", "val", "test", "predict"),
-}
+from bpnp.datamodules.module import STAGES, PairDataModule
+from bpnp.datamodules.pair import PairSource
+from bpnp.datamodules.store import Store, StoreError, is_store, open_store
+from bpnp.datamodules.stored_pairs import PAIRS, StoredPairs, check_limits, scene_rows
 
 
-class ColmapDataModule(LightningDataModule):
+class ColmapDataModule(PairDataModule):
     """Photos with known poses in COLMAP models: MegaDepth, or scenes of your own.
 
     Scenes are split, not images, so that no landmark is both trained and tested on, as in Campbell et al. (ECCV 2020).
@@ -53,14 +43,8 @@ class ColmapDataModule(LightningDataModule):
         clutter: natural clutter, as a ratio to the true pairs: keypoints without a 3D point, and points of the scene
             that the image does not see.
         clutter_side: the side that gets clutter, both, 2d or 3d.
-        train_outliers: synthetic outliers and occlusion in training and validation; none for none.
-        test_outliers: the same in testing and prediction.
         rotate: turn each pair's scene by a random rotation; never in prediction.
-        batch_size: training pairs per step, over all processes.
-        eval_batch_size: pairs per step in validation, testing and prediction; none for batch_size.
-        max_cells: limit of pairs x 2D points x 3D points of such a step, to bound the memory; none for no limit.
-        num_workers: loader processes.
-        seed: of the split, the subsets, the clutter and the order.
+        loading: options of `PairDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
     """
 
     def __init__(
@@ -78,17 +62,16 @@ class ColmapDataModule(LightningDataModule):
         eval_max_points: int | None = None,
         clutter: float = 0.0,
         clutter_side: Side = "both",
-        train_outliers: Outliers | None = None,
-        test_outliers: Outliers | None = None,
         rotate: bool = False,
-        batch_size: int = 16,
-        eval_batch_size: int | None = None,
-        max_cells: int | None = 2**25,
-        num_workers: int = 0,
-        seed: int = 0,
+        **loading: Any,
     ) -> None:
-        super().__init__()
-        self.root = root
+        super().__init__(**loading)
+        check_limits(min_points, max_points, eval_max_points)
+        if not clutter < np.inf:
+            raise ValueError(f"expected a finite `clutter`, got {clutter}; 0.5 adds half as many points")
+        self.root, self.min_points, self.fresh = root, min_points, fresh_subsets
+        self.training = Augmentation(max_points, clutter, clutter_side, rotate)
+        self.evaluation = replace(self.training, max_points=eval_max_points)
         self._split = partial(
             split_scenes,
             train=_scene_list("train_scenes", train_scenes),
@@ -96,15 +79,10 @@ class ColmapDataModule(LightningDataModule):
             test=_scene_list("test_scenes", test_scenes),
             val_fraction=val_fraction,
             test_fraction=test_fraction,
-            seed=seed,
+            seed=self.seed,
         )
-        self._options: dict[str, Any] = {"min_points": min_points, "clutter": clutter, "clutter_side": clutter_side}
-        self.outliers = {"train": train_outliers, "val": train_outliers, "test": test_outliers}
-        self.max_points, self.eval_max_points = max_points, eval_max_points
-        self.fresh_subsets, self.rotate = fresh_subsets, rotate
-        self.batch_size, self.eval_batch_size = batch_size, eval_batch_size or batch_size
-        self.max_cells, self.num_workers, self.seed = max_cells, num_workers, seed
-        self.sources: dict[str, PairSource] = {}
+        self._store: Store | None = None
+        self._scenes: dict[str, Any] = {}  # of each scene its rows in the store, or its models
         self._read: dict[str, Reconstruction] = {}
 
     def setup(self, stage: str | None = None) -> None:
@@ -114,68 +92,41 @@ class ColmapDataModule(LightningDataModule):
         leaves none for the stage; fit does without validation scenes. A model that cannot be read is skipped with a
         warning if the part (train, val, test) has others.
         """
-        store = PairStore(self.root) if isinstance(self.root, str) and is_store(self.root) else None
-        scenes = dict.fromkeys(store.scenes, {}) if store else find_scenes(self.root)
-        split = self._split(list(scenes))
-        split["predict"] = split["test"]
-        for part in PARTS[stage]:
-            if split[part]:
-                models = {scene: scenes[scene] for scene in split[part]}
-                source = self._stored(store, split[part], part) if store else self._read_anew(models, part)
-                outliers = self.outliers["test" if part == "predict" else part]
-                fresh = self.fresh_subsets and part == "train"
-                self.sources[part] = harder(source, outliers, seed=self.seed, fresh=fresh)
-            elif stage is not None and (stage, part) != ("fit", "val"):
-                name = stage.value if isinstance(stage, TrainerFn) else stage
-                raise ValueError(
-                    f"expected scenes for {name}, got none left of {', '.join(scenes)}; try to name them in the "
-                    "*_scenes arguments, or other fractions"
-                )
+        self._store = open_store(self.root, PAIRS) if isinstance(self.root, str) and is_store(self.root) else None
+        self._scenes = scene_rows(self._store) if self._store else find_scenes(self.root)
+        self._parts = self._split(list(self._scenes))
+        clutter = self.training.clutter
+        if self._store and clutter > (kept := self._store.parameters.get("clutter", np.inf)):
+            raise StoreError(
+                f"expected `clutter` of at most {kept}, what {self.root} was made with, got {clutter}; try that, or "
+                f"preparing again with --clutter {clutter}"
+            )
+        super().setup(stage)
+        if stage is not None and STAGES[stage][0] not in self.datasets:
+            name = stage.value if isinstance(stage, TrainerFn) else stage
+            raise ValueError(
+                f"expected scenes for {name}, got none left of {', '.join(self._scenes)}; try to name them in the "
+                "*_scenes arguments, or other fractions"
+            )
 
-    def train_dataloader(self) -> DataLoader[Batch]:
-        return self._loader("train")
+    def _augmentation(self, part: str) -> Augmentation:
+        how = self.training if part == "train" else self.evaluation
+        return replace(how, rotate=how.rotate and part != "predict", outliers=self.outliers[part])
 
-    def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
-        return self._loader("val") if "val" in self.sources or not self.sources else []
+    def _source(self, part: str, seed: tuple[int, int]) -> PairSource | None:
+        """The pairs of a part's scenes; None if it has no scenes."""
+        scenes = [self._scenes[scene] for scene in self._parts["test" if part == "predict" else part]]
+        if not scenes:
+            return None
+        if self._store is not None:
+            return StoredPairs(self._store, np.sort(np.concatenate(scenes)), min_points=self.min_points)
+        models = {name: folder for models in scenes for name, folder in models.items()}
+        clutter = self.training.clutter
+        return ColmapSource(self._models(models), min_points=self.min_points, clutter=clutter, seed=seed)
 
-    def test_dataloader(self) -> DataLoader[Batch]:
-        return self._loader("test")
-
-    def predict_dataloader(self) -> DataLoader[Batch]:
-        return self._loader("predict")
-
-    def _loader(self, part: str) -> DataLoader[Batch]:
-        if part not in self.sources:
-            raise ValueError(f"expected `setup` before the {part} loader, got no call; try `setup()`")
-        training = part == "train"
-        return pair_loader(
-            self.sources[part],
-            batch_size=self.batch_size if training else self.eval_batch_size,
-            shuffle=training,
-            seed=self.seed,
-            num_workers=self.num_workers,
-            max_cells=None if training else self.max_cells,
-        )
-
-    def _drawing(self, part: str) -> dict[str, Any]:
-        """The options of a source, of either kind, for a part."""
-        return self._options | {
-            "max_points": self.max_points if part == "train" else self.eval_max_points,
-            "rotate": self.rotate and part != "predict",
-            "fresh": self.fresh_subsets and part == "train",
-            "seed": self.seed,
-        }
-
-    def _stored(self, store: PairStore, scenes: list[str], part: str) -> StoreSource:
-        wanted = [store.scenes.index(scene) for scene in scenes]
-        return StoreSource(store, np.flatnonzero(np.isin(store.scene, wanted)), **self._drawing(part))
-
-    def _read_anew(self, scenes: Mapping[str, Mapping[str, Path]], part: str) -> ColmapSource:
-        return ColmapSource(self._reconstructions(scenes), **self._drawing(part))
-
-    def _reconstructions(self, scenes: Mapping[str, Mapping[str, Path]]) -> list[Reconstruction]:
+    def _models(self, folders: Mapping[str, Path]) -> list[Reconstruction]:
         found, failures = [], []
-        for name, folder in (item for models in scenes.values() for item in models.items()):
+        for name, folder in folders.items():
             try:
                 if name not in self._read:
                     self._read[name] = read_reconstruction(folder, name=name)
@@ -186,8 +137,7 @@ class ColmapDataModule(LightningDataModule):
             raise failures[0]
         if failures:
             warnings.warn(
-                f"skipped {len(failures)} of {len(found) + len(failures)} COLMAP models: "
-                + "; ".join(map(str, failures[:4])),
+                f"skipped {len(failures)} of {len(folders)} COLMAP models: {'; '.join(map(str, failures[:4]))}",
                 stacklevel=3,
             )
         return found

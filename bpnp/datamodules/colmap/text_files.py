@@ -1,47 +1,55 @@
-"""The text form of a COLMAP model: cameras.txt, images.txt and points3D.txt, record by record.
+"""The text form of a COLMAP model, cameras.txt, images.txt and points3D.txt, read by pycolmap.
 
 Source: https://colmap.github.io/format.html
 """
 
-import operator
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bpnp.datamodules.colmap.model_records import CameraRecord, ColmapError, ImageRecord
+from bpnp.cameras import read_text_model
+from bpnp.datamodules.colmap.model_records import POINT, CameraRecord, ColmapError, ImageRecord
+
+LINES = {"cameras": 1, "images": 2, "points3D": 1}  # of a record
 
 
-def text_records(path: Path, content: bytes, parse: Callable[[bytes, Iterator[bytes]], Any]) -> Iterator[Any]:
-    """Every record of a text file. `parse` gets its first line, and the lines after it to draw from.
+def read_text(
+    paths: Sequence[Path], contents: Sequence[bytes]
+) -> tuple[dict[int, CameraRecord], list[ImageRecord], NDArray[Any]]:
+    """Cameras, images and points in the three files. Raises ColmapError that names the file, or all three."""
+    for path, content in zip(paths, contents, strict=True):
+        _check_whole(path, content)
+    try:
+        model = read_text_model(paths[0].parent)
+        names = _image_names(contents[1])
+        images = [_image(image, names[image.image_id]) for image in model.images.values()]
+    except ValueError as error:
+        files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
+        raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
+    cameras = {key: CameraRecord(camera.model.name, np.array(camera.params)) for key, camera in model.cameras.items()}
+    points = np.zeros(len(model.points3D), POINT)
+    for row, (key, point) in zip(points, model.points3D.items(), strict=True):
+        row["point_id"], row["position"], row["colour"], row["error"] = key, point.xyz, point.color, point.error
+        row["track_length"] = point.track.length()
+    return cameras, images, points
 
-    Comments and blank lines between records are skipped. The count in COLMAP's header, where there is one, and the
-    line break at the end are what shows that a text file was cut.
+
+def _check_whole(path: Path, content: bytes) -> None:
+    """What pycolmap does not see: that a file was cut between two records, or in the last number.
+
+    The count in COLMAP's header, where there is one, and the line break at the end show it.
     """
     if not content.endswith(b"\n"):
         raise ColmapError(
             f"expected {path} to end with a line break, got {content[-20:]!r}: it looks truncated; try copying the "
             "model again, or add the line break if it is whole"
         )
-    lines = content.splitlines()
-    rest = iter(lines)
-    found = 0
-    for line in rest:
-        if line.startswith(b"#") or not line.strip():
-            continue
-        try:
-            record = parse(line, rest)
-        except (ValueError, OverflowError, StopIteration) as error:
-            number = len(lines) - operator.length_hint(rest)
-            raise ColmapError(
-                f"expected a COLMAP record, got {line[:40]!r} at line {number} of {path} ({error or 'cut short'}); "
-                "try copying the model again"
-            ) from error
-        found += 1
-        yield record
     header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
+    found = sum(not line.startswith(b"#") for line in content.splitlines()) // LINES[path.stem]
     if header and int(header[1]) > found:
         raise ColmapError(
             f"expected {int(header[1])} records in {path} as its header says, got {found}: it is truncated; try "
@@ -49,29 +57,21 @@ def text_records(path: Path, content: bytes, parse: Callable[[bytes, Iterator[by
         )
 
 
-def text_camera(line: bytes, models: Mapping[str, int]) -> tuple[int, CameraRecord]:
-    camera_id, name, _, _, *params = line.split()
-    model = name.decode(errors="backslashreplace")
-    if len(params) != models.get(model):
-        raise ValueError(f"{len(params)} parameters, camera model {model} has {models.get(model, 'never been known')}")
-    return int(camera_id), CameraRecord(model, np.array(params, dtype=np.float64))
+def _image_names(content: bytes) -> dict[int, str]:
+    """Name of each image by its id; pycolmap 4.2 ends a name at its first space."""
+    names = {}
+    lines = iter(content.splitlines())
+    for line in lines:
+        if line.strip() and not line.startswith(b"#"):
+            image_id, *_, name = line.split(maxsplit=9)
+            names[int(image_id)] = name.rstrip().decode(errors="backslashreplace")
+            next(lines, None)  # its keypoints
+    return names
 
 
-def text_image(line: bytes, rest: Iterator[bytes]) -> ImageRecord:
-    image_id, *numbers, camera_id, name = line.split(maxsplit=9)  # a name may have spaces
-    pose = np.array(numbers, dtype=np.float64)
-    fields = next(rest).split()
-    keypoints = np.array(fields, dtype=np.float64).reshape(-1, 3)[:, :2]
-    point_ids = np.array(fields[2::3], dtype=np.int64)
-    shown = name.rstrip().decode(errors="backslashreplace")
-    return ImageRecord(shown, int(image_id), int(camera_id), pose[:4], pose[4:], keypoints, point_ids)
-
-
-def text_point(line: bytes, rest: Iterator[bytes]) -> tuple:
-    del rest
-    point_id, x, y, z, *colour, error = (fields := line.split())[:8]
-    track = fields[8:]
-    if len(colour) != 3 or len(track) % 2:
-        raise ValueError(f"{len(fields)} fields, should be 8 and a track of pairs")
-    position = float(x), float(y), float(z)
-    return int(np.int64(int(point_id))), position, tuple(map(int, colour)), float(error), len(track) // 2
+def _image(image: Any, name: str) -> ImageRecord:
+    pose = image.cam_from_world()
+    keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
+    ids = np.array([point.point3D_id for point in image.points2D], np.uint64).astype(np.int64)  # none: 2^64 - 1
+    quaternion = np.roll(pose.rotation.quat, 1)  # pycolmap's has the real part last
+    return ImageRecord(name, image.image_id, image.camera_id, quaternion, pose.translation, keypoints, ids)

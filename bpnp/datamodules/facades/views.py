@@ -6,11 +6,11 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
+from bpnp.datamodules.augment import SIDES, Drawn, DrawnSide, Side, bounds
 from bpnp.datamodules.facades.scenes import Array, Scene, Walls, draw_scene
-from bpnp.datamodules.loader import Pair
-from bpnp.datamodules.outliers import Drawn, DrawnSide, bounds, draw, draw_side
+from bpnp.datamodules.pair import Pair
+from bpnp.geometry import random_rotations
 
 LONG_SIDE = 1200.0  # of an image, pixels: a focal length of 800 to 1650 pixels at 75 to 40 degrees
 MIN_DEPTH = 0.5  # metres; nothing nearer to the camera is seen
@@ -46,7 +46,7 @@ class SfmOptions:
                 )
         if not 0 < self.scale_range[0] <= self.scale_range[1] < np.inf:
             raise ValueError(f"expected a positive `scale_range` (low, high), got {self.scale_range}")
-        if self.clutter_side not in ("both", "2d", "3d", "random"):
+        if self.clutter_side not in (*SIDES, "random"):
             raise ValueError(f'expected `clutter_side` "both", "2d", "3d" or "random", got {self.clutter_side!r}')
 
 
@@ -124,12 +124,12 @@ def hidden(walls: Walls, centre: Array, points: Array) -> NDArray[np.bool_]:
 
 
 def draw_sfm_pair(name: str, options: SfmOptions, rng: np.random.Generator) -> Pair:
-    """A new scene, seen by a camera, with natural clutter, each side in random order.
+    """A new scene, seen by a camera, with natural clutter.
 
     A scene of which the camera sees fewer than `min_points` mapped points is drawn anew. Raises ValueError if 50 are.
     """
-    wanted, side = draw(options.clutter, rng), draw_side(options.clutter_side, rng)
-    field_of_view = draw(options.field_of_view, rng)
+    wanted, side = _drawn(options.clutter, rng), _drawn_side(options.clutter_side, rng)
+    field_of_view = _drawn(options.field_of_view, rng)
     for _ in range(ATTEMPTS):
         scene = draw_scene(max(640, SCENE_POINTS * options.num_points), rng)
         camera = draw_camera(scene.walls, field_of_view, rng)
@@ -147,17 +147,23 @@ def draw_sfm_pair(name: str, options: SfmOptions, rng: np.random.Generator) -> P
     extra3d = _unseen(scene, sight.true, extra * (side != "2d"), rng)
 
     focal = LONG_SIDE / 2 / float(camera.half.max())
-    order2d, order3d = rng.permutation(len(true) + len(extra2d)), rng.permutation(len(true) + len(extra3d))
-    points2d = sight.image[np.concatenate([true, extra2d])[order2d]]
-    points2d += draw(options.noise_px, rng) / focal * rng.standard_normal(points2d.shape)
-    match3d = np.full(len(order3d), -1)
-    match3d[: len(true)] = np.argsort(order2d)[: len(true)]
-    points3d = scene.points[np.concatenate([true, extra3d])[order3d]]
-
+    points2d = sight.image[np.concatenate([true, extra2d])]
+    points2d += _drawn(options.noise_px, rng) / focal * rng.standard_normal(points2d.shape)
+    points3d = scene.points[np.concatenate([true, extra3d])]
     points3d, rotation, translation = _in_frame(points3d, camera, options, rng)
     return Pair(
-        name, points2d.astype(np.float32), points3d.astype(np.float32), rotation, translation, match3d[order3d], focal
-    )
+        name, points2d.astype(np.float32), points3d.astype(np.float32), len(true), rotation, translation, focal
+    )  # fmt: skip
+
+
+def _drawn(value: Drawn, rng: np.random.Generator) -> float:
+    low, high = bounds(value)
+    return float(rng.uniform(low, high)) if low < high else low
+
+
+def _drawn_side(side: DrawnSide, rng: np.random.Generator) -> Side:
+    sides: tuple[Side, ...] = ("both", "2d", "3d")
+    return sides[rng.integers(3)] if side == "random" else side
 
 
 def _unseen(scene: Scene, seen: NDArray[np.int64], count: int, rng: np.random.Generator) -> NDArray[np.int64]:
@@ -176,7 +182,7 @@ def _in_frame(
     points: Array, camera: Camera, options: SfmOptions, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
     """Points and pose in the frame of an SfM model: any scale, any origin nearby, and turned if `rotate`."""
-    turn = Rotation.from_quat(rng.standard_normal(4)).as_matrix() if options.rotate else np.eye(3)
+    turn = random_rotations(1, rng)[0].numpy() if options.rotate else np.eye(3)
     low, high = options.scale_range
     scale = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     origin = 20 * scale * rng.standard_normal(3)

@@ -4,7 +4,7 @@ import importlib
 import re
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -14,7 +14,6 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.meshes.folder import LAYOUT, mesh_files
 from bpnp.datamodules.meshes.surfaces import (
     SUFFIXES,
     MeshError,
@@ -24,9 +23,11 @@ from bpnp.datamodules.meshes.surfaces import (
     read_mesh,
     sample_surface,
 )
+from bpnp.files import files_as_they_are, fingerprint
 
 SPLITS = ("train", "test")
-ENTRY = re.compile(rf"(?:.*/)?([^/]+/(?:{'|'.join(SPLITS)})/[^/.][^/]*)({'|'.join(map(re.escape, SUFFIXES))})", re.I)
+LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
+ENTRY = re.compile(rf"(?:.*/)?([^/]+)/(train|test)/([^/.][^/]*)(?:{'|'.join(map(re.escape, SUFFIXES))})", re.I)
 
 
 @runtime_checkable
@@ -37,11 +38,11 @@ class MeshArchive(Protocol):
     def names(self) -> Sequence[str]: ...
 
     @property
-    def files(self) -> Sequence[Path]:
-        """What the meshes are read from."""
+    def identity(self) -> str:
+        """Another one if a mesh is another."""
 
-    def part(self, names: Sequence[str]) -> "MeshArchive":
-        """Only these meshes."""
+    def part(self, start: int, stop: int) -> "MeshArchive":
+        """The meshes of names[start:stop]."""
 
     def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
         """`count` normalised surface samples (count, 3), a function of the mesh and its name. Raises MeshError."""
@@ -59,11 +60,12 @@ class MeshFiles:
         return list(self.entries)
 
     @property
-    def files(self) -> Sequence[Path]:
-        return [Path(path) for path in self.entries.values()] if self.archive is None else [self.archive]
+    def identity(self) -> str:
+        files = map(Path, self.entries.values()) if self.archive is None else [self.archive]
+        return fingerprint([self.names, files_as_they_are(files)])
 
-    def part(self, names: Sequence[str]) -> "MeshFiles":
-        return replace(self, entries={name: self.entries[name] for name in names})
+    def part(self, start: int, stop: int) -> "MeshFiles":
+        return replace(self, entries=dict(list(self.entries.items())[start:stop]))
 
     def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
         mesh = read_mesh(Path(self.entries[name])) if self.archive is None else self._packed(name)
@@ -90,11 +92,11 @@ class SampledFiles:
         return list(self.rows)
 
     @property
-    def files(self) -> Sequence[Path]:
-        return sorted({path for path, _ in self.rows.values()})
+    def identity(self) -> str:
+        return fingerprint([self.names, files_as_they_are(sorted({path for path, _ in self.rows.values()}))])
 
-    def part(self, names: Sequence[str]) -> "SampledFiles":
-        return SampledFiles({name: self.rows[name] for name in names})
+    def part(self, start: int, stop: int) -> "SampledFiles":
+        return SampledFiles(dict(list(self.rows.items())[start:stop]))
 
     def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
         path, row = self.rows[name]
@@ -113,31 +115,32 @@ def open_archive(source: Path) -> MeshArchive:
     if source.is_file():
         return _zip_archive(source)
     if not source.is_dir():
-        raise ValueError(f"expected ModelNet40.zip or a folder with {LAYOUT}, got {source}, which is not there")
+        raise ValueError(f"expected a folder with {LAYOUT}, or ModelNet40.zip, got {source}, which is not there")
     inside = sorted(path for path in source.iterdir() if path.is_dir())
     for folder in (source, *inside):
         if list(folder.glob("ply_data_*.h5")):
             return _sampled_archive(folder)
-    roots = [folder for folder in (source, *inside) if any(next(folder.glob(f"*/{s}"), None) for s in SPLITS)]
-    if not roots:
-        raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
-    entries = {}
-    for split in SPLITS:
-        for path in mesh_files(roots[0], split):
-            entries[path.relative_to(roots[0]).with_suffix("").as_posix()] = str(path)
-    return MeshFiles(entries)
+        if entries := _named(str(path) for path in folder.glob("*/*/*") if path.is_file()):
+            return MeshFiles(entries)
+    raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
+
+
+def _named(paths: Iterable[str]) -> dict[str, str]:
+    """Path of each mesh by its name, ``<class>/<split>/<stem>``; the training meshes first. Others are no meshes."""
+    found = (ENTRY.fullmatch(path) for path in paths if "__MACOSX" not in path)
+    entries = {f"{match[1]}/{match[2].lower()}/{match[3]}": match[0] for match in found if match}
+    order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
+    return {name: entries[name] for name in order}
 
 
 def _zip_archive(path: Path) -> MeshFiles:
     try:
-        found = [ENTRY.fullmatch(entry) for entry in _open(path).namelist() if "__MACOSX" not in entry]
+        entries = _named(_open(path).namelist())
     except (zipfile.BadZipFile, OSError) as error:
         raise ValueError(f"expected a zip of meshes, got {path} ({error}); try downloading it again") from error
-    entries = {match[1]: match[0] for match in found if match}
     if not entries:
         raise ValueError(f"expected meshes {LAYOUT} in {path}, got none; try ModelNet40.zip")
-    order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2].lower()), name))
-    return MeshFiles({name: entries[name] for name in order}, archive=path)
+    return MeshFiles(entries, archive=path)
 
 
 def _sampled_archive(folder: Path) -> SampledFiles:

@@ -1,13 +1,14 @@
 """Procedural shapes: as many meshes as one likes, without a download."""
 
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.pools import SurfacePools, open_pools
 from bpnp.datamodules.meshes.surfaces import Mesh, Normalisation, normalise, primitives, sample_surface
+from bpnp.files import fingerprint
+from bpnp.geometry import random_rotations
 
 VERSION = 1  # raised whenever the same seed makes another shape
 
@@ -36,29 +37,31 @@ def _part(rng: np.random.Generator, size: float) -> Mesh:
     vertices = size * rng.uniform(0.2, 1.0, 3) * solid.vertices
     along = vertices[:, 2:] / np.abs(vertices[:, 2]).max()
     vertices = np.hstack([vertices[:, :2] * (1 + rng.uniform(-0.6, 0.6) * along), vertices[:, 2:]])
-    turned = Rotation.from_quat(rng.standard_normal(4)).apply(vertices)  # uniform over the rotations
-    return Mesh(turned, solid.faces)
+    return Mesh(vertices @ random_rotations(1, rng)[0].numpy().T, solid.faces)
 
 
-def procedural_pools(
-    split: str, count: int, *, seed: int, pool_size: int, normalisation: Normalisation, cache_dir: Path
-) -> SurfacePools:
-    """Surface samples of the `count` shapes of a split. No shape belongs to two splits or two seeds.
+@dataclass(frozen=True)
+class ProceduralShapes:
+    """The shapes of a split, as a `MeshArchive`. No shape belongs to two splits or two seeds.
 
-    Shape i does not depend on `count`. Raises ValueError for fewer than one shape.
+    Shape i does not depend on their number.
     """
-    if count < 1:
-        raise ValueError(f"expected at least one procedural {split} shape, got {count}")
 
-    def sample(i: int) -> NDArray[np.float64]:
-        rng = np.random.default_rng([seed, SPLITS.index(split), i])
-        return normalise(sample_surface(procedural_shape(rng), pool_size, rng), normalisation)
+    split: str
+    seed: int
+    numbers: range
 
-    return open_pools(
-        cache_dir,
-        label=f"procedural-{split}",
-        inputs={"procedural": VERSION, "seed": seed, "normalisation": normalisation},
-        names=[f"procedural/{split}/{i:06d}" for i in range(count)],
-        sample=sample,
-        pool_size=pool_size,
-    )
+    @property
+    def names(self) -> Sequence[str]:
+        return [f"procedural/{self.split}/{i:06d}" for i in self.numbers]
+
+    @property
+    def identity(self) -> str:
+        return fingerprint(["procedural", VERSION, self.split, self.seed, list(self.numbers)])
+
+    def part(self, start: int, stop: int) -> "ProceduralShapes":
+        return replace(self, numbers=self.numbers[start:stop])
+
+    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
+        rng = np.random.default_rng([self.seed, SPLITS.index(self.split), int(name[-6:])])
+        return normalise(sample_surface(procedural_shape(rng), count, rng), mode)

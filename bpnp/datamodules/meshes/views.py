@@ -1,15 +1,19 @@
-"""Virtual cameras: what a camera drawn at random sees of a set of surface samples."""
+"""Virtual cameras: what cameras drawn at random see of surface samples."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
+import roma
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
 
-from bpnp.datamodules.loader import Pair
-from bpnp.geometry import MIN_POINTS
+from bpnp.datamodules.augment import picked
+from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, stream, uniform
+from bpnp.geometry import MIN_POINTS, project, transform
+from bpnp.types import Batch
 
 MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
 
@@ -48,40 +52,55 @@ class Views:
         return self.distance - self.translation_range - radius > MIN_DEPTH
 
 
-def draw_pose(views: Views, rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Rotation (3, 3) and translation (3,) of a camera = R p + t."""
+def draw_poses(views: Views, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """A random camera = R p + t for each key; float64."""
+    numbers = uniform(keys, 6)
     if views.rotation == "so3":
-        rotation = Rotation.from_quat(rng.standard_normal(4))  # a normal 4-vector has a uniform direction
+        rotation = rotations(stream(keys, Purpose.POSE))
     else:
-        rotation = Rotation.from_euler("xyz", rng.uniform(*views.euler_range, 3), degrees=True)
-    offset = rng.uniform(-views.translation_range, views.translation_range, 3)
-    return rotation.as_matrix(), offset + np.array([0.0, 0.0, views.distance])
+        low, high = (math.radians(angle) for angle in views.euler_range)
+        rotation = roma.euler_to_rotmat("xyz", low + (high - low) * numbers[:, :3])
+    offset = views.translation_range * (2 * numbers[:, 3:] - 1)
+    offset[:, 2] += views.distance
+    return rotation, offset
 
 
-def draw_pair(
-    name: str,
-    samples: NDArray[np.float32],
-    *,
-    num_points: int,
-    views: Views,
-    rng: np.random.Generator,
-) -> Pair:
-    """A random camera's view of `num_points` of the samples (k, 3), drawn without replacement.
+def draw_views(
+    samples: Float[Tensor, "b k 3"], index: Int[Tensor, " b"], views: Views, num_points: int, keys: Int[Tensor, " b"]
+) -> Batch:
+    """A random camera's view of `num_points` samples of each row, drawn without replacement; as `stacked` makes pairs.
 
-    points2d are the points seen, x/z and y/z plus noise, in random order. A point behind the camera, or less than
-    0.1 in front of it, has no 2D point and -1 in match3d. Raises ValueError if fewer than 4 points are seen.
+    2D points are x/z and y/z plus noise, computed in float64. A point behind the camera, or less than 0.1 in front of
+    it, has no 2D point and -1 in match3d.
     """
-    points3d = samples[rng.permutation(len(samples))[:num_points]]
-    rotation, translation = draw_pose(views, rng)
-    camera = points3d @ rotation.T + translation
-    order = rng.permutation(np.flatnonzero(camera[:, 2] > MIN_DEPTH))  # 2D point i shows 3D point order[i]
-    if len(order) < MIN_POINTS:
+    subset = permutations(stream(keys, Purpose.SUBSET), samples.shape[1])[:, :num_points]
+    points3d = picked(samples, subset)
+    rotation, translation = draw_poses(views, stream(keys, Purpose.POSE))
+    camera = transform(rotation, translation, points3d.double())
+    seen = camera[..., 2] > MIN_DEPTH
+    noise = normal(stream(keys, Purpose.NOISE), 2 * num_points).view(-1, num_points, 2)
+    points2d = project(camera) + noise * (views.noise_px / views.focal)
+    return Batch(
+        points2d=(points2d.where(seen[..., None], 0.0)).float(),
+        points3d=points3d,
+        mask2d=seen,
+        mask3d=torch.ones_like(seen),
+        focal=torch.full((len(samples),), views.focal, device=samples.device),
+        index=index,
+        ids=(),
+        rotation=rotation,
+        translation=translation,
+        match3d=torch.arange(num_points, device=samples.device).where(seen, -1),
+        origin=torch.zeros(len(samples), 3, dtype=torch.float64, device=samples.device),
+    )
+
+
+def check_seen(batch: Batch, names: Sequence[str]) -> None:
+    """Raises ValueError that names the first pair of which a camera sees fewer than 4 points."""
+    count = batch.count2d
+    if bool((few := count < MIN_POINTS).any()):
+        first = int(few.nonzero()[0, 0])
         raise ValueError(
-            f"expected at least {MIN_POINTS} points in front of the camera, got {len(order)} in {name}; "
+            f"expected at least {MIN_POINTS} points in front of the camera, got {int(count[first])} in {names[first]}; "
             "try normalisation unit_sphere or a larger `distance`"
         )
-    points2d = camera[order, :2] / camera[order, 2:]
-    points2d += rng.normal(scale=views.noise_px / views.focal, size=points2d.shape)
-    match3d = np.full(len(points3d), -1)
-    match3d[order] = np.arange(len(order))
-    return Pair(name, points2d.astype(np.float32), points3d, rotation, translation, match3d, views.focal)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.loader import Pair
+from bpnp.datamodules.pair import Pair
 from bpnp.datamodules.released.pickles import PickleError, load_pickle
 from bpnp.geometry import MIN_POINTS
 
@@ -122,10 +122,9 @@ def _indexed_by_2d(part: AuthorsPart, samples: Sequence[Mapping[str, Any]]) -> b
             except SampleError:
                 found.append(np.inf)
                 continue
-            true = pair.match3d >= 0
-            camera = pair.points3d[true] @ pair.rotation.T + pair.translation
+            camera = pair.points3d[: pair.matched] @ pair.rotation.T + pair.translation
             with np.errstate(divide="ignore", invalid="ignore"):
-                distance = camera[:, :2] / camera[:, 2:] - pair.points2d[pair.match3d[true]]
+                distance = camera[:, :2] / camera[:, 2:] - pair.points2d[: pair.matched]
             found.append(float(np.median(np.linalg.norm(np.nan_to_num(distance, nan=np.inf), axis=-1))))
     direct, inverse = (float(np.median(errors[by_2d])) for by_2d in (False, True))
     if AGREEMENT < min(direct, inverse) < np.inf:
@@ -152,9 +151,18 @@ def _pair(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) ->
         raise SampleError("expected a rotation matrix, got another matrix")
     if np.linalg.det(rotation) < 0 or translation.shape != (3,) or not np.isfinite(translation).all():
         raise SampleError("expected a rotation and a finite translation, got a reflection or something else")
+    match3d = _once(match3d)
     if (match3d >= 0).sum() < MIN_POINTS:
         raise SampleError(f"expected {MIN_POINTS} or more true pairs, got {(match3d >= 0).sum()}")
-    return Pair(name, points2d.astype("f4"), points3d.astype("f4"), rotation, translation, match3d, focal)
+    return Pair.from_matches(name, points2d, points3d, rotation, translation, match3d, focal)
+
+
+def _once(match3d: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Of several 3D points that were seen as one 2D point, the first."""
+    _, first = np.unique(match3d, return_index=True)
+    kept = np.full_like(match3d, -1)
+    kept[first] = match3d[first]
+    return kept
 
 
 def _numbers(value: Any, name: str, width: int) -> NDArray[np.float64]:

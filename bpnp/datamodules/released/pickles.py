@@ -1,22 +1,19 @@
 """Pickles of numpy arrays, plain containers and numbers; nothing else in a pickle is ever imported or called.
 
-numpy itself is not trusted with a stranger's pickle either: a made-up dtype may pass bytes off as object pointers. So
-arrays are recorded here as their shape, type and bytes, checked, and only then made.
+Only the names in `ALLOWED` can be called, and numpy makes an array only after its shape, type and bytes were compared:
+it would take a made-up type or a wrong size for pointers to objects.
 """
 
 import math
 import pickle
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-PLAIN = (bool, int, float, str, bytes, type(None))
-NUMERIC = re.compile(r"[biuf][1248]|O[48]?")
+NUMBER = re.compile(r"[biuf][1248]|O8?")
 
 
 class PickleError(ValueError):
@@ -24,38 +21,36 @@ class PickleError(ValueError):
 
 
 def load_pickle(path: Path) -> Any:
-    """What is in a pickle, of Python 2 or 3: dicts, lists, tuples, sets, strings, numbers and numpy arrays of numbers.
+    """The dict, list, tuple or array in a pickle of Python 2 or 3; its arrays may be subclasses of numpy's.
 
-    Arrays of objects are admitted if their elements are. Nothing in the file is imported or called.
     Raises PickleError that names the file and what was refused; OSError if it cannot be opened.
     """
-    try:
-        with path.open("rb") as file:
-            return _resolve(_Unpickler(file, encoding="latin1").load())
-    except OSError:
-        raise
-    except Exception as error:
-        raise PickleError(
-            f"expected a pickle of numpy arrays, plain containers and numbers, got {path}: "
-            f"{error or type(error).__name__}; try the authors' file as it was downloaded"
-        ) from error
+    with path.open("rb") as file:
+        try:
+            content = _Unpickler(file, encoding="latin1").load()
+            if not isinstance(content, (dict, list, tuple, np.ndarray)):
+                _refuse(f"a bare {type(content).__name__}")
+        except Exception as error:
+            raise PickleError(
+                f"expected a pickle of numpy arrays, plain containers and numbers, got {path}: "
+                f"{error or type(error).__name__}; try the authors' file as it was downloaded"
+            ) from error
+    return content
 
 
 class _Unpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module.replace('numpy._core', 'numpy.core').replace('__builtin__', 'builtins')}.{name}"
-        if full == "numpy.ndarray":
-            return _NDARRAY
-        if full not in _ADMITTED:
-            raise pickle.UnpicklingError(f"{module}.{name} is refused")
-        return _Admitted(_ADMITTED[full])
+        if full not in ALLOWED:
+            _refuse(f"{module}.{name}")
+        return _Call(ALLOWED[full])
 
     def persistent_load(self, pid: Any) -> Any:
-        raise pickle.UnpicklingError("a persistent reference is refused")
+        _refuse("a persistent reference")
 
 
-class _Admitted:
-    """A function that a pickle may call, and can neither change nor look into."""
+class _Call:
+    """A function that a pickle may call and cannot change."""
 
     __slots__ = ("_function",)
 
@@ -66,125 +61,64 @@ class _Admitted:
         return self._function(*args)
 
     def __setstate__(self, state: Any) -> None:
-        raise pickle.UnpicklingError("a changed function is refused")
+        _refuse("a changed function")
 
 
-@dataclass
 class _Type:
-    """A dtype to be: one of a number, or of objects."""
+    """A type of array: numbers or objects, in a byte order."""
 
-    text: str
-    order: Any = "="
+    __slots__ = ("order", "text")
 
-    def __setstate__(self, state: Any) -> None:
-        order, parts = state[1], state[2:5]
-        if order not in ("<", ">", "=", "|") or any(part is not None for part in parts):
-            raise pickle.UnpicklingError(f"the array type {state} is refused")
-        self.order = order
-
-    @property
-    def dtype(self) -> np.dtype:
-        return np.dtype(self.text).newbyteorder(self.order)
-
-
-@dataclass
-class _Array:
-    """An array to be. content: its bytes, or the list of its objects."""
-
-    shape: Any = (0,)
-    kind: Any = None
-    fortran: Any = False
-    content: Any = b""
+    def __init__(self, text: Any, *_: Any) -> None:
+        if not isinstance(text, str) or not NUMBER.fullmatch(text):
+            _refuse(f"the array type {text!r}")
+        self.text, self.order = text, "="
 
     def __setstate__(self, state: Any) -> None:
-        _, self.shape, self.kind, self.fortran, self.content = state
-        self.check()
-
-    def check(self) -> None:
-        """Whether everything is of its kind and as long as it says."""
-        if isinstance(self.content, str):  # Python 2
-            self.content = self.content.encode("latin1")
-        if not isinstance(self.kind, _Type) or not isinstance(self.shape, tuple):
-            raise pickle.UnpicklingError("an array without shape and type is refused")
-        if not all(type(size) is int and size >= 0 for size in self.shape):
-            raise pickle.UnpicklingError(f"an array of shape {self.shape} is refused")
-        count, objects = math.prod(self.shape), self.kind.text.startswith("O")
-        if not isinstance(self.content, list if objects else (bytes, bytearray)):
-            raise pickle.UnpicklingError(f"an array of {self.kind.text} made of a {type(self.content).__name__}")
-        if len(self.content) != count * (1 if objects else self.kind.dtype.itemsize):
-            raise pickle.UnpicklingError(f"an array of shape {self.shape} made of {len(self.content)} bytes or objects")
-
-    def array(self) -> NDArray[Any]:
-        order: Literal["C", "F"] = "F" if self.fortran else "C"
-        if isinstance(self.content, list):
-            flat = np.empty(len(self.content), object)
-            for i, value in enumerate(self.content):
-                flat[i] = _resolve(value)
-            return flat.reshape(self.shape, order=order)
-        return np.frombuffer(self.content, self.kind.dtype).reshape(self.shape, order=order)
+        if state[1] not in ("<", ">", "=", "|") or any(part is not None for part in state[2:5]):
+            _refuse(f"the array type {state}")
+        self.order = state[1]
 
 
-_NDARRAY = object()
+class _Array(np.ndarray[Any, Any]):
+    def __setstate__(self, state: Any) -> None:
+        _, shape, kind, fortran, content = state
+        super().__setstate__(_checked(shape, kind, content, fortran))
 
 
-def _dtype(text: Any, *_: Any) -> _Type:
-    if not isinstance(text, str) or not NUMERIC.fullmatch(text):
-        raise pickle.UnpicklingError(f"the array type {text!r} is refused")
-    return _Type(text)
+def _checked(shape: Any, kind: Any, content: Any, fortran: Any = False) -> tuple[Any, ...]:
+    """The state of an array, if its content is of its type and as long as shape and type say."""
+    content = content.encode("latin1") if type(content) is str else content  # of Python 2
+    content = bytes(content) if type(content) is bytearray else content
+    if not isinstance(kind, _Type) or type(shape) is not tuple or not all(type(n) is int and n >= 0 for n in shape):
+        _refuse(f"an array of shape {shape}")
+    objects, dtype = kind.text[0] == "O", np.dtype(kind.text).newbyteorder(kind.order)
+    if type(content) is not (list if objects else bytes):
+        _refuse(f"an array type of {kind.text} made of a {type(content).__name__}")
+    if len(content) != math.prod(shape) * (1 if objects else dtype.itemsize):
+        _refuse(f"an array of shape {shape} made of {len(content)} bytes or objects")
+    return 1, shape, dtype, bool(fortran), content
 
 
-def _reconstruct(subtype: Any, *_: Any) -> _Array:
-    if subtype is not _NDARRAY:
-        raise pickle.UnpicklingError("a subclass of numpy.ndarray is refused")
-    return _Array()
-
-
-def _frombuffer(buffer: Any, kind: Any, shape: Any, order: Any) -> _Array:
-    array = _Array(shape, kind, order == "F", buffer)
-    array.check()
+def _array(*state: Any) -> Any:
+    array = np.ndarray.__new__(_Array, (0,))
+    np.ndarray.__setstate__(array, _checked(*state))
     return array
 
 
-def _scalar(kind: Any, content: Any) -> Any:
-    array = _Array((), kind, False, content)
-    array.check()
-    return array.array().item()
+def _refuse(what: Any) -> Any:
+    raise pickle.UnpicklingError(f"{what} is refused")
 
 
-def _no_bytes(*args: Any) -> bytes:
-    if args:
-        raise pickle.UnpicklingError("bytes of something are refused")
-    return b""
-
-
-def _encode(text: Any, encoding: Any) -> bytes:
-    if not isinstance(text, str) or encoding != "latin1":
-        raise pickle.UnpicklingError(f"encoding as {encoding!r} is refused")
-    return text.encode("latin1")
-
-
-_ADMITTED: Mapping[str, Callable[..., Any]] = {
-    "numpy.dtype": _dtype,
-    "numpy.core.multiarray._reconstruct": _reconstruct,
-    "numpy.core.multiarray.scalar": _scalar,
-    "numpy.core.numeric._frombuffer": _frombuffer,
-    "_codecs.encode": _encode,
-    "builtins.bytes": _no_bytes,
+ALLOWED: dict[str, Callable[..., Any]] = {
+    "numpy.ndarray": lambda *_: _refuse("a bare numpy.ndarray"),
+    "numpy.dtype": _Type,
+    "numpy.core.multiarray._reconstruct": lambda *_: np.ndarray.__new__(_Array, (0,)),
+    "numpy.core.multiarray.scalar": lambda kind, content: _array((), kind, content).item(),
+    "numpy.core.numeric._frombuffer": lambda content, kind, shape, order: _array(shape, kind, content, order == "F"),
+    "_codecs.encode": lambda text, encoding: text.encode("latin1") if encoding == "latin1" else _refuse(encoding),
+    "builtins.bytes": lambda *args: b"" if not args else _refuse("bytes of something"),
     "builtins.set": set,
     "builtins.frozenset": frozenset,
     "collections.OrderedDict": dict,
 }
-
-
-def _resolve(value: Any) -> Any:
-    """The value with its arrays made."""
-    if type(value) in PLAIN:
-        return value
-    if isinstance(value, _Array):
-        value.check()
-        return value.array()
-    if type(value) is dict:
-        return {_resolve(k): _resolve(v) for k, v in value.items()}
-    if type(value) in (list, tuple, set, frozenset):
-        return type(value)(_resolve(v) for v in value)
-    raise pickle.UnpicklingError(f"a bare {type(value).__name__.strip('_')} is refused")

@@ -1,6 +1,7 @@
 """Batches: the sampler's laws for any length and number of processes, and exact resuming under Lightning."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import lightning
@@ -10,24 +11,41 @@ import torch
 from lightning.pytorch.callbacks import ModelCheckpoint
 from torch.utils.data import DataLoader, SequentialSampler
 
-from bpnp.datamodules.loader import BucketSampler, Pair, PairDataset, PairLoader, collate, pair_loader
+from bpnp.datamodules.loader import BucketSampler, PairDataset, PairLoader, pair_loader
+from bpnp.datamodules.pair import Counts, Pair, stacked
+from bpnp.types import Batch
 
 
 class Numbered:
-    """Pair i at epoch e is named "e:i", so that a batch tells which keys it was made of."""
+    """Pair i at epoch e is named "i" and has e in its points, so that a batch tells which keys it was made of."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
-        self._sizes = np.asarray(sizes, dtype=np.int64)
+        self.sizes = np.asarray(sizes, dtype=np.int64)
 
     @property
-    def sizes(self) -> np.ndarray:
-        return self._sizes
+    def counts(self) -> Counts:
+        return Counts(self.sizes, self.sizes, self.sizes)
+
+    def names(self, index: Sequence[int]) -> tuple[str, ...]:
+        return tuple(map(str, index))
+
+    def batch(self, index: torch.Tensor, epoch: int) -> Batch:
+        return stacked([self.pair(i, epoch) for i in index.tolist()], index)
 
     def pair(self, index: int, epoch: int) -> Pair:
         rng = np.random.default_rng([epoch, index])
-        n = int(self._sizes[index])
-        points2d, points3d = rng.random((n, 2), dtype=np.float32), rng.random((n, 3), dtype=np.float32)
-        return Pair(f"{epoch}:{index}", points2d, points3d, np.eye(3), np.ones(3), rng.permutation(n), 800.0)
+        n = int(self.sizes[index])
+        points2d, points3d = rng.random((n, 2), dtype=np.float32), np.full((n, 3), epoch, np.float32)
+        return Pair(str(index), points2d, points3d, n, np.eye(3), np.ones(3), 800.0)
+
+
+def keys_of(batch: Batch) -> tuple[str, ...]:
+    """ "epoch:index" of each pair."""
+    return tuple(f"{int(points[0, 0])}:{name}" for points, name in zip(batch.points3d, batch.ids, strict=True))
+
+
+def dataset(sizes: Sequence[int]) -> PairDataset:
+    return PairDataset(Numbered(sizes), fresh=True)
 
 
 def random_sizes(count: int, *, largest: int = 400) -> list[int]:
@@ -36,23 +54,26 @@ def random_sizes(count: int, *, largest: int = 400) -> list[int]:
 
 
 def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options) -> BucketSampler:
-    return BucketSampler(PairDataset(Numbered(sizes)), rank=rank, num_replicas=replicas, seed=3, **options)
+    return BucketSampler(dataset(sizes), rank=rank, num_replicas=replicas, seed=3, **options)
 
 
-def test_collate_pads_and_masks() -> None:
+def test_stacked_pairs_are_padded_and_masked() -> None:
     source = Numbered([2, 5, 3])
     pairs = [source.pair(i, 0) for i in (1, 2)]
-    batch = collate(pairs, [1, 2])
-    assert batch.points2d.dtype == batch.rotation.dtype == batch.focal.dtype == torch.float32
+    pairs[1] = replace(pairs[1], matched=2, origin=np.array([1.0, 2.0, 3.0]))
+    batch = stacked(pairs, torch.tensor([1, 2]))
+    assert batch.points2d.dtype == batch.focal.dtype == torch.float32
+    assert batch.rotation.dtype == torch.float64
     assert batch.index.tolist() == [1, 2]
-    assert batch.ids == ("0:1", "0:2")
+    assert batch.ids == ("1", "2")
     assert batch.focal.tolist() == [800.0, 800.0]
+    assert batch.origin.tolist() == [[0, 0, 0], [1, 2, 3]]
+    assert batch.match3d.tolist() == [[0, 1, 2, 3, 4], [0, 1, -1, -1, -1]]
     for row, pair in enumerate(pairs):
         n = len(pair.points3d)
-        assert batch.mask3d[row].tolist() == [True] * n + [False] * (5 - n)
+        assert batch.mask3d[row].tolist() == batch.mask2d[row].tolist() == [True] * n + [False] * (5 - n)
         np.testing.assert_array_equal(batch.points3d[row, :n], pair.points3d)
         np.testing.assert_array_equal(batch.points2d[row, :n], pair.points2d)
-        assert batch.match3d[row].tolist() == pair.match3d.tolist() + [-1] * (5 - n)
 
 
 @pytest.mark.parametrize("count", [1, 7, 24, 1003])
@@ -116,7 +137,7 @@ def test_max_cells_bounds_padding_and_buckets_waste_little() -> None:
 
 
 def test_workers_change_nothing() -> None:
-    source = Numbered(random_sizes(20))
+    source = dataset(random_sizes(20))
     loaders = [pair_loader(source, batch_size=4, shuffle=True, seed=1, num_workers=w) for w in (0, 1)]
     state = torch.get_rng_state()
     for one, other in zip(*loaders, strict=True):
@@ -127,7 +148,7 @@ def test_workers_change_nothing() -> None:
 
 
 def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = Numbered(random_sizes(20))
+    source = dataset(random_sizes(20))
     whole = [batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)]
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
@@ -145,9 +166,9 @@ def test_errors_name_what_is_wrong() -> None:
         sampler([], batch_size=4, shuffle=False)
     with pytest.raises(ValueError, match=r"max_cells.*shuffle=False"):
         sampler([4], batch_size=4, shuffle=True, max_cells=100)
-    dataset = PairDataset(Numbered([4, 4]))
+    pairs = dataset([4, 4])
     with pytest.raises(ValueError, match="overfit_batches"):
-        next(iter(PairLoader(dataset, sampler=SequentialSampler(dataset), batch_size=None)))
+        next(iter(PairLoader(pairs, sampler=SequentialSampler(pairs), batch_size=None)))
 
 
 class Recorder(lightning.LightningModule):
@@ -157,7 +178,7 @@ class Recorder(lightning.LightningModule):
         self.seen: list[tuple[str, ...]] = []
 
     def training_step(self, batch, _) -> torch.Tensor:
-        self.seen.append(batch.ids)
+        self.seen.append(keys_of(batch))
         return self.layer(batch.points2d).mean()
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
@@ -170,7 +191,7 @@ class Pairs(lightning.LightningDataModule):
         self.workers = workers
 
     def train_dataloader(self) -> DataLoader:
-        return pair_loader(Numbered(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=self.workers)
+        return pair_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=self.workers)
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -1,0 +1,241 @@
+"""Pairs as they are trained and tested on: subsets, clutter, occlusion, outliers, rotation, and a random order."""
+
+import math
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import pad
+
+from bpnp.datamodules.keyed_random import Purpose, permutations, rotations, stream, uniform
+from bpnp.datamodules.pair import Counts
+from bpnp.geometry import MIN_POINTS
+from bpnp.types import Batch
+
+Side = Literal["both", "2d", "3d"]
+DrawnSide = Literal["both", "2d", "3d", "random"]
+Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each pair
+SIDES = ("2d", "both", "3d")  # in this order, a side is numbered
+
+
+@dataclass(frozen=True)
+class Outliers:
+    """What is added to and taken from a pair. The defaults change nothing.
+
+    Args:
+        ratio: rho, synthetic outliers as a ratio to the true pairs: int(rho * pairs) points, uniform in the
+            axis-aligned bounding box of the true points of that side; 1 makes half of the points outliers. Two numbers,
+            [low, high], draw it for each pair, uniformly.
+        side: the side that gets them, both, 2d or 3d, or random for one of the three in each pair.
+        occlusion: share of the true pairs that lose one of their two points, so that the other has no partner; a number
+            or [low, high], as ratio. At least 4 true pairs are left.
+        occluded_side: where they lose it, 2d, 3d, or both for half of them here and half there; or random.
+    """
+
+    ratio: Drawn = 0.0
+    side: DrawnSide = "both"
+    occlusion: Drawn = 0.0
+    occluded_side: DrawnSide = "2d"
+
+    def __post_init__(self) -> None:
+        low, high = bounds(self.ratio)
+        if not 0 <= low <= high < np.inf:
+            raise ValueError(
+                f"expected an outlier `ratio` of 0 or more, or (low, high), got {self.ratio}; 1 doubles the points"
+            )
+        low, high = bounds(self.occlusion)
+        if not 0 <= low <= high < 1:
+            raise ValueError(
+                f"expected `occlusion` in [0, 1), or (low, high), got {self.occlusion}; 0.1 hides one point in ten"
+            )
+        for name in ("side", "occluded_side"):
+            if getattr(self, name) not in (*SIDES, "random"):
+                raise ValueError(f'expected `{name}` "both", "2d", "3d" or "random", got {getattr(self, name)!r}')
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What `augment` does to the pairs of a source.
+
+    max_points: at most this many true pairs of a pair, a random subset of more; None for all.
+    clutter: points without a partner to keep, as a ratio to the true pairs kept, or as many as there are; inf for all.
+    clutter_side: which sides keep them, "both", "2d" or "3d".
+    rotate: turn the 3D points by a uniformly random rotation about their origin.
+    outliers: synthetic outliers and occlusion.
+
+    Raises ValueError for a value out of range.
+    """
+
+    max_points: int | None = None
+    clutter: float = math.inf
+    clutter_side: Side = "both"
+    rotate: bool = False
+    outliers: Outliers = field(default_factory=Outliers)
+
+    def __post_init__(self) -> None:
+        if self.max_points is not None and self.max_points < MIN_POINTS:
+            raise ValueError(f"expected `max_points` of {MIN_POINTS} or more, got {self.max_points}")
+        check_clutter(self.clutter)
+        if self.clutter_side not in SIDES:
+            raise ValueError(f'expected `clutter_side` "both", "2d" or "3d", got {self.clutter_side!r}')
+
+    @property
+    def clutter2d(self) -> float:
+        return 0.0 if self.clutter_side == "3d" else self.clutter
+
+    @property
+    def clutter3d(self) -> float:
+        return 0.0 if self.clutter_side == "2d" else self.clutter
+
+    def sizes(self, counts: Counts) -> NDArray[np.int64]:
+        """Most points of the larger side of each augmented pair (k,)."""
+        kept = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
+        extra2d, extra3d = (
+            np.minimum(count - counts.matched, np.rint(ratio * np.maximum(kept, 1)))
+            for count, ratio in ((counts.points2d, self.clutter2d), (counts.points3d, self.clutter3d))
+        )
+        added = np.floor(bounds(self.outliers.ratio)[1] * kept)
+        return (kept + np.maximum(extra2d, extra3d) + added).astype(np.int64)
+
+
+class SideCounts(NamedTuple):
+    """Points of one side of each augmented pair (b, 1).
+
+    kept: of the true pairs that were chosen, those whose point on this side is left. skipped: those after the true
+    pairs whose point is hidden. extra: clutter. outliers: synthetic ones.
+    """
+
+    kept: Tensor
+    skipped: Tensor
+    extra: Tensor
+    outliers: Tensor
+
+
+def augment(batch: Batch, how: Augmentation, keys: Int[Tensor, " b"]) -> Batch:
+    """Choose the points of each pair, add outliers, and put both sides into random order.
+
+    batch: pairs as `stacked` makes them, on any device. keys: one a pair; a pair depends on its key alone, whatever
+    batch it is in and however it is padded. Rotations and translations keep their dtype.
+    """
+    if batch.match3d is None or batch.rotation is None:
+        raise ValueError("expected pairs with `match3d` and a pose to augment, got none")
+    matched = batch.match3d >= 0
+    total = matched.sum(-1, keepdim=True)
+    true, side2d, side3d = _amounts(how, total, batch, stream(keys, Purpose.AMOUNTS))
+    # On both sides the true pairs in one random order, then the points without a partner.
+    choice = stream(keys, Purpose.CHOICE)
+    order3d = _matched_first(choice, matched, batch.mask3d)
+    alike = torch.equal(batch.mask2d, batch.mask3d)
+    matched2d = pad(matched, (0, batch.points2d.shape[1] - matched.shape[1]))
+    order2d = order3d if alike else _matched_first(choice, matched2d, batch.mask2d)
+    points2d = _chosen(batch.points2d, order2d, true, total, side2d, stream(keys, Purpose.OUTLIERS2D))
+    points3d = _chosen(batch.points3d, order3d, true, total, side3d, stream(keys, Purpose.OUTLIERS3D))
+    points2d, mask2d, place2d = _shuffled(points2d, side2d, stream(keys, Purpose.ORDER2D))
+    points3d, mask3d, place3d = _shuffled(points3d, side3d, stream(keys, Purpose.ORDER3D))
+    slots2d = torch.arange(place2d.shape[1], device=place2d.device).expand_as(place2d)
+    seen_as = torch.empty_like(place2d).scatter_(1, place2d, slots2d).gather(1, place3d.clamp(max=len(slots2d[0]) - 1))
+    batch = replace(
+        batch,
+        points2d=points2d,
+        points3d=points3d,
+        mask2d=mask2d,
+        mask3d=mask3d,
+        match3d=torch.where(place3d < true, seen_as, -1),
+    )
+    return _turned(batch, rotations(stream(keys, Purpose.TURN))) if how.rotate else batch
+
+
+def check_clutter(clutter: float) -> None:
+    """Raises ValueError for a ratio below 0, or NaN."""
+    if not clutter >= 0:
+        raise ValueError(f"expected `clutter` of 0 or more, got {clutter}; 0.5 adds half as many points")
+
+
+def bounds(value: Drawn) -> tuple[float, float]:
+    """(low, high) of a number that may be drawn."""
+    low, high = value if isinstance(value, (tuple, list)) else (value, value)
+    return low, high
+
+
+def _amounts(how: Augmentation, total: Tensor, batch: Batch, keys: Tensor) -> tuple[Tensor, SideCounts, SideCounts]:
+    """True pairs (b, 1) that are left of `total`, and the points of either side."""
+    ratio, side, occlusion, occluded = uniform(keys, 4).unsqueeze(-1).unbind(1)
+    kept = total if how.max_points is None else total.clamp(max=how.max_points)
+    hidden = (_drawn(how.outliers.occlusion, occlusion) * kept).round().long()
+    hidden = torch.minimum(hidden, kept - MIN_POINTS).clamp(min=0)
+    true = kept - hidden
+    hidden2d, hidden3d = _on_sides(how.outliers.occluded_side, occluded)
+    hidden2d = torch.where(hidden3d, torch.where(hidden2d, hidden // 2, 0), hidden)
+    added = (_drawn(how.outliers.ratio, ratio) * true).long()
+    added2d, added3d = _on_sides(how.outliers.side, side)
+    extra2d, extra3d = (
+        torch.minimum((clutter * kept.clamp(min=1)).round().clamp(max=2**31).long(), count[:, None] - total)
+        for clutter, count in ((how.clutter2d, batch.count2d), (how.clutter3d, batch.count3d))
+    )
+    return (
+        true,
+        SideCounts(kept - hidden2d, hidden2d, extra2d, added * added2d),
+        SideCounts(true + hidden2d, torch.zeros_like(hidden), extra3d, added * added3d),
+    )
+
+
+def _drawn(value: Drawn, share: Tensor) -> Tensor:
+    low, high = bounds(value)
+    return low + (high - low) * share
+
+
+def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool[Tensor, "b 1"]]:
+    """Whether it is on the 2D side, and on the 3D side; for "random" 2d, both and 3d are equally likely."""
+    number = (3 * share).long() if side == "random" else torch.full_like(share, SIDES.index(side)).long()
+    return number < 2, number > 0
+
+
+def _matched_first(keys: Tensor, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
+    """Places of the true pairs in random order, then those of the other points in random order, then padding."""
+    return permutations(keys, mask.shape[1], group=2 - mask.long() - matched.long())
+
+
+def _chosen(
+    points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, keys: Tensor
+) -> Float[Tensor, "b k d"]:
+    """The true pairs' points first, then those without a partner, then outliers; meaningless beyond their number."""
+    natural = side.kept + side.extra
+    slot = torch.arange(int((natural + side.outliers).max()), device=points.device)
+    rank = torch.where(slot < side.kept, slot + side.skipped * (slot >= true), total + slot - side.kept)
+    chosen = picked(points, order.gather(1, rank.clamp(max=order.shape[1] - 1)))
+    if not side.outliers.any():
+        return chosen
+    own = (slot < true)[..., None]
+    low = chosen.where(own, math.inf).amin(1, keepdim=True)
+    high = chosen.where(own, -math.inf).amax(1, keepdim=True)
+    share = uniform(keys, chosen[0].numel()).view_as(chosen).to(chosen)
+    return torch.where((slot < natural)[..., None], chosen, low + (high - low) * share)
+
+
+def _shuffled(points: Tensor, side: SideCounts, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The points in random order, zero beyond their number; which are real; and where each comes from."""
+    slot = torch.arange(points.shape[1], device=points.device)
+    mask = slot < side.kept + side.extra + side.outliers
+    place = permutations(keys, len(slot), group=1 - mask.long())
+    return picked(points, place) * mask[..., None], mask, place
+
+
+def picked(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[Tensor, "b k d"]:
+    """The points at the places `order` of each row."""
+    rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
+    return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])
+
+
+def _turned(batch: Batch, turn: Float[Tensor, "b 3 3"]) -> Batch:
+    """The pair in a scene whose points p are turned: turn p."""
+    assert batch.rotation is not None
+    return replace(
+        batch,
+        points3d=(batch.points3d.double() @ turn.mT).to(batch.points3d),
+        rotation=batch.rotation @ turn.mT.to(batch.rotation),
+        origin=None if batch.origin is None else (turn.to(batch.origin) @ batch.origin[..., None]).squeeze(-1),
+    )

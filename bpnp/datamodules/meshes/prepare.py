@@ -1,0 +1,105 @@
+"""Stores of surface samples: of a data set of meshes, or of procedural shapes."""
+
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.datamodules.meshes.archives import MeshArchive, open_archive
+from bpnp.datamodules.meshes.procedural import ProceduralShapes
+from bpnp.datamodules.meshes.source import POINTS, SURFACES
+from bpnp.datamodules.meshes.surfaces import MeshError, Normalisation
+from bpnp.datamodules.prepare import Prepared, Recipe, cached, prepare
+from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store
+
+MESHES_A_PART = 64
+WIDTHS = {POINTS: 3}
+
+
+def prepare_meshes(
+    source: Path, output: Path, *, points: int, normalisation: Normalisation, processes: int
+) -> Prepared:  # fmt: skip
+    """Keep `points` surface samples of every mesh of `source` (see `open_archive`), for `MeshDataModule(root=output)`.
+
+    Meshes that cannot be used are left out and listed. If `output` has been made from the same source in the same way
+    it is left as it is. Raises ValueError, StoreError or OSError: unusable source, no usable mesh, another `output`.
+    """
+    recipe = surfaces_recipe(open_archive(source), points=points, normalisation=normalisation, label=str(source))
+    store = prepare(recipe, output, processes=processes)
+    return Prepared(output, Counter(store.name(row).split("/")[-2] for row in range(len(store))), store.skipped)
+
+
+def surfaces_recipe(archive: MeshArchive, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
+    """How the store of an archive's meshes is made. label: what the meshes are, for messages."""
+    starts = range(0, len(archive.names), MESHES_A_PART)
+    return Recipe(
+        kind=SURFACES,
+        widths=WIDTHS,
+        parameters={"points": points, "normalisation": normalisation, "source": archive.identity},
+        jobs=[(archive.part(start, start + MESHES_A_PART), points, normalisation) for start in starts],
+        work=sample_part,
+        what="mesh",
+        source=label,
+    )
+
+
+def sample_part(job: tuple[MeshArchive, int, Normalisation], folder: Path) -> None:
+    """Write the store of some meshes."""
+    archive, count, mode = job
+    with new_store(folder, SURFACES, WIDTHS) as writer:
+        for name in archive.names:
+            try:
+                samples = archive.samples(name, count, mode)
+            except (MeshError, OSError) as error:
+                writer.skipped[name] = str(error)
+            else:
+                writer.add(name, {POINTS: samples}, radius=float(np.linalg.norm(samples, axis=-1).max()))
+
+
+def open_surfaces(
+    root: Path, *, points: int, normalisation: Normalisation, cache_dir: str | None
+) -> Store:  # fmt: skip
+    """The store `root`, or the cached store of the meshes in it, made if it is not there.
+
+    Raises ValueError as `open_archive`; StoreError for a store of another `normalisation`.
+    """
+    if not is_store(root):
+        recipe = surfaces_recipe(open_archive(root), points=points, normalisation=normalisation, label=str(root))
+        return cached(recipe, root.resolve().name, cache_dir)
+    store = open_store(root, SURFACES)
+    if (kept := store.parameters["normalisation"]) != normalisation:
+        raise StoreError(
+            f"expected meshes of `normalisation` {normalisation}, got {kept} in {root}; try {kept}, or preparing again "
+            f"with --normalisation {normalisation}"
+        )
+    return store
+
+
+def open_procedural(
+    split: str, count: int, *, seed: int, points: int, normalisation: Normalisation, cache_dir: str | None
+) -> Store:
+    """The cached store of the `count` procedural shapes of a split, made if it is not there.
+
+    Raises ValueError for fewer than one shape.
+    """
+    if count < 1:
+        raise ValueError(f"expected at least one procedural {split} shape, got {count}")
+    label, shapes = f"procedural-{split}", ProceduralShapes(split, seed, range(count))
+    recipe = surfaces_recipe(shapes, points=points, normalisation=normalisation, label=label)
+    return cached(recipe, label, cache_dir)
+
+
+def split_rows(store: Store, split: str, *, root: Path | None, pool_size: int) -> NDArray[np.int64]:
+    """The meshes of a split. StoreError if there are none, or fewer samples of each than `pool_size`."""
+    rows = [row for row in range(len(store)) if store.name(row).split("/")[-2] == split]
+    if not rows:
+        raise StoreError(
+            f"expected meshes <class>/{{train,test}}/* in {root}, got none for {split!r}; try another `root`"
+        )
+    if pool_size > (kept := int(store.counts(POINTS)[0])):
+        raise StoreError(
+            f"expected `pool_size` of at most {kept}, the samples in {store.folder}, got {pool_size}; try that, or "
+            f"preparing again with --points {pool_size}"
+        )
+    return np.array(rows)

@@ -1,0 +1,105 @@
+"""The data module of all sources: stages, loaders and the options that every source has."""
+
+from abc import abstractmethod
+from typing import Any
+
+from lightning import LightningDataModule
+from torch.utils.data import DataLoader
+
+from bpnp.datamodules.augment import Augmentation, Outliers
+from bpnp.datamodules.loader import PairDataset, PairKeys, pair_loader
+from bpnp.datamodules.pair import PairSource
+from bpnp.types import Batch
+
+PARTS = ("train", "val", "test", "predict")
+STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",), None: PARTS}
+
+
+class PairDataModule(LightningDataModule):
+    """Stages and loaders over a source of pairs. A child says what the pairs of each part are: `_source`.
+
+    Works without a Trainer: `setup()`, then the loaders. datasets: by part (train, val, test, predict), after `setup`.
+
+    Args:
+        train_outliers: synthetic outliers and occlusion in training and validation; none for none.
+        test_outliers: the same in testing and prediction.
+        batch_size: training pairs per step, over all processes.
+        eval_batch_size: pairs per step in validation, testing and prediction; none for batch_size.
+        max_cells: limit of pairs x 2D points x 3D points of such a step, to bound the memory; none for no limit.
+        num_workers: loader processes.
+        seed: of all that is drawn at random, and of the order.
+    """
+
+    fresh = False  # whether the training pairs are drawn anew in every epoch
+
+    def __init__(
+        self,
+        *,
+        train_outliers: Outliers | None = None,
+        test_outliers: Outliers | None = None,
+        batch_size: int = 16,
+        eval_batch_size: int | None = None,
+        max_cells: int | None = 2**25,
+        num_workers: int = 0,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        for name, value, least in (
+            ("batch_size", batch_size, 1),
+            ("eval_batch_size", eval_batch_size, 1),
+            ("max_cells", max_cells, 1),
+            ("num_workers", num_workers, 0),
+        ):
+            if value is not None and value < least:
+                raise ValueError(f"expected `{name}` of {least} or more, got {value}")
+        train, test = train_outliers or Outliers(), test_outliers or Outliers()
+        self.outliers = {"train": train, "val": train, "test": test, "predict": test}
+        self.batch_size = batch_size
+        self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
+        self.max_cells, self.num_workers, self.seed = max_cells, num_workers, seed
+        self.datasets: dict[str, PairDataset] = {}
+
+    @abstractmethod
+    def _source(self, part: str, seed: tuple[int, int]) -> PairSource | None:
+        """The pairs of a part; None if there are none and the stage can do without them."""
+
+    def _augmentation(self, part: str) -> Augmentation:
+        """What is done to the pairs of a part."""
+        return Augmentation(outliers=self.outliers[part])
+
+    def setup(self, stage: str | None = None) -> None:
+        """Open the pairs of a stage (fit, validate, test, predict; none for all). Raises ValueError for bad data."""
+        for part in STAGES[stage]:
+            seed = (self.seed, min(PARTS.index(part), PARTS.index("test")))  # prediction has the pairs of testing
+            if (source := self._source(part, seed)) is not None:
+                fresh = self.fresh and part == "train"
+                self.datasets[part] = PairDataset(source, self._augmentation(part), seed=seed, fresh=fresh)
+
+    def train_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("train")
+
+    def val_dataloader(self) -> DataLoader[Batch] | list[DataLoader[Batch]]:
+        return self._loader("val") if "val" in self.datasets or not self.datasets else []
+
+    def test_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("test")
+
+    def predict_dataloader(self) -> DataLoader[Batch]:
+        return self._loader("predict")
+
+    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
+        """The training pairs of a batch of keys, made on the device; other batches as they are."""
+        return self.datasets["train"].batch(batch) if isinstance(batch, PairKeys) else batch
+
+    def _loader(self, part: str) -> DataLoader[Batch]:
+        if part not in self.datasets:
+            raise ValueError(f"expected `setup` before the {part} loader, got no call; try `setup()`")
+        training = part == "train"
+        return pair_loader(
+            self.datasets[part],
+            batch_size=self.batch_size if training else self.eval_batch_size,
+            shuffle=training,
+            seed=self.seed,
+            num_workers=self.num_workers,
+            max_cells=None if training else self.max_cells,
+        )

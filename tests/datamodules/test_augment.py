@@ -1,0 +1,221 @@
+"""Augmentation: counts, bounds and distributions of the protocol; true pairs stay true; no leak between pairs."""
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from jsonargparse import ArgumentParser
+from scipy import stats
+
+from bpnp.datamodules import MeshDataModule
+from bpnp.datamodules.augment import Augmentation, Outliers, augment
+from bpnp.datamodules.keyed_random import row_keys
+from bpnp.datamodules.pair import Counts, Pair, stacked
+from bpnp.geometry import project, transform
+from bpnp.types import Batch
+
+FIELDS = ("points2d", "points3d", "mask2d", "mask3d", "match3d", "rotation", "translation", "origin")
+
+
+def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0) -> Pair:
+    """A camera's pair without noise; points without a partner have coordinates above 50."""
+    rng = np.random.default_rng(seed)
+    points3d = rng.normal(size=(count, 3))
+    rotation, translation = cv2.Rodrigues(rng.normal(size=3))[0], np.array([0.1, -0.2, 9.0])
+    camera = points3d @ rotation.T + translation
+    points2d = np.concatenate([camera[:, :2] / camera[:, 2:], 50 + rng.random((free2d, 2))])
+    points3d = np.concatenate([points3d, 50 + rng.random((free3d, 3))])
+    return Pair(f"p{seed}", np.float32(points2d), np.float32(points3d), count, rotation, translation, 800.0)
+
+
+def raw(*pairs: Pair) -> Batch:
+    return stacked(pairs, torch.arange(len(pairs)))
+
+
+def augmented(batch: Batch, *seeds: int, **options: Any) -> Batch:
+    return augment(batch, Augmentation(**options), row_keys(batch.index, *(seeds or (0,))))
+
+
+def true_pairs(batch: Batch) -> torch.Tensor:
+    return (batch.match3d >= 0).sum(-1)
+
+
+def check(batch: Batch) -> None:
+    """True pairs project onto their 2D points, no 2D point twice, nothing beyond the masks."""
+    true = batch.match3d >= 0
+    seen = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
+    shown = project(transform(batch.rotation, batch.translation, batch.points3d.double())).float()
+    torch.testing.assert_close(shown[true], seen[true], rtol=0, atol=2e-6)
+    for match, own in zip(batch.match3d, true, strict=True):
+        assert len(match[own].unique()) == own.sum()
+    assert (batch.mask3d | ~true).all()
+    assert (batch.points3d[~batch.mask3d] == 0).all()
+    assert (batch.points2d[~batch.mask2d] == 0).all()
+
+
+@pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.5])
+@pytest.mark.parametrize("side", ["both", "2d", "3d"])
+def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
+    pair = planted()
+    result = augmented(raw(pair), outliers=Outliers(ratio=ratio, side=side))
+    added = int(ratio * 60)
+    assert int(result.count2d) == 60 + added * (side != "3d")
+    assert int(result.count3d) == 60 + added * (side != "2d")
+    assert int(true_pairs(result)) == 60
+    check(result)
+    assert result.points2d[0].amin(0).tolist() == pair.points2d.min(0).tolist()
+    assert result.points3d[0].amax(0).tolist() == pair.points3d.max(0).tolist()
+
+
+def test_outliers_are_uniform_in_the_box_and_nowhere_first() -> None:
+    pair = planted(400)
+    result = augmented(raw(pair), outliers=Outliers(ratio=5.0))
+    false = result.match3d[0] < 0
+    outliers = result.points3d[0, false].numpy()
+    low, high = pair.points3d.min(0), pair.points3d.max(0)
+    for axis in range(3):
+        assert stats.kstest((outliers[:, axis] - low[axis]) / (high - low)[axis], "uniform").pvalue > 1e-3
+    for positions in (false.nonzero()[:, 0], result.match3d[0, ~false]):
+        assert stats.kstest(positions.numpy() / 2400, "uniform").pvalue > 1e-3
+
+
+@pytest.mark.parametrize(("side", "left2d", "left3d"), [("2d", 45, 60), ("3d", 60, 45), ("both", 53, 52)])
+def test_occlusion_leaves_points_without_a_partner(side: str, left2d: int, left3d: int) -> None:
+    batch = raw(planted(), planted(6, seed=1))
+    result = augmented(batch, outliers=Outliers(occlusion=0.25, occluded_side=side))
+    assert (int(result.count2d[0]), int(result.count3d[0])) == (left2d, left3d)
+    assert true_pairs(result).tolist() == [45, 4]
+    check(result)
+    assert true_pairs(augmented(batch, outliers=Outliers(occlusion=0.9))).tolist() == [6, 4]
+
+
+@pytest.mark.parametrize(
+    ("clutter", "side", "extra2d", "extra3d"),
+    [(0.25, "both", 5, 5), (0.25, "2d", 5, 0), (0.25, "3d", 0, 5), (2.0, "both", 12, 30), (0.0, "both", 0, 0)],
+)
+def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str, extra2d: int, extra3d: int) -> None:
+    batch = raw(planted(40, free2d=12, free3d=30))
+    result = augmented(batch, max_points=20, clutter=clutter, clutter_side=side)
+    assert (int(true_pairs(result)), int(result.count2d), int(result.count3d)) == (20, 20 + extra2d, 20 + extra3d)
+    check(result)
+    assert int((result.points2d > 50).all(-1).sum()) == extra2d
+    assert int((result.points3d > 50).all(-1).sum()) == extra3d
+    assert len(result.points3d[0].unique(dim=0)) == 20 + extra3d
+    whole = augmented(batch)
+    assert (int(true_pairs(whole)), int(whole.count2d), int(whole.count3d)) == (40, 52, 70)
+
+
+def test_every_pair_and_every_clutter_point_is_as_likely() -> None:
+    """How often each of 10 true pairs and 6 free points is among 5 and 2 chosen, over 4000 draws."""
+    batch = raw(*[planted(10, free3d=6)] * 4000)
+    result = augmented(batch, max_points=5, clutter=0.4)
+    for points, count in ((batch.points3d[0, :10], 5), (batch.points3d[0, 10:], 2)):
+        hits = (result.points3d[:, :, None] == points).all(-1).sum((0, 1)).double()
+        share = count / len(points)
+        assert (hits / 4000 - share).abs().max() < 4 * (share * (1 - share) / 4000) ** 0.5
+
+
+def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
+    """camera = R (p + origin) + t - R origin is the same however the pair is turned."""
+    batch = raw(planted(), planted(seed=1))
+    batch.origin = torch.tensor([[5e5, -3e6, 40.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
+    straight, turned = augmented(batch), augmented(batch, rotate=True)
+    check(turned)
+    for before, after in ((straight, turned),):
+        camera = (transform(b.rotation, b.translation, b.points3d.double()) for b in (before, after))
+        torch.testing.assert_close(*camera, rtol=0, atol=1e-5)
+        seen = ((b.rotation @ b.origin[..., None]) for b in (before, after))
+        torch.testing.assert_close(*seen, rtol=1e-12, atol=0)
+    assert (straight.rotation - turned.rotation).abs().amax((-2, -1)).min() > 0.1
+    assert not torch.allclose(*(turned.rotation.mT @ straight.rotation))
+
+
+def test_turns_are_uniform() -> None:
+    """The angle of a uniform rotation has the distribution function (a - sin a) / pi."""
+    batch = raw(*[planted(4)] * 1000)
+    turns = augmented(batch, rotate=True).rotation.mT @ batch.rotation
+    angles = np.arccos(np.clip((np.trace(turns.numpy(), axis1=1, axis2=2) - 1) / 2, -1, 1))
+    assert stats.kstest(angles, lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
+
+
+HARD: dict[str, Any] = {
+    "max_points": 30, "clutter": 0.3, "rotate": True,
+    "outliers": Outliers(ratio=(0.0, 1.0), side="random", occlusion=(0.0, 0.4), occluded_side="random"),
+}  # fmt: skip
+
+
+def test_a_pair_depends_on_its_key_alone_not_on_neighbours_or_padding() -> None:
+    pairs = [planted(n, free2d=n // 2, free3d=9, seed=n) for n in (8, 60, 25)]
+    together = augmented(raw(*pairs), 1, 2, **HARD)
+    check(together)
+    for row, pair in enumerate(pairs):
+        alone = augment(stacked([pair], torch.tensor([row])), Augmentation(**HARD), row_keys(torch.tensor([row]), 1, 2))
+        for name in FIELDS:
+            whole, own = getattr(together, name)[row], getattr(alone, name)[0]
+            assert torch.equal(whole[: len(own)], own), name
+            assert name in ("rotation", "translation", "origin") or not (whole[len(own) :] > 0).any()
+    again, other = (augmented(raw(*pairs), 1, epoch, **HARD) for epoch in (2, 3))
+    assert torch.equal(again.points2d, together.points2d)
+    assert other.points2d.shape != together.points2d.shape or not torch.equal(other.points2d, together.points2d)
+
+
+def test_ranges_are_drawn_uniformly_for_each_pair() -> None:
+    """Counts follow their ranges: ratio uniform in (0.2, 1.4), occlusion in (0.1, 0.5), each side a third."""
+    outliers = Outliers(ratio=(0.2, 1.4), side="random", occlusion=(0.1, 0.5), occluded_side="3d")
+    result = augmented(raw(*[planted(200)] * 600), outliers=outliers)
+    true = true_pairs(result).double()
+    outliers2d, outliers3d = result.count2d - 200, result.count3d - true
+    added = torch.maximum(outliers2d, outliers3d) / true
+    assert stats.kstest(added.numpy(), "uniform", (0.2, 1.2)).statistic < 0.08
+    assert stats.kstest(1 - true.numpy() / 200, "uniform", (0.1, 0.4)).statistic < 0.08
+    kinds = np.bincount(((outliers2d > 0) + 2 * (outliers3d > 0)).numpy(), minlength=4)
+    assert kinds[0] == 0
+    assert stats.chisquare(kinds[1:]).pvalue > 1e-3
+
+
+def test_sizes_are_upper_bounds_that_are_reached() -> None:
+    pairs = [planted(n, free2d=2 * n, free3d=7, seed=n) for n in (8, 60, 25)]
+    counts = Counts(*(np.array(x) for x in ([8, 60, 25], [24, 180, 75], [15, 67, 32])))
+    hard = dict(HARD, outliers=Outliers(ratio=(0.0, 1.0)))
+    for options in ({}, {"max_points": 30}, {"clutter": 0.0}, {"clutter": 0.5, "clutter_side": "3d"}, hard):
+        bound = Augmentation(**options).sizes(counts)
+        largest = np.zeros(3)
+        for seed in range(60 if "outliers" in options else 1):
+            result = augmented(raw(*pairs), seed, **options)
+            sides = torch.maximum(result.count2d, result.count3d).numpy()
+            assert (sides <= bound).all()
+            largest = np.maximum(largest, sides)
+        assert (largest >= (0.8 if "outliers" in options else 1) * bound).all()
+
+
+WRONG: list[tuple[type, dict[str, Any]]] = [
+    (Outliers, {"ratio": -1.0}), (Outliers, {"ratio": np.nan}), (Outliers, {"ratio": (0.5, 0.2)}),
+    (Outliers, {"ratio": (0.0, np.inf)}), (Outliers, {"occlusion": 1.0}), (Outliers, {"occlusion": (0.0, 1.0)}),
+    (Augmentation, {"clutter": -0.1}), (Augmentation, {"clutter": np.nan}), (Augmentation, {"max_points": 3}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "bad"), WRONG)
+def test_wrong_options_are_named(kind: type, bad: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=next(iter(bad))):
+        kind(**bad)
+
+
+@pytest.mark.parametrize(("valid", "name"), [(Outliers(), "side"), (Augmentation(), "clutter_side")])
+def test_a_side_that_there_is_not_is_named(valid: Any, name: str) -> None:
+    object.__setattr__(valid, name, "2D")  # past the type checks of the tests, which users do not have
+    with pytest.raises(ValueError, match=f'`{name}` "both", "2d".* got \'2D\''):
+        valid.__post_init__()
+
+
+def test_ranges_come_from_yaml(tmp_path: Path) -> None:
+    (tmp_path / "data.yaml").write_text("train_outliers: {ratio: [0, 1], side: random, occlusion: [0.1, 0.3]}\n")
+    parser = ArgumentParser()
+    parser.add_class_arguments(MeshDataModule, "data")
+    options = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'data.yaml'}"]))
+    assert options.data.outliers["train"] == Outliers((0.0, 1.0), "random", (0.1, 0.3))
+    options = parser.instantiate_classes(parser.parse_args(["--data.train_outliers={ratio: 0.5}"]))
+    assert options.data.outliers["train"] == Outliers(0.5)

@@ -1,0 +1,173 @@
+"""The data store: what comes out is what went in, nothing is copied, and damage is noticed."""
+
+import json
+import os
+import pickle
+import resource
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bpnp.datamodules.store import Store, StoreError, StoreWriter, is_store, new_store, open_store
+
+WIDTHS = {"flat": 2, "deep": 3}
+
+
+def rows(count: int = 12, first: int = 0) -> list[tuple[str, dict[str, np.ndarray], float]]:
+    """Name, points of either column, and one number, of rows of 0 to 40 points."""
+    result = []
+    for i in range(first, first + count):
+        rng = np.random.default_rng(i)
+        points = {name: rng.random((rng.integers(0, 40), width)).astype("f4") for name, width in WIDTHS.items()}
+        result.append((f"scène {'x' * i}/{i}", points, float(i)))
+    return result
+
+
+def fill(writer: StoreWriter, count: int = 12, first: int = 0) -> None:
+    for name, points, number in rows(count, first):
+        writer.add(name, points, number=number, scene=np.bytes_(f"s{number}".encode()))
+
+
+def write(folder: Path, count: int = 12, first: int = 0) -> Store:
+    with new_store(folder, "toy", WIDTHS) as writer:
+        fill(writer, count, first)
+        writer.parameters["clutter"] = 1.0
+        writer.skipped["s9/1"] = "too few"
+    return open_store(folder, "toy")
+
+
+def check(store: Store, count: int = 12) -> None:
+    assert len(store) == count
+    store.verify()
+    for i, (name, points, number) in enumerate(rows(count)):
+        assert (store.name(i), store.columns["number"][i]) == (name, number)
+        for key, values in store.row(i).items():
+            np.testing.assert_array_equal(values, points[key])
+            assert store.counts(key)[i] == len(values)
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    return write(tmp_path / "store")
+
+
+def test_round_trip(store: Store) -> None:
+    check(store)
+    assert (store.parameters, store.skipped) == ({"clutter": 1.0}, {"s9/1": "too few"})
+    for path in store.folder.glob("*.npy"):
+        np.load(path)  # a column is a plain .npy file
+
+
+def test_parts_in_a_row_are_the_whole(tmp_path: Path, store: Store) -> None:
+    parts = [write(tmp_path / "a", 5), write(tmp_path / "none", 0), write(tmp_path / "b", 7, first=5)]
+    with new_store(tmp_path / "whole", "toy", WIDTHS) as writer:
+        for part in parts:
+            writer.extend(part)
+        writer.parameters["clutter"] = 1.0
+    check(open_store(tmp_path / "whole", "toy"))
+    for path in store.folder.iterdir():
+        assert (tmp_path / "whole" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_a_store_may_be_empty(tmp_path: Path) -> None:
+    assert len(write(tmp_path / "none", 0)) == 0
+
+
+def test_nothing_is_copied_for_a_reader_or_a_worker(store: Store) -> None:
+    a, b = store.row(3)["deep"], store.row(3)["deep"]
+    assert np.shares_memory(a, b)
+    assert not a.flags.writeable
+    sent = pickle.dumps(store)
+    assert len(sent) < 500
+    check(pickle.loads(sent))
+
+
+COLUMNS = ["flat", "deep", "flat_start", "deep_start", "number", "scene", "name", "checksum"]
+
+
+@pytest.mark.parametrize("name", [*(f"{column}.npy" for column in COLUMNS), "manifest.json"])
+@pytest.mark.parametrize("damage", ["cut", "long", "gone", "flip", "header"])
+def test_damage_is_one_clear_error(store: Store, name: str, damage: str) -> None:
+    path = store.folder / name
+    content = bytearray(path.read_bytes())
+    content[3 if damage == "header" else -1] ^= 1
+    changed = {"cut": content[:-1], "long": content + b"0"}.get(damage, content)
+    os.unlink(path)
+    if damage != "gone":
+        path.write_bytes(changed)
+    with pytest.raises(StoreError, match=str(store.folder)):
+        open_store(store.folder, "toy").verify()
+
+
+@pytest.mark.parametrize("content", ["", "{}", "[]", "null", "not json", '{"checksum": 1}'])
+def test_a_broken_manifest_is_one_clear_error(store: Store, content: str) -> None:
+    (store.folder / "manifest.json").write_text(content)
+    with pytest.raises(StoreError, match=str(store.folder)):
+        open_store(store.folder, "toy")
+
+
+def test_an_edited_manifest_and_another_kind_are_noticed(store: Store) -> None:
+    with pytest.raises(StoreError, match=r"expected other in format \d, got toy .*try the other data module"):
+        open_store(store.folder, "other")
+    path = store.folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    assert manifest["rows"] == 12
+    manifest["rows"] += 1
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match="edited"):
+        open_store(store.folder, "toy")
+
+
+def test_a_failed_write_leaves_nothing(tmp_path: Path, store: Store) -> None:
+    def stopped() -> None:
+        with new_store(tmp_path / "other", "toy", WIDTHS) as writer:
+            fill(writer, 3)
+            raise RuntimeError("stop")
+
+    with pytest.raises(RuntimeError, match="stop"):
+        stopped()
+    with pytest.raises(StoreError, match="exists"), new_store(store.folder, "toy", WIDTHS):
+        pass
+    assert [p.name for p in tmp_path.iterdir()] == ["store"]
+    assert is_store(store.folder)
+    assert not is_store(tmp_path)
+
+
+FULL = """
+import sys
+from pathlib import Path
+import numpy as np
+from bpnp.datamodules.store import new_store
+try:
+    with new_store(Path(sys.argv[1]), "toy", {"points": 3}) as writer:
+        for i in range(400):
+            writer.add(str(i), {"points": np.ones((2048, 3))}, radius=1.0)
+except OSError as error:
+    sys.exit(str(error))
+"""
+
+
+def limited() -> None:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
+
+
+@pytest.mark.parametrize("way", ["limit", "disk"])
+def test_a_full_disk_is_one_error_that_names_the_store(tmp_path: Path, way: str) -> None:
+    """No SIGBUS and nothing left; on a file system of 2 MB where this user may mount one."""
+    command, before = [sys.executable, "-c", FULL, str(tmp_path / "disk" / "store")], limited
+    (tmp_path / "disk").mkdir()
+    if way == "disk":
+        mount = f"mount -t tmpfs -o size=2m none {tmp_path / 'disk'}"
+        if subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True).returncode:
+            pytest.skip("no file system can be mounted here")
+        script = f'{mount} && "$@"; code=$?; ls -A {tmp_path / "disk"}; exit $code'
+        command, before = ["unshare", "-rm", "sh", "-c", script, "sh", *command], None
+    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=before)
+    assert result.returncode == 1, result.stderr
+    message = {"limit": "File too large", "disk": "No space left on device"}[way]
+    assert f"{message}: '{tmp_path / 'disk' / 'store'}'" in result.stderr
+    assert result.stdout == ""
+    assert list((tmp_path / "disk").iterdir()) == []

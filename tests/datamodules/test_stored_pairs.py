@@ -1,0 +1,116 @@
+"""Pairs in a store: every pair comes back, small ones are left out, and what does not fit is refused."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bpnp.datamodules import ColmapDataModule, Pair, PairSource, write_pairs
+from bpnp.datamodules.augment import Augmentation
+from bpnp.datamodules.loader import PairDataset, pair_loader
+from bpnp.datamodules.store import Store, StoreError, open_store
+from bpnp.datamodules.stored_pairs import PAIRS, StoredPairs, scene_rows, stored_pair
+
+
+def sets(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """4 to 60 true pairs with clutter on both sides, shuffled; the x of both points of a pair are equal."""
+    rng = np.random.default_rng(i)
+    k, free2d, free3d = rng.integers(4, 60), rng.integers(0, 40), rng.integers(0, 40)
+    values = rng.random(k)
+    points2d = np.column_stack([np.r_[values, -1 - rng.random(free2d)], rng.random(k + free2d)])
+    points3d = np.column_stack([np.r_[values, 2 + rng.random(free3d)], rng.random((k + free3d, 2))])
+    order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(points3d))
+    match = np.r_[np.argsort(order2d)[:k], np.full(free3d, -1)]
+    return points2d[order2d], points3d[order3d], match[order3d]
+
+
+def pairs(count: int = 12) -> list[tuple[str, Pair]]:
+    result = []
+    for i in range(count):
+        rng = np.random.default_rng(100 + i)
+        pose = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
+        points2d, points3d, match = sets(i)
+        origin = rng.normal(size=3) if i % 2 else None
+        pair = Pair.from_matches(f"scène {i % 3}/{i}", points2d, points3d, *pose, match, float(i + 1), origin)
+        result.append((f"s{i % 3}", pair))
+    return result
+
+
+@pytest.fixture
+def store(tmp_path: Path) -> Store:
+    write_pairs(tmp_path / "store", pairs(), parameters={"clutter": 1.0})
+    return open_store(tmp_path / "store", PAIRS)
+
+
+def test_matches_put_the_true_pairs_first_and_lose_no_point() -> None:
+    for i, (_, pair) in enumerate(pairs()):
+        points2d, points3d, match = sets(i)
+        assert pair.matched == (match >= 0).sum()
+        np.testing.assert_array_equal(pair.points2d[: pair.matched, 0], pair.points3d[: pair.matched, 0])
+        assert (pair.points2d[pair.matched :, 0] < 0).all()
+        assert (pair.points3d[pair.matched :, 0] >= 2).all()
+        for ours, given in ((pair.points2d, points2d), (pair.points3d, points3d)):
+            assert {tuple(p) for p in ours} == {tuple(p) for p in given.astype("f4")}
+
+
+def test_pairs_come_back(store: Store) -> None:
+    assert {name: rows.tolist() for name, rows in scene_rows(store).items()} == {
+        f"s{s}": list(range(s, 12, 3)) for s in range(3)
+    }
+    for i, (_, pair) in enumerate(pairs()):
+        back = stored_pair(store, i)
+        assert (back.name, back.focal, back.matched) == (pair.name, pair.focal, pair.matched)
+        for name in ("points2d", "points3d", "rotation", "translation"):
+            np.testing.assert_array_equal(getattr(back, name), getattr(pair, name))
+        np.testing.assert_array_equal(back.origin, np.zeros(3) if pair.origin is None else pair.origin)
+
+
+WRONG = [
+    ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in 'a/1'; try .astype"),
+    ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in 'a/1'"),
+    ({"match3d": np.arange(3)}, r"`match3d` \(n,\), got .* in 'a/1'"),
+    ({"match3d": np.array([0, 1, 1, 2])}, "at most one 3D point for each 2D point, got two in `match3d` of 'a/1'"),
+    ({"points2d": np.full((4, 2), np.nan)}, "finite points, pose and focal.*'a/1'"),
+    ({"translation": np.full(3, np.inf)}, "finite points, pose and focal.*'a/1'"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), WRONG)
+def test_arrays_that_do_not_fit_are_named(change: dict[str, np.ndarray], message: str) -> None:
+    points = np.ones((4, 3))
+    given = {"points2d": points[:, :2], "points3d": points, "rotation": np.eye(3), "translation": np.zeros(3)}
+    create = Pair.from_matches.__func__
+    create = getattr(create, "__wrapped__", create)  # past the type checks of the tests, which users do not have
+    with pytest.raises(ValueError, match=message):
+        create(Pair, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | given | change))
+
+
+def test_small_pairs_are_left_out(store: Store) -> None:
+    with pytest.warns(UserWarning, match=r"skipped \d+ of 12 pairs"):
+        source = StoredPairs(store, np.arange(12), min_points=30)
+    assert isinstance(source, PairSource)
+    assert set(source.names(range(len(source.rows)))) == {pair.name for _, pair in pairs() if pair.matched >= 30}
+    assert source.counts.matched.tolist() == [pair.matched for _, pair in pairs() if pair.matched >= 30]
+    with pytest.raises(StoreError, match="min_points"):
+        StoredPairs(store, np.arange(12), min_points=100)
+
+
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) -> None:
+    dataset = PairDataset(StoredPairs(store, np.arange(12), min_points=4), Augmentation(max_points=20, clutter=0.5))
+    loader = pair_loader(dataset, batch_size=5, shuffle=False, seed=0, num_workers=num_workers)
+    served = {}
+    for batch in loader:
+        for row, name in enumerate(batch.ids):
+            served[name] = batch.points3d[row, batch.mask3d[row]]
+    assert sorted(served) == sorted(pair.name for _, pair in pairs())
+    for i, (_, pair) in enumerate(pairs()):
+        assert torch.equal(served[pair.name], pickle.loads(pickle.dumps(dataset)).pair(i).points3d[0])
+
+
+def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
+    data = ColmapDataModule(str(store.folder), test_scenes=["s1"], val_scenes=["s2"])
+    data.setup()
+    assert {name for batch in data.test_dataloader() for name in batch.ids} == {f"scène 1/{i}" for i in range(1, 12, 3)}
