@@ -1,5 +1,6 @@
 """Blind Perspective-n-Point: a camera's pose from 2D and 3D points that nobody has matched."""
 
+from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
 from bpnp.models import BPnPNet, Matcher
@@ -24,3 +25,9 @@ def __getattr__(name: str) -> Any:
 
         return SceneMap
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+try:
+    __version__ = version("bpnp")
+except PackageNotFoundError:  # run from its source
+    __version__ = "unknown"

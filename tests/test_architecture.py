@@ -31,7 +31,7 @@ MAY_IMPORT = {
     "search": set(),
     "layers": {"robust"},
     "models": {"robust", "layers", "search"},
-    "solving": {"robust", "layers", "search", "models"},
+    "solving": {"robust", "layers", "search", "models", "report"},
     "datamodules": set(),
     "maps": {"solving", "search", "models", "robust", "layers", "datamodules"},
     "report": set(),
@@ -40,6 +40,7 @@ MAY_IMPORT = {
     "table": {"models", "solving", "datamodules", "report", "training"},
     "commands": {"models", "search", "solving", "training", "datamodules", "report", "localization", "table"},
     "cli": {"commands", "training"},
+    "examples": {"datamodules"},
     "__main__": {"cli"},
     "": {"maps", "models", "search", "solving"},
 }  # fmt: skip

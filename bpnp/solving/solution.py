@@ -4,13 +4,16 @@ import json
 import math
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 import numpy.typing as npt
 
 from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = npt.NDArray[np.float64]
 FORMAT = 2  # 2 has the false alarms
@@ -105,6 +108,26 @@ class Solution:
     def found(self) -> bool:
         """Whether there is a pose at all; see `verdict` for whether to trust it."""
         return bool(np.isfinite(self.rotation).all() and np.isfinite(self.translation).all())
+
+    def __repr__(self) -> str:
+        rows = "\n            ".join("  ".join(f"{value: .6f}" for value in row) for row in self.rotation)
+        return (
+            f"Solution({self.verdict}: {self.reason}\n  rotation: {rows}\n"
+            f"  translation: {'  '.join(f'{value: .6g}' for value in self.translation)}\n"
+            f"  matches: {self.inlier_count} of {min(len(self.points2d), len(self.points3d))}, "
+            f"mean error {self.reprojection_error:.3g} {self.unit}\n"
+            f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"
+        )
+
+    def plot(self, *, photo: npt.NDArray[np.uint8] | None = None) -> "Figure":
+        """The image points and the scene points where the pose puts them, as a matplotlib figure.
+
+        photo: (h, w, 3) under the points, undistorted, that fills `bpnp.report.pictures.picture_box(points2d)`.
+        Raises ValueError if no image point is in front of the camera.
+        """
+        from bpnp.report.pictures import solution_picture
+
+        return solution_picture(self, photo=photo)
 
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""

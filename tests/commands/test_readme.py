@@ -6,13 +6,16 @@ import shlex
 import typing
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
 from bpnp.cli import COMMANDS, LIGHTNING
 from bpnp.commands.parser import run_command
 from bpnp.configs import packaged_config
+from bpnp.examples import load
 
 ROOT = Path(__file__).parents[2]
 TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -64,3 +67,24 @@ def test_links_lead_somewhere(text: Path) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", text.read_text(encoding="utf-8")):
         if not target.startswith("http"):
             assert (text.parent / target).exists(), target
+
+
+def test_the_readme_is_short() -> None:
+    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 100
+    assert max(map(len, lines)) <= 120
+
+
+def test_the_code_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(blocks) == 2
+    names: dict[str, Any] = {}
+    exec(blocks[0], names)
+    assert names["example"].rotation_error_deg(names["solution"].rotation) < 0.1
+    assert (tmp_path / "pose.png").stat().st_size > 5000
+    mesh = load("mesh")
+    bearings = np.c_[mesh.points2d, np.ones(200)] @ np.linalg.inv(mesh.camera).T
+    names |= {"points2d": bearings[:, :2], "points3d": mesh.points3d}
+    exec(blocks[1], names)
+    assert names["pose"].rotation.shape == (1, 3, 3)
