@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from bpnp.search.annealing import Deadline, finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
-from bpnp.search.few.search import is_few, search_few
+from bpnp.search.few.search import is_few, judged_few, search_few
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -51,11 +51,12 @@ def search_poses(
     few = Candidates.none()
     if is_few(sets) and not end.passed():
         few, exhausted = search_few(sets, end, settings)
-        result = judged(few, sets, batches=0, exhaustive=True, rule=settings.evidence)
+        result = judged_few(sets, few, settings)
         if progress is not None:
             progress(0, time.monotonic() - start)
+        # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        if result.verdict == "confident" or exhausted or small:
+        if exhausted or small or result.log10_false_alarms <= settings.evidence.false_alarms:
             return result
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"

@@ -85,6 +85,8 @@ class Evidence:
     exhaustive search stayed above 1 in 999 of 1000 cases, and never came below 0.1.
     lead: by which every different pose must have more. other_deg, other_shift: poses with rotations farther apart, or
     translations by this share of their length, are different.
+    loose_deg: standard deviation of the rotation about its least certain axis; few points that fix it less well than
+        this leave the verdict ambiguous.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed;
     far_false_alarms: below it one is enough, since repeated structure does not reach it.
     stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search,
@@ -96,6 +98,7 @@ class Evidence:
     lead: float = 2.0
     other_deg: float = 5.0
     other_shift: float = 0.1
+    loose_deg: float = 1.0
     hits: int = 2
     far_false_alarms: float = -60.0
     stalled: int = 4

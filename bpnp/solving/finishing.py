@@ -26,7 +26,9 @@ def finished(
     if not len(found):
         return without_pose(problem, result.reason, inlier_threshold, dropped)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
-    rotation, translation = _fitted(problem, *result.best, threshold)
+    rotation, translation = result.best
+    if result.batches:  # an enumerated pose is a least-squares fit in float64 already
+        rotation, translation = _fitted(problem, rotation, translation, threshold)
     projected = problem.view(rotation, translation)
     matches = one_to_one(problem.image, projected, threshold, problem.allowed)
     counts = [len(matches)] + [

@@ -1,6 +1,7 @@
 """The enumeration as a search: candidates with their likelihood, and an end when the verdict on them is certain."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,13 +12,15 @@ from bpnp.search.few.knowledge import pairs_that_fix
 from bpnp.search.few.poses import FewPoses, enumerate_poses
 from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.settings import SearchSettings
-from bpnp.search.verdict import is_certain, weighed
+from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.verdict import SearchResult, is_certain, judged, weighed
 
 Array = NDArray[np.float64]
 FEW_PAIRS = 4000  # pairs of an image point and a scene point up to which near triples are enumerated: 60 x 60
 KNOWN_PAIRS = 250_000  # the same where a prior lets two pairs fix a pose
 FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels where that is a tenth of one
 RADIUS = 3e-3  # radians, where no scale is known
+MATCHED_SCALES = 3.0  # distance of a matched point, in scales of the residuals
 NEAR_NATS = 25.0  # of evidence: a pose that has so much less than the best is no rival
 
 
@@ -37,6 +40,52 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
     found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe)
     return _candidates(found, sets, settings), found.exhausted
+
+
+def judged_few(sets: PointSets, few: Candidates, settings: SearchSettings) -> SearchResult:
+    """The verdict on enumerated poses; one that its matches leave loose is ambiguous: its neighbours fit as well."""
+    result = judged(few, sets, batches=0, exhaustive=True, rule=settings.evidence)
+    if result.verdict != "confident":
+        return result
+    sigma = math.degrees(rotation_sigma(sets, *result.best, result.residual))
+    if sigma <= settings.evidence.loose_deg:
+        return result
+    reason = f"the pose fits, but so few and near matches leave its rotation loose: {sigma:.1f} deg, one sigma"
+    return replace(result, verdict="ambiguous", reason=reason)
+
+
+def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: float) -> float:
+    """Standard deviation of the rotation about its least certain axis, radians, from noise of `scale` radians.
+
+    (J^T J)^-1 scale^2 of the directions of the matched points, J by the turn and the shift of the points' middle, with
+    what the prior adds; infinite if the matches do not fix the pose.
+    """
+    turned = sets.points3d @ rotation.T
+    camera = turned + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    seen = camera / depth[:, None]
+    if sets.normals3d is not None:
+        seen[(seen * (sets.normals3d @ rotation.T)).sum(-1) >= 0] = np.inf
+    near = np.linalg.norm(sets.bearings[:, None] - seen, axis=-1)
+    partner = near.argmin(1)
+    partner = np.unique(partner[near.min(1) < MATCHED_SCALES * scale])
+    if not len(partner):
+        return math.inf
+    u, p = seen[partner], turned[partner] - turned[partner].mean(0)
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[partner, None, None]
+    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1).reshape(-1, 6)
+    information = jacobian.T @ jacobian / scale**2
+    prior = sets.prior
+    if isinstance(prior, GravityPrior):
+        up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
+        information[:3, :3] += (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
+    elif isinstance(prior, PosePrior):
+        information[:3, :3] += np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
+    # The shift is eliminated; what is left of the rotation's information has the least certain axis' eigenvalue.
+    shift = information[3:, 3:] + 1e-12 * np.trace(information[3:, 3:]) * np.eye(3)
+    rest = information[:3, :3] - information[:3, 3:] @ np.linalg.solve(shift, information[3:, :3])
+    least = float(np.linalg.eigvalsh(rest)[0])
+    return 1 / math.sqrt(least) if least > 0 else math.inf
 
 
 def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
