@@ -120,10 +120,11 @@ def frame(
     background: int = 0,
     missing: float = 0.0,
     least: int = 4,
+    most: int | None = None,
     distance: tuple[float, float] = (0.25, 0.8),
     off_axis: float = 0.5,
 ) -> Frame:
-    """A picture of a device in a random pose, at least `least` of whose LEDs are seen.
+    """A picture of a device in a random pose, at least `least` of whose LEDs are seen and at most `most` are detected.
 
     noise: pixels, standard deviation. background: lights that are not the device's, uniform in the picture or, half of
     them, around the device. missing: share of the LEDs that face the camera and are not detected. distance: metres.
@@ -136,6 +137,9 @@ def frame(
         led, pixels = seen(device, rotation, translation, camera, rng, noise=noise, missing=missing)
         if len(led) < least:
             continue
+        if most is not None and len(led) > most:
+            chosen = rng.choice(len(led), most, replace=False)
+            led, pixels = led[chosen], pixels[chosen]
         lights = camera.size * rng.random((background, 2))
         near = rng.random(background) < 0.5
         spread = 1.5 * np.ptp(pixels, axis=0).max()
