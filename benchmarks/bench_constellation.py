@@ -1,6 +1,6 @@
 """Few points: LED devices, noise, gravity, two devices, craters; success, false accepts and milliseconds.
 
-python benchmarks/bench_constellation.py [--frames 200] [--seed 0] [--peers 20] [--only ring,craters] [--out FILE.json]
+python benchmarks/bench_constellation.py [--frames 200] [--seed 0] [--peers 20] [--only ring craters] [--out FILE.json]
 
 Every frame has a new pose, every fifth a new device; `--seed` changes devices and frames. "right" is a rotation within
 3 degrees; "limit" is the share of frames in which least squares on the true matches is that close; "wrong" counts
@@ -80,15 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--frames", type=int, default=200, help="a row (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--peers", type=int, default=0, help="frames of some rows for the baselines")
-    parser.add_argument("--only", default="", help="words, one of which a row's name has, separated by commas")
+    parser.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "constellation.json")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
-    wanted = [word for word in options.only.split(",") if word] or [""]
     rows = [
         (name, run)
         for name, run in rows_of(options.frames, options.seed, options.peers)
-        if any(word in name for word in wanted)
+        if any(part in name for part in options.only)
     ]
     record: dict[str, Any] = {"machine": machine(), "seed": options.seed, "rows": []}
     table = Table("", "frames", "right %", "limit %", "confident %", "wrong", "p50 ms", "p95", "p99")
@@ -259,7 +258,7 @@ def _first_call() -> tuple[Any, ...]:
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
-    """Bars of what was right and of what was said with confidence; the time of the median and of the slowest hundredth."""
+    """Bars of what was right and of what was confident; the time of the median and of the slowest hundredth."""
     import matplotlib.pyplot as plt
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(11, 0.3 * len(rows) + 1.2), sharey=True, layout="constrained")
