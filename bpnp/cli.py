@@ -3,6 +3,7 @@
 import difflib
 import logging
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -21,7 +22,7 @@ from bpnp.commands import COMMANDS
 from bpnp.commands.parser import OneLineParser, first_line, run_command
 from bpnp.configs import config_names, packaged_config
 from bpnp.files import claimed
-from bpnp.training.plugins import SafeCheckpointIO
+from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
@@ -65,7 +66,7 @@ class BpnpCLI(LightningCLI):
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
         if self._get(self.config, "trainer.enable_progress_bar") is False:
-            self.trainer_defaults["callbacks"] = []
+            self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         plugins = self._get(self.config_init, "trainer.plugins") or []
         own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
@@ -89,9 +90,27 @@ class BpnpCLI(LightningCLI):
 
     def _run_subcommand(self, subcommand: str) -> None:
         """In a run folder that no other training holds."""
+        self._check_checkpoint(subcommand)
         training = subcommand == "fit" and self.trainer.global_rank == 0
         with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext():
-            super()._run_subcommand(subcommand)
+            try:
+                super()._run_subcommand(subcommand)
+            except SystemExit:
+                # Lightning ends the process with status 1 after an interruption.
+                if self.trainer.interrupted:
+                    signal.signal(signal.SIGINT, signal.default_int_handler)
+                    raise KeyboardInterrupt from None
+                raise
+
+    def _check_checkpoint(self, subcommand: str) -> None:
+        """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""
+        path = self._get(self.config, "ckpt_path")
+        folder = Path(_checkpoint_folder(self.trainer.default_root_dir))
+        if path == "last" and not list(folder.glob("last*.ckpt")):
+            raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
+        trained = [name for name in ("checkpoint", "pretrained") if name in str(self._get(self.config, "model.solver"))]
+        if subcommand != "fit" and path is None and not trained and any(True for _ in self.model.parameters()):
+            print("bpnp: no --ckpt_path: the weights of the solver are untrained", file=sys.stderr)
 
 
 def _checkpoint_folder(root: str) -> str:
@@ -183,7 +202,11 @@ def _lightning(arguments: list[str]) -> None:
         subclass_mode_data=True,
         seed_everything_default=0,
         save_config_kwargs={"overwrite": True},
-        trainer_defaults={"callbacks": [RichProgressBar()], "max_epochs": 200, "num_sanity_val_steps": 0},
+        trainer_defaults={
+            "callbacks": [RichProgressBar(), InterruptedCheckpoint()],
+            "max_epochs": 200,
+            "num_sanity_val_steps": 0,
+        },
         parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
         args=arguments,
     )

@@ -106,7 +106,7 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
         raise FileNotFoundError(f"expected a checkpoint, got no file at {file}; try runs/<name>/checkpoints/last.ckpt")
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError) as error:
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, OSError) as error:
         reason = str(error).splitlines()[0].split(". ")[0]
         raise ValueError(
             f"expected a checkpoint of `bpnp fit`, got a file that cannot be read: {file} ({reason})"

@@ -1,11 +1,13 @@
 """How the trainer reads checkpoints and runs the nets."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
 
 from bpnp.models.weights import read_checkpoint
@@ -42,3 +44,13 @@ class CompileNets(Callback):
             raise ValueError(f"expected nets of {type(solver).__name__}, got {missing}; try others in `names`")
         for name in self.names:
             getattr(solver, name).compile(backend=self.backend)
+
+
+class InterruptedCheckpoint(Callback):
+    """Saves `checkpoints/interrupted.ckpt` in the trainer's default_root_dir when a training is stopped by Ctrl-C."""
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit" and trainer.global_step > 0:
+            path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
+            trainer.save_checkpoint(path)
+            rank_zero_info(f"interrupted in epoch {trainer.current_epoch}; go on with --ckpt_path {path}")

@@ -59,17 +59,26 @@ class ResultsWriter(Callback):
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather((self.rows, self.losses, self.chosen, self.views))
+        self._write_test(trainer, _gather((self.rows, self.losses, self.chosen, self.views)), complete=True)
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """Of an interrupted test the pairs that are finished; of several processes those of the first."""
+        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
+            self._write_test(trainer, [(self.rows, self.losses, self.chosen, self.views)], complete=False)
+
+    def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
         if trainer.is_global_zero:
             rows = [row for part, _, _, _ in gathered for row in part]
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer, "test")
-            write_results(folder, rows, correspondence_loss=mean, settings=_settings(trainer))
+            write_results(folder, rows, correspondence_loss=mean, settings=_settings(trainer) | {"complete": complete})
             chosen = select_views([view for _, _, part, _ in gathered for view in part])
             write_views(folder, [*chosen, *(view for *_, part in gathered for view in part)])
             report([folder])
-            rank_zero_info(f"results of {len({row.index for row in rows})} pairs in {folder}")
+            rank_zero_info(
+                f"{'' if complete else 'interrupted: '}results of {len({row.index for row in rows})} pairs in {folder}"
+            )
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.poses = {}

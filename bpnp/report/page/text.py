@@ -76,6 +76,8 @@ def _described(settings: Mapping[str, Any]) -> str:
             options = ", ".join(f"{key} {value}" for key, value in given.items())
             kind = str(own["class_path"]).rpartition(".")[2]
             said.append(f"{name} {kind}" + (f" ({options})" if options and name == "data" else ""))
+    if settings.get("complete") is False:
+        said.append("interrupted before the last pair")
     if settings.get("checkpoint"):
         said.append(f"checkpoint {settings['checkpoint']}")
     return ", ".join(said)

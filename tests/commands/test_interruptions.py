@@ -1,0 +1,75 @@
+"""Ctrl-C, and checkpoints that are not there: no work is lost in silence."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from lightning.pytorch import Callback
+from small_data import SMALL_MESHES, SMALL_NET
+
+import bpnp
+from bpnp.cli import main
+from bpnp.models.weights import read_checkpoint
+from bpnp.report import read_results
+from bpnp.report.samples import read_views
+
+MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
+
+
+class Stop(Callback):
+    """Ctrl-C after the second batch."""
+
+    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        if batch_idx == 1:
+            raise KeyboardInterrupt
+
+    def on_test_batch_end(
+        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        if batch_idx == 1:
+            raise KeyboardInterrupt
+
+
+def arguments(command: str, folder: Path) -> list[str]:
+    return [command, *MESHES, *SMALL_NET, f"--data.cache_dir={folder}", f"--trainer.default_root_dir={folder}/run"]
+
+
+def interrupted(words: list[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*words, "--trainer.callbacks=test_interruptions.Stop"])
+    assert stop.value.code == 130
+
+
+def test_an_interrupted_training_keeps_its_checkpoint(tmp_path: Path) -> None:
+    interrupted(arguments("fit", tmp_path))
+    kept = tmp_path / "run" / "checkpoints" / "interrupted.ckpt"
+    assert kept.is_file()
+    main([*arguments("fit", tmp_path), f"--ckpt_path={kept}", "--trainer.max_epochs=1"])
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_an_interrupted_test_keeps_its_finished_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    interrupted([*arguments("test", tmp_path), "--data.eval_batch_size=2"])
+    results = read_results(tmp_path / "run" / "test")
+    assert results.pairs == 2  # of the first batch; the second ended in the interruption
+    assert results.settings["complete"] is False
+    assert len(read_views(tmp_path / "run" / "test")) == 2
+    assert "weights of the solver are untrained" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("share", [0.0001, 0.01, 0.3, 0.5, 0.9, 0.9999])
+def test_a_checkpoint_that_was_cut_short_is_named(tmp_path: Path, share: float) -> None:
+    whole = (Path(bpnp.__file__).parent / "weights" / "procedural-so3.ckpt").read_bytes()
+    cut = tmp_path / "cut.ckpt"
+    cut.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(ValueError, match=r"expected a checkpoint of `bpnp fit`, got a file that cannot be read: .*cut"):
+        read_checkpoint(cut)
+
+
+def test_a_last_checkpoint_that_is_not_there_is_no_new_training(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main([*arguments("fit", tmp_path), "--ckpt_path=last"])
+    assert stop.value.code == 2
+    assert "expected a checkpoint for --ckpt_path last" in capsys.readouterr().err
