@@ -15,6 +15,8 @@ from torch import Tensor
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 HALF = (torch.float16, torch.bfloat16)
+_LOCK = threading.Lock()
+_RESTORE: list[Callable[[], None]] = []  # one an open block; the first has the user's setting
 
 
 def full_precision(function: _F) -> _F:
@@ -23,10 +25,13 @@ def full_precision(function: _F) -> _F:
     The first argument is a tensor; its device is the one whose autocast is switched off.
     """
 
+    def widened(value: Any) -> Any:
+        return value.float() if isinstance(value, Tensor) and value.dtype in HALF else value
+
     @functools.wraps(function)
     def run(first: Tensor, *rest: Any, **options: Any) -> Any:
         with exact_products(first.device):
-            return function(_widened(first), *map(_widened, rest), **{k: _widened(v) for k, v in options.items()})
+            return function(widened(first), *map(widened, rest), **{k: widened(v) for k, v in options.items()})
 
     return run  # type: ignore[return-value]
 
@@ -38,55 +43,31 @@ def exact_products(device: torch.device) -> Iterator[None]:
     The precision of products is a setting of the process: products that other threads start meanwhile are as exact.
     The user's setting returns when the last of nested or concurrent blocks ends.
     """
-    _PRODUCTS.enter()
+    with _LOCK:
+        _RESTORE.append(_raise_precision())
     try:
         with torch.autocast(device.type, enabled=False):
             yield
     finally:
-        _PRODUCTS.leave()
-
-
-def _widened(value: Any) -> Any:
-    return value.float() if isinstance(value, Tensor) and value.dtype in HALF else value
-
-
-class _ExactProducts:
-    """Counts the blocks that need exact float32 products; the first sets the precision, the last restores it."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._blocks = 0
-        self._restore: Callable[[], None] = lambda: None
-
-    def enter(self) -> None:
-        with self._lock:
-            if self._blocks == 0:
-                self._restore = _raise_precision()
-            self._blocks += 1
-
-    def leave(self) -> None:
-        with self._lock:
-            self._blocks -= 1
-            if self._blocks == 0:
-                self._restore()
-
-
-_PRODUCTS = _ExactProducts()
+        with _LOCK:
+            restore = _RESTORE.pop()
+            if not _RESTORE:
+                restore()
 
 
 def _raise_precision() -> Callable[[], None]:
     """Make float32 products exact; return what undoes it."""
     try:
-        precision = torch.get_float32_matmul_precision()
-    except RuntimeError:  # the user has set the switch of a backend, which this function cannot tell
+        before = torch.get_float32_matmul_precision()
+    except RuntimeError:  # the user has set the switch of one backend, which this function cannot tell
         switches: list[Any] = [getattr(torch.backends, name).matmul for name in ("cuda", "mkldnn")]
         values = [switch.fp32_precision for switch in switches]
         _set_switches(switches, ["ieee"] * len(switches))
         return functools.partial(_set_switches, switches, values)
-    if precision == "highest":
+    if before == "highest":
         return lambda: None
     torch.set_float32_matmul_precision("highest")
-    return functools.partial(torch.set_float32_matmul_precision, precision)
+    return functools.partial(torch.set_float32_matmul_precision, before)
 
 
 def _set_switches(switches: list[Any], values: list[str]) -> None:

@@ -19,7 +19,6 @@ GROUND = {
     "configs",
     "metrics",
     "compilation",
-    "thread_pool",
     "precision",
     "checks",
     "distinct_poses",

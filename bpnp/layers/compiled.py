@@ -12,8 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.compilation import compiler
-from bpnp.thread_pool import in_threads
+from bpnp.compilation import compiler, in_threads
 
 # Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")

@@ -78,9 +78,10 @@ def ransac_pnp(
     `converged` False. No gradient: the pose is the initial pose of a solver that has one.
     Raises ValueError for arguments of wrong shape or type, an unknown backend and options that are not positive.
 
-    >>> points3d = torch.rand(1, 50, 3)
+    >>> points3d = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
     >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
-    >>> rotation, translation, stats = ransac_pnp(torch.eye(50)[None], camera[..., :2] / camera[..., 2:], points3d)
+    >>> points2d = camera[..., :2] / camera[..., 2:]
+    >>> rotation, translation, stats = ransac_pnp(torch.eye(50)[None], points2d, points3d, pairs_factor=1.0)
     >>> torch.allclose(translation, torch.tensor([[0.0, 0.0, 4.0]]), atol=1e-3)
     True
     """

@@ -5,9 +5,9 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from bpnp.layers.assignment import Sinkhorn
+from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.composition import AnyModule, chosen
@@ -108,7 +108,7 @@ def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> F
 
 
 class _PairwiseDistance(torch.autograd.Function):
-    """One matrix is kept for the gradient, the distances: dL/da = -(G / D) b."""
+    """One matrix is kept for the gradient, the distances: dL/da = -(G / D) b. Its products are exact too."""
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
@@ -119,7 +119,7 @@ class _PairwiseDistance(torch.autograd.Function):
         return distance
 
     @staticmethod
-    @once_differentiable
+    @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, distance = ctx.saved_tensors
         weight = (gradient / distance).masked_fill_(distance == 0, 0).neg_()

@@ -62,7 +62,7 @@ def consensus(
     hypotheses: number of triples. Computed in float64 but for the scores. Not differentiable. A pose needs at least 4
     inliers. Raises ValueError for arguments of wrong shape or type and options that are not positive.
 
-    >>> points3d = torch.rand(1, 50, 3)
+    >>> points3d = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
     >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
     >>> found = consensus(camera[..., :2] / camera[..., 2:], points3d, torch.ones(1, 50))
     >>> torch.allclose(found.translation, torch.tensor([[0.0, 0.0, 4.0]]), atol=1e-3)

@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from bpnp.compilation import in_threads
 from bpnp.search.candidates import Candidates, best_distinct, merged
 from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
 from bpnp.search.settings import ClusterStage, Recipe
 from bpnp.search.starts import Prior, draw_poses
-from bpnp.thread_pool import in_threads
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The examples in the docstrings of the layers run and give what they show."""
+"""The examples in the docstrings of the layers and below run and give what they show."""
 
 import doctest
 import importlib
@@ -7,7 +7,18 @@ import pytest
 import torch
 
 
-@pytest.mark.parametrize("module", ["layers.assignment", "layers.implicit", "layers.pnp", "geometry"])
+@pytest.mark.parametrize(
+    "module",
+    [
+        "layers.assignment",
+        "layers.implicit",
+        "layers.pnp",
+        "layers.ransac",
+        "robust.consensus",
+        "robust.p3p",
+        "geometry",
+    ],
+)
 def test_examples_are_right(module: str) -> None:
     result = doctest.testmod(importlib.import_module(f"bpnp.{module}"), extraglobs={"torch": torch})
     assert result.attempted > 0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from bpnp.thread_pool import in_threads
+from bpnp.compilation import in_threads
 
 
 @pytest.fixture(params=[1, 2, 5])
