@@ -76,7 +76,7 @@ def anneal_on_clusters(
     def anneal(i: int, j: int) -> None:
         descend(*clusters, rotation[i:j], translation[i:j], scales, outlier, score[i:j])
 
-    done = _in_time(anneal, len(starts), deadline, scene.settings.starts_a_check)
+    done = in_time(anneal, len(starts), deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
     return best_distinct(ends, scene, stage.kept, degrees=stage.apart_deg, shift=math.inf)
 
@@ -101,7 +101,7 @@ def anneal_on_points(
             tuple(grid)[:5], points, rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j]
         )
 
-    done = _in_time(anneal, len(starts), deadline, torch.get_num_threads())
+    done = in_time(anneal, len(starts), deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
     ends = replace(
         starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2]
@@ -142,7 +142,7 @@ def finish(
     return best_distinct(Candidates.concatenated(ends), scene, scene.settings.kept)
 
 
-def _in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
+def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
     """Run work(first, last) on shares of range(count) in threads; how many were done when the deadline passed.
 
     The first `at_once` are always done.

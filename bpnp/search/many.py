@@ -8,10 +8,11 @@ from dataclasses import replace
 from bpnp.search.annealing import Deadline, finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.few.search import is_few, judged_few, search_few
+from bpnp.search.nearby import cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.starts import Prior
+from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict import SearchResult, is_certain, is_exhausted, judged, no_pose, weighed
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
@@ -71,8 +72,7 @@ def search_poses(
     batches, stalled, best = 0, 0, -math.inf
     over = False
     while batches < settings.max_batches and not (over or end.passed()):
-        recipe = settings.recipes[batches % len(settings.recipes)]
-        found = run_batch(scene, recipe, known, candidates, share, end)
+        found = _batch(scene, batches, known, candidates, share, end)
         candidates = merged([candidates, found], scene)
         batches += 1
         if len(candidates):
@@ -85,3 +85,16 @@ def search_poses(
     if len(candidates):
         candidates = finish(scene, candidates, share, end, None if clutter is None else ())
     return judged(in_user_frame(candidates, scene), sets, batches=batches, rule=settings.evidence)
+
+
+def _batch(
+    scene: Scene, number: int, prior: Prior | None, best: Candidates, outliers: float, deadline: Deadline
+) -> Candidates:
+    """One batch of starts; of a rough pose every other one is looked up in a raster, which finds other poses."""
+    recipes = scene.settings.recipes
+    if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
+        return run_batch(scene, recipes[number % len(recipes)], prior, best, outliers, deadline)
+    if number % 2 == 0:
+        return nearby_batch(scene, prior, outliers, deadline)
+    recipe = cooled(recipes[number // 2 % len(recipes)], prior, scene)
+    return run_batch(scene, recipe, prior, best, outliers, deadline)

@@ -67,6 +67,30 @@ class Shaking:
 
 
 @dataclass(frozen=True)
+class Nearby:
+    """Starts around a rough pose, looked up in a raster of the view (`bpnp.search.nearby`).
+
+    starts: a batch; 2^19 poses within 15 degrees and 15 % of the distance leave few gaps over the width of a basin.
+    points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each;
+    the last of them are annealed on all points.
+    scale: of the smoothed bearings and of the first iteration, in spreads of the bearings; at twice as much chance
+        fills the view, at half as much the gaps between starts are wider than the basins.
+    background: scale of the density that is chance, in scales. cells: of the raster, a scale; most_cells: a side.
+    outliers: share of the points without a partner, at least. starts_a_check: between two looks at the clock.
+    """
+
+    starts: int = 2**19
+    points: tuple[int, ...] = (150, 600, 5000)
+    kept: tuple[int, ...] = (2**16, 2**12, 300)
+    scale: float = 0.04
+    background: float = 8.0
+    cells: float = 2.0
+    most_cells: int = 1024
+    outliers: float = 0.5
+    starts_a_check: int = 4096
+
+
+@dataclass(frozen=True)
 class RefineSettings:
     """How `refine_poses` chooses among many starts: beyond `direct` they compete on clusters.
 
@@ -134,6 +158,7 @@ class SearchSettings:
     middle: ClusterStage = ClusterStage(256, last_scale=0.04, iterations=16, kept=10, apart_deg=1.0)
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
+    nearby: Nearby = Nearby()
     refine: RefineSettings = RefineSettings()
     evidence: Evidence = Evidence()
     least_annealed: int = 12

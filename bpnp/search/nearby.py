@@ -1,0 +1,109 @@
+"""Many starts around a rough pose, of which those go on whose points fall on bearings more often than chance lets them.
+
+Annealing on clusters loses a pose among many outliers even if it begins there: at scales at which 64 clusters stand for
+a thousand points the true pose is no optimum. At a scale of a few hundredths of the view it is one, in a basin so
+narrow that it takes some 10^5 starts to hit within the range of a prior. They are affordable because each is only
+looked up, not annealed: a point that falls at x adds
+
+    log(w + (1 - w) d_s(x) / d_b(x)) - its mean near x,
+
+d_s the density of the bearings smoothed by the small scale s, d_b by a larger one, w the share of outliers. So a point
+adds nothing in the mean if it falls where it does by chance, wherever the bearings are dense, and nothing outside.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.annealing import Deadline, anneal_on_points, in_time
+from bpnp.search.candidates import Candidates
+from bpnp.search.kernels.raster import add_up
+from bpnp.search.scene import Scene
+from bpnp.search.settings import Recipe
+from bpnp.search.starts import Array, PosePrior
+
+INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
+
+
+class Raster(NamedTuple):
+    """What a point adds to the score of a pose by where it falls; see `kernels.raster.add_up`."""
+
+    values: Array
+    half: np.float32
+    per_cell: np.float32
+
+
+def nearby_batch(scene: Scene, prior: PosePrior, outliers: float, deadline: Deadline) -> Candidates:
+    """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed."""
+    rule = scene.settings.nearby
+    poses, raster = drawn_around(scene, prior, rule.starts), raster_of(scene)
+    for points, kept in zip(rule.points, rule.kept, strict=True):
+        poses = looked_up(poses, raster, scene.points3d[:points], kept, deadline, rule.starts_a_check)
+    first_scale, share = rule.scale * scene.spread, max(outliers, rule.outliers)
+    return anneal_on_points(
+        scene, poses, first_scale, share, deadline, bearings=scene.settings.fine.bearings
+    )  # fmt: skip
+
+
+def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
+    """Poses drawn from the prior, the first one its mean; each turns about the middle of the points.
+
+    There an error of the rotation moves the camera, not what it looks at.
+    """
+    middle, mean = scene.bulk3d.mean(0), np.asarray(prior.rotation, np.float32)
+    vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
+    shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
+    vectors[0], shifts[0] = 0, 0
+    rotation = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ mean
+    translation = mean @ middle + np.asarray(prior.translation, np.float32) + shifts - rotation @ middle
+    return Candidates.unscored(rotation, translation.astype(np.float32), hits=1)
+
+
+def looked_up(
+    poses: Candidates, raster: Raster, points3d: Array, kept: int, deadline: Deadline, at_once: int
+) -> Candidates:
+    """The `kept` poses under which the points fall best, best first."""
+    points, score = np.ascontiguousarray(points3d.T), poses.score.copy()
+
+    def look_up(i: int, j: int) -> None:
+        add_up(*raster, points, poses.rotation[i:j], poses.translation[i:j], score[i:j])
+
+    done = in_time(look_up, len(poses), deadline, at_once)
+    return poses[np.argsort(-score[:done], kind="stable")[:kept]]
+
+
+def raster_of(scene: Scene) -> Raster:
+    """The raster of a scene's bearings."""
+    rule = scene.settings.nearby
+    d = scene.offsets.astype(np.float64)
+    at = 2 * d[:, :2] / (2 + d[:, 2:])
+    scale = rule.scale * scene.spread
+    half = float(np.abs(at).max()) + 3 * scale
+    cells = min(math.ceil(2 * half * rule.cells / scale), rule.most_cells)
+    per_cell = cells / (2 * half)
+    place = np.minimum(((at + half) * per_cell).astype(np.int64), cells - 1)
+    counts = np.bincount(place[:, 1] * cells + place[:, 0], minlength=cells**2).reshape(cells, cells).astype(float)
+    wide = rule.background * scale * per_cell
+    near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
+    inside = around > INSIDE * around.max()
+    gain = np.log(rule.outliers + (1 - rule.outliers) * near / np.where(inside, around, 1))
+    mean = _smoothed(np.where(inside, gain, 0.0), wide) / np.maximum(_smoothed(inside.astype(float), wide), 1e-6)
+    return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
+
+
+def cooled(recipe: Recipe, prior: PosePrior, scene: Scene) -> Recipe:
+    """The recipe with a first scale no wider than the prior: from a hotter one the starts leave what is known."""
+    middle = scene.bulk3d.mean(0)
+    depth = max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
+    turned = math.radians(prior.rotation_sigma_deg) * float(np.sqrt(scene.bulk3d.var(0).sum())) / depth
+    width = math.hypot(prior.translation_sigma / depth, turned) / scene.spread
+    return replace(recipe, first_scale=float(np.clip(width, scene.settings.coarse.last_scale, recipe.first_scale)))
+
+
+def _smoothed(values: NDArray[np.float64], cells: float) -> NDArray[np.float64]:
+    return np.asarray(gaussian_filter(values, cells, mode="constant"))

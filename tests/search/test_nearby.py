@@ -1,0 +1,118 @@
+"""Starts around a rough pose find a planted one among more outliers than annealing on clusters can stand."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.annealing import Deadline
+from bpnp.search.kernels.raster import add_up
+from bpnp.search.many import search_poses
+from bpnp.search.nearby import cooled, drawn_around, nearby_batch, raster_of
+from bpnp.search.point_sets import PointSets
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
+from bpnp.search.starts import PosePrior
+
+Array = NDArray[np.float64]
+
+
+def cluttered(seed: int, true: int = 80, outliers: int = 220) -> tuple[Array, Array, Array, Array]:
+    """Bearings and points in random order and their pose; noise of 1e-3, and outliers that fill the frame of both."""
+    rng = np.random.default_rng(seed)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
+    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
+    depth = rng.uniform(3.5, 6.5, (len(plane), 1))
+    points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
+    seen = plane + 1e-3 * rng.standard_normal(plane.shape)
+    rays = np.column_stack([seen, np.ones(len(seen))])
+    bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    image = np.r_[:true, true : true + outliers]
+    scene = np.r_[:true, true + outliers : true + 2 * outliers]
+    return bearings[rng.permutation(image)], points[rng.permutation(scene)], rotation, translation
+
+
+def off(rotation: Array, translation: Array, points: Array, rng: np.random.Generator) -> PosePrior:
+    """A prior 4 degrees off, and 4 % of the distance, of that size."""
+    axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
+    turned = Rotation.from_rotvec(np.radians(4) * axis).as_matrix() @ rotation
+    middle = points.mean(0)
+    moved = rotation @ middle + translation + 0.04 * 5 * shift - turned @ middle
+    return PosePrior(turned, moved, 4.0, 0.2)
+
+
+def angle(a: Array, b: Array) -> float:
+    return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
+    bearings, points, rotation, translation = cluttered(seed)
+    prior = off(rotation, translation, points, np.random.default_rng(seed))
+    found = search_poses(PointSets(bearings, points, prior=prior))
+    assert angle(found.best[0], rotation) < 0.3
+    np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+
+
+def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
+    bearings, points, rotation, translation = cluttered(0, outliers=1500)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    raster = raster_of(scene)
+    inside = raster.values != 0
+    assert abs(raster.values[inside].mean()) < 0.1 * raster.values[inside].std()
+    right = scene.enter(rotation, translation)
+    camera = scene.points3d @ right[0].T + right[1]
+    u = camera / np.linalg.norm(camera, axis=-1, keepdims=True)
+    at = ((2 * u[:, :2] / (1 + u[:, 2:]) + raster.half) * raster.per_cell).astype(int)
+    expected = raster.values[at[:, 1], at[:, 0]].sum()
+
+    poses = drawn_around(scene, PosePrior(*right, 0.0, 0.0), 2)
+    score = np.empty(2, np.float32)
+    add_up(*raster, np.ascontiguousarray(scene.points3d.T), poses.rotation, poses.translation, score)
+    np.testing.assert_allclose(score, expected, rtol=2e-2)
+
+
+def test_starts_have_the_spread_of_the_prior_and_the_first_is_its_mean() -> None:
+    bearings, points, rotation, translation = cluttered(1)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    prior = scene.enter_prior(PosePrior(rotation, translation, 5.0, 0.3))
+    assert isinstance(prior, PosePrior)
+    starts = drawn_around(scene, prior, 4000)
+    np.testing.assert_allclose(starts.rotation[0], prior.rotation, atol=1e-6)
+    np.testing.assert_allclose(starts.translation[0], prior.translation, atol=1e-5)
+    vectors = Rotation.from_matrix(starts.rotation @ np.asarray(prior.rotation).T).as_rotvec()
+    np.testing.assert_allclose(np.degrees(vectors[1:].std(0)), 5.0, rtol=0.05)
+    middle = scene.bulk3d.mean(0)
+    shift = starts.rotation @ middle + starts.translation
+    np.testing.assert_allclose(shift[1:].std(0) * scene.size, 0.3, rtol=0.05)
+
+
+def test_the_first_scale_follows_the_width_of_the_prior() -> None:
+    bearings, points, rotation, translation = cluttered(2)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    hot = DEFAULT.recipes[0]
+
+    def first_scale(degrees: float, shift: float) -> float:
+        prior = scene.enter_prior(PosePrior(rotation, translation, degrees, shift))
+        assert isinstance(prior, PosePrior)
+        return cooled(hot, prior, scene).first_scale
+
+    assert first_scale(1.0, 0.05) == pytest.approx(DEFAULT.coarse.last_scale)
+    assert DEFAULT.coarse.last_scale < first_scale(4.0, 0.2) < first_scale(8.0, 0.3) < hot.first_scale
+    assert first_scale(90.0, 5.0) == hot.first_scale
+
+
+def test_a_deadline_that_has_passed_still_gives_poses_and_stops_early() -> None:
+    bearings, points, rotation, translation = cluttered(0)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    prior = scene.enter_prior(PosePrior(rotation, translation, 4.0, 0.2))
+    assert isinstance(prior, PosePrior)
+    nearby_batch(scene, prior, 0.3, Deadline(time.monotonic()))  # compiles
+    start = time.process_time()
+    assert len(nearby_batch(scene, prior, 0.3, Deadline(time.monotonic()))) >= 1
+    hurried = time.process_time() - start
+    start = time.process_time()
+    nearby_batch(scene, prior, 0.3, Deadline())
+    assert hurried < 0.7 * (time.process_time() - start)
