@@ -21,7 +21,7 @@ from bpnp import PosePrior, solve
 from bpnp.models import load_pretrained
 
 AUC_PX = (1.0, 5.0, 10.0)
-VIEW_DEGREES, VIEW_SHARE = 15.0, 0.15  # how far a photo is from a view that shares a third of its points
+VIEW_DEGREES, VIEW_SHARE = 12.0, 0.12  # how far a photo is from a view that shares a third of its points
 ROUGH_DEGREES, ROUGH_SHARE, ROUGH_SECONDS = 4.0, 0.04, 2.0
 Answer = tuple[Array, Array, str]  # rotation, translation, verdict
 

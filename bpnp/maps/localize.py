@@ -7,13 +7,16 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from bpnp.cameras import camera_from
 from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
 from bpnp.search.starts import PosePrior
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
 
+MOST_KEYPOINTS = 2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 a tenth
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
@@ -49,18 +52,22 @@ def localize(
         raise ValueError(
             f"expected `scores` of shape {np.shape(keypoints)[:1]}, one a keypoint, got {np.shape(scores)}"
         )
+    strongest = None if scores is None else np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
+    used = keypoints if strongest is None else np.asarray(keypoints)[strongest]
     regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
     best: Solution | None = None
     for region in regions:
         left = None if time_limit is None else time_limit - (time.monotonic() - start)
         if best is not None and left is not None and left <= 0:
             break
-        found = _tried(scene, region, keypoints, camera, prior, seed, None if left is None else max(left, 1e-3))
+        found = _tried(scene, region, used, camera, prior, seed, None if left is None else max(left, 1e-3))
         best = found if best is None else max(best, found, key=_rank)
         if best.verdict == "confident":
             break
     if best is None:
         raise ValueError("expected a map with views that see 4 or more points, got none")
+    if strongest is not None:
+        best = _with_all_keypoints(best, strongest, keypoints, camera)
     return replace(best, seconds=time.monotonic() - start)
 
 
@@ -81,7 +88,13 @@ def _tried(
     return replace(found, matches=matches, view=region.view.name, point_ids=ids)
 
 
+def _with_all_keypoints(solution: Solution, used: NDArray[np.int64], keypoints: Any, camera: Any) -> Solution:
+    """The solution of some keypoints with its matches and points among all of them."""
+    matches = np.column_stack([used[solution.matches[:, 0]], solution.matches[:, 1]])
+    lens = camera_from(camera)
+    return replace(solution, matches=matches, points2d=lens.normalise(np.asarray(keypoints, np.float64)))
+
+
 def _rank(solution: Solution) -> tuple[int, float]:
-    """Confident before ambiguous before failed; then the likelihood of the keypoints, the same ones in every region."""
-    score = solution.candidates[0].score if solution.candidates else -math.inf
-    return RANKS[solution.verdict], score
+    """Confident before ambiguous before failed; then the fewest false alarms."""
+    return RANKS[solution.verdict], -solution.log10_false_alarms

@@ -11,7 +11,7 @@ from bpnp.maps.views import View, ViewedPoints
 from bpnp.search.starts import PosePrior
 
 VIEW_DEGREES = 12.0  # root mean square angle per axis between photos that share a third of their points
-VIEW_SHARE = 0.1  # the same of the shift of what they look at, in distances to it
+VIEW_SHARE = 0.12  # the same of the shift of what they look at, in distances to it
 
 
 @dataclass(frozen=True, eq=False)

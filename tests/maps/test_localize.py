@@ -60,6 +60,26 @@ def test_matches_and_their_places_name_the_same_points(planted: tuple[SceneMap, 
     np.testing.assert_array_equal(again.match_places, solution.match_places)
 
 
+def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, truth = planted
+    keypoints, ids = photo_of(truth, 1)
+    scores = (ids > 0).astype(float)
+    monkeypatch.setattr("bpnp.maps.localize.MOST_KEYPOINTS", 90)
+    shuffled = np.random.default_rng(0).permutation(len(ids))
+    solution = scene.localize(keypoints[shuffled], CAMERA, views=["photo 1.jpg"], scores=scores[shuffled])
+    assert_right(solution, truth, 1, ids[shuffled])
+    np.testing.assert_allclose(solution.points2d, (keypoints[shuffled] - [400, 300]) / 520)
+
+
+def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap, Planted]) -> None:
+    scene, _ = planted
+    for seed in range(3):
+        noise = np.random.default_rng(seed).uniform((0, 0), (800, 600), (90, 2))
+        assert scene.localize(noise, CAMERA, time_limit=3).verdict != "confident"
+
+
 def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, _ = photo_of(truth, 0)

@@ -1,0 +1,91 @@
+"""Keypoints are found where the picture has them, and features of another photo or size are refused."""
+
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from bpnp.maps.keypoints import detected_keypoints, read_features
+from bpnp.maps.photos import camera_from_exif, photo_size
+
+
+@pytest.fixture
+def blobs(tmp_path: Path) -> tuple[Path, np.ndarray, np.ndarray]:
+    """A picture of dark discs with known centres, in COLMAP's coordinates, and radii."""
+    centres = np.array([[60.5, 50.5], [160.5, 60.5], [70.5, 150.5], [170.0, 160.0]])
+    radii = np.array([5.0, 8.0, 11.0, 15.0])
+    x, y = np.meshgrid(np.arange(240) + 0.5, np.arange(200) + 0.5)
+    picture = np.full((200, 240), 220.0)
+    for (cx, cy), radius in zip(centres, radii, strict=True):
+        picture -= 170 / (1 + np.exp(2 * (np.hypot(x - cx, y - cy) - radius)))
+    path = tmp_path / "discs.png"
+    Image.fromarray(picture.astype(np.uint8)).save(path)
+    return path, centres, radii
+
+
+def test_discs_are_found_at_their_centres_and_large_ones_are_stronger(blobs) -> None:
+    path, centres, radii = blobs
+    found = detected_keypoints(path)
+    assert found.size == photo_size(path) == (240, 200)
+    distance = np.linalg.norm(found.pixels[:, None] - centres, axis=-1)
+    assert (distance.min(0) < 0.3).all()
+    sizes = found.scores[distance.argmin(0)]
+    np.testing.assert_allclose(sizes / radii, np.median(sizes / radii), rtol=0.25)
+
+
+def test_what_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
+    (tmp_path / "a.jpg").write_text("no photo")
+    for read in (detected_keypoints, camera_from_exif, photo_size):
+        with pytest.raises(ValueError, match=r"expected a photo that .* got .*a\.jpg"):
+            read(tmp_path / "a.jpg")
+    Image.new("L", (64, 64)).save(tmp_path / "black.png")
+    with pytest.raises(ValueError, match=r"expected a photo with keypoints, got none in .*black\.png"):
+        detected_keypoints(tmp_path / "black.png")
+
+
+def photo_with(path: Path, **tags: float) -> Path:
+    names = {"FocalLength": 0x920A, "FocalLengthIn35mmFilm": 0xA405, "FocalPlaneXResolution": 0xA20E}
+    image = Image.new("RGB", (400, 300))
+    exif = image.getexif()
+    exif.get_ifd(0x8769).update({names[name]: value for name, value in tags.items()})
+    image.save(path, exif=exif)
+    return path
+
+
+def test_the_focal_length_comes_from_exif(tmp_path: Path) -> None:
+    # 5 mm on a sensor of 4 mm x 3 mm: 100 pixels a mm, so 500 pixels; the same as 43.27 mm on a diagonal of 43.27 mm.
+    camera = camera_from_exif(photo_with(tmp_path / "a.jpg", FocalLength=5.0, FocalPlaneXResolution=2540.0))
+    assert camera == ("SIMPLE_PINHOLE", 400, 300, (pytest.approx(500.0), 200.0, 150.0))
+    equivalent = camera_from_exif(photo_with(tmp_path / "b.jpg", FocalLengthIn35mmFilm=43))
+    assert equivalent[3][0] == pytest.approx(500, rel=0.01)
+    with pytest.raises(
+        ValueError, match=r"expected a focal length in the EXIF data of .*c\.jpg, got none; try --camera"
+    ):
+        camera_from_exif(photo_with(tmp_path / "c.jpg"))
+
+
+def test_features_of_hloc(tmp_path: Path) -> None:
+    path = tmp_path / "features.h5"
+    with h5py.File(path, "w") as file:
+        group = file.create_group("query/a.jpg")
+        group["keypoints"] = np.array([[0.0, 0.0], [99.0, 49.0]], np.float32)
+        group["scores"] = np.array([0.25, 0.5])
+        group["image_size"] = [100, 50]
+    found = read_features(path, "query/a.jpg")
+    np.testing.assert_array_equal(found.pixels, [[0.5, 0.5], [99.5, 49.5]])
+    np.testing.assert_array_equal(found.scores, [0.25, 0.5])
+    with pytest.raises(ValueError, match=r"expected keypoints of b\.jpg in .*features\.h5, got query"):
+        read_features(path, "b.jpg")
+    with pytest.raises(ValueError, match=r"at its size \(200, 100\) in .*, got them at \(100, 50\)"):
+        read_features(path, "query/a.jpg", (200, 100))
+    with h5py.File(path, "a") as file:
+        del file["query/a.jpg/image_size"]
+    with pytest.raises(
+        ValueError, match=r"inside the 80 x 50 pixels of query/a\.jpg .*, got 1 outside, such as \[99\.5"
+    ):
+        read_features(path, "query/a.jpg", (80, 50))
+    path.write_bytes(b"something else")
+    with pytest.raises(ValueError, match="expected an HDF5 file of keypoints"):
+        read_features(path, "query/a.jpg")
