@@ -1,6 +1,5 @@
 """How far apart the features of a set are, while a network is trained."""
 
-from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,6 +10,9 @@ from lightning.pytorch import Callback
 from lightning.pytorch.utilities.rank_zero import rank_zero_warn
 from torch import Tensor, nn
 from torch.utils.hooks import RemovableHandle
+
+from bpnp.models.nets.normalisation import centred
+from bpnp.training.plugins import feature_nets
 
 
 class FeatureSpread(Callback):
@@ -23,24 +25,14 @@ class FeatureSpread(Callback):
         threshold: a spread below it counts as collapsed.
         patience: steps in a row below the threshold before the warning.
         every: steps from one measurement to the next.
-        names: feature nets of the solver, called with points and mask.
     """
 
-    def __init__(
-        self,
-        threshold: float = 0.05,
-        patience: int = 300,
-        every: int = 10,
-        names: Sequence[str] = ("features2d", "features3d"),
-    ) -> None:
+    def __init__(self, threshold: float = 0.05, patience: int = 300, every: int = 10) -> None:
         if threshold < 0 or patience < 1 or every < 1:
             raise ValueError(
                 f"expected threshold >= 0, patience >= 1 and every >= 1, got {threshold}, {patience} and {every}"
             )
-        self.threshold = threshold
-        self.patience = patience
-        self.every = every
-        self.names = tuple(names)
+        self.threshold, self.patience, self.every = threshold, patience, every
         self.spread: dict[str, Tensor] = {}
         self.collapsed_since: int | None = None
         self.warned = False
@@ -48,11 +40,8 @@ class FeatureSpread(Callback):
         self._hooks: list[RemovableHandle] = []
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        solver = pl_module.get_submodule("solver")
-        missing = [name for name in self.names if not isinstance(getattr(solver, name, None), nn.Module)]
-        if missing:
-            raise ValueError(f"expected nets of {type(solver).__name__}, got {missing}; try others in `names`")
-        self._hooks = [getattr(solver, name).register_forward_hook(partial(self._measure, name)) for name in self.names]
+        nets = feature_nets(pl_module)
+        self._hooks = [net.register_forward_hook(partial(self._measure, side)) for side, net in nets.items()]
 
     def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         for hook in self._hooks:
@@ -67,7 +56,7 @@ class FeatureSpread(Callback):
         if not self._measuring:
             return
         self._measuring = False
-        values = {f"train/feature_spread_{name.removeprefix('features')}": v for name, v in self.spread.items()}
+        values = {f"train/feature_spread_{side}": value for side, value in self.spread.items()}
         pl_module.log_dict(values, on_step=True, on_epoch=False, batch_size=1)
         lowest = float(torch.stack(list(self.spread.values())).min())
         if lowest >= self.threshold:
@@ -82,9 +71,9 @@ class FeatureSpread(Callback):
                 "collapsed; try a lower model.learning_rate, a warm-up, or `centre` of the solver's features"
             )
 
-    def _measure(self, name: str, net: nn.Module, inputs: tuple[Any, ...], features: Tensor) -> None:
+    def _measure(self, side: str, net: nn.Module, inputs: tuple[Any, ...], features: Tensor) -> None:
         if self._measuring:
-            self.spread[name] = feature_spread(features.detach(), inputs[1]).mean()
+            self.spread[side] = feature_spread(features.detach(), inputs[1]).mean()
 
     def state_dict(self) -> dict[str, Any]:
         return {"collapsed_since": self.collapsed_since, "warned": self.warned}
@@ -95,7 +84,4 @@ class FeatureSpread(Callback):
 
 def feature_spread(features: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, " b"]:
     """Mean distance of the features of each set's real points from their mean."""
-    weight = mask.to(features.dtype)
-    count = weight.sum(1)
-    mean = (features * weight.unsqueeze(-1)).sum(1, keepdim=True) / count[:, None, None]
-    return (torch.linalg.vector_norm(features - mean, dim=-1) * weight).sum(1) / count
+    return (torch.linalg.vector_norm(centred(features, mask), dim=-1) * mask).sum(1) / mask.sum(1)

@@ -10,12 +10,9 @@ from bpnp.geometry import angle_between, bearings, chords, rotation_angle, trans
 from bpnp.types import Batch, Pose, Prediction
 
 SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
-RELEASED_BOUNDS = (math.pi / 2, 1.0)  # radians and scene units, as in the authors' code
 
 
-def correspondence_loss(
-    assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]
-) -> Float[Tensor, " b"]:  # fmt: skip
+def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
     """L_c = sum_ij P_ij (1 - 2 C_ij) (Eq. 9) with C from indices; in [-1, 1) where P sums to one.
 
     match3d: index of the 2D point that 3D point j was seen as, -1 for none (padding included).
@@ -89,19 +86,9 @@ def pose_loss(
     translation: Float[Tensor, "b 3"],
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
-    *,
-    bounds: tuple[float, float] | None = None,
 ) -> Float[Tensor, " b"]:
-    """L_p = angle(R, R_gt) + ||t - t_gt|| (Eqs. 10 to 12), in radians and scene units.
-
-    bounds: None for the paper's unbounded loss; (largest angle, largest distance) beyond which a term is constant, and
-        has no gradient, as in the released code (`RELEASED_BOUNDS`).
-    """
-    angle = rotation_angle(rotation_gt, rotation)
-    distance = torch.linalg.vector_norm(translation - translation_gt, dim=-1)
-    if bounds is not None:
-        angle, distance = angle.clamp_max(bounds[0]), distance.clamp_max(bounds[1])
-    return angle + distance
+    """L_p = angle(R, R_gt) + ||t - t_gt|| (Eqs. 10 to 12), in radians and scene units."""
+    return rotation_angle(rotation_gt, rotation) + torch.linalg.vector_norm(translation - translation_gt, dim=-1)
 
 
 def reprojection_loss(
@@ -124,8 +111,7 @@ def self_supervised_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose:
     leave it out of means by `pose.stats.converged`.
     """
     solved = pose.stats.converged
-    identity = torch.eye(3, dtype=pose.rotation.dtype, device=pose.rotation.device)
-    rotation = torch.where(solved[:, None, None], pose.rotation, identity)
+    rotation = torch.where(solved[:, None, None], pose.rotation, torch.eye(3).to(pose.rotation))
     translation = torch.where(solved[:, None], pose.translation, 0)
     real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
     angles = reprojection_loss(assignment * real, batch.points2d, batch.points3d, rotation, translation)

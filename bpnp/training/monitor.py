@@ -45,8 +45,7 @@ class TrainingMonitor(Callback):
     def __init__(self, pairs: int = 4, every: int = 10) -> None:
         if pairs < 1 or every < 0:
             raise ValueError(f"expected pairs >= 1 and every >= 0, got {pairs} and {every}")
-        self.pairs = pairs
-        self.every = every
+        self.pairs, self.every = pairs, every
         self.watched: Batch | None = None
         self.started = 0.0
         self.seen = 0
@@ -102,16 +101,13 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, torch.Tens
 
 
 def _draw(trainer: Trainer, views: list[PairView]) -> None:
-    drawn = False
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             logger.log_image("val/pairs", [image(plot_pair(view), caption=view.id) for view in views])
-            drawn = True
         elif isinstance(logger, TensorBoardLogger):
             for number, view in enumerate(views):
                 logger.experiment.add_figure(f"val/pair{number}", plot_pair(view), trainer.global_step)
-            drawn = True
-    if not drawn and trainer.loggers:
+    if trainer.loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in trainer.loggers):
         folder = os.path.join(trainer.default_root_dir, "pictures", f"epoch_{trainer.current_epoch:04d}")
         for number, view in enumerate(views):
             save_figure(plot_pair(view), os.path.join(folder, f"pair{number}.png"))

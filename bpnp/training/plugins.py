@@ -1,6 +1,5 @@
 """How the trainer reads checkpoints and runs the nets."""
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,27 +22,21 @@ class SafeCheckpointIO(TorchCheckpointIO):
 
 
 class CompileNets(Callback):
-    """torch.compile of the solver's nets for training: a minute or more to start with, then quicker steps.
+    """torch.compile of `features2d` and `features3d` for training: a minute or more to start, then quicker steps.
 
     The layers stay as they are, and so do checkpoints: parameters keep their names. On a CPU it pays from about a
     thousand steps on.
 
     Args:
-        names: attributes of the solver to compile.
         backend: of torch.compile.
     """
 
-    def __init__(self, names: Sequence[str] = ("features2d", "features3d"), backend: str = "inductor") -> None:
-        self.names = tuple(names)
+    def __init__(self, backend: str = "inductor") -> None:
         self.backend = backend
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        solver = pl_module.get_submodule("solver")
-        missing = [name for name in self.names if not isinstance(getattr(solver, name, None), nn.Module)]
-        if missing:
-            raise ValueError(f"expected nets of {type(solver).__name__}, got {missing}; try others in `names`")
-        for name in self.names:
-            getattr(solver, name).compile(backend=self.backend)
+        for net in feature_nets(pl_module).values():
+            net.compile(backend=self.backend)
 
 
 class InterruptedCheckpoint(Callback):
@@ -54,3 +47,12 @@ class InterruptedCheckpoint(Callback):
             path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
             trainer.save_checkpoint(path)
             rank_zero_info(f"interrupted in epoch {trainer.current_epoch}; go on with --ckpt_path {path}")
+
+
+def feature_nets(task: LightningModule) -> dict[str, nn.Module]:
+    """The nets "2d" and "3d" of the task's solver. Raises ValueError if it has none."""
+    solver = task.get_submodule("solver")
+    nets = {side: getattr(solver, f"features{side}", None) for side in ("2d", "3d")}
+    if not all(isinstance(net, nn.Module) for net in nets.values()):
+        raise ValueError(f"expected a solver with `features2d` and `features3d`, got {type(solver).__name__}")
+    return nets  # type: ignore[return-value]

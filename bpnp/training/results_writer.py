@@ -1,7 +1,6 @@
 """The files that a test or a prediction leaves."""
 
 import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -30,17 +29,16 @@ class ResultsWriter(Callback):
 
     Args:
         folder: where; null for `test` and `predict` in the trainer's default_root_dir.
-        inlier_threshold: of the counted inliers, normalised image coordinates.
     """
 
-    def __init__(self, folder: str | None = None, inlier_threshold: float = 0.01) -> None:
+    rows: list[PairRow]
+    losses: dict[int, float]
+    chosen: Sequence[PairView]
+    views: list[PairView]
+    poses: dict[tuple[int, str], list[Any]]
+
+    def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
-        self.inlier_threshold = inlier_threshold
-        self.rows: list[PairRow] = []
-        self.losses: dict[int, float] = {}
-        self.chosen: Sequence[PairView] = ()
-        self.views: list[PairView] = []
-        self.poses: dict[tuple[int, str], list[Any]] = {}
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.rows, self.losses, self.chosen, self.views = [], {}, (), []
@@ -48,10 +46,7 @@ class ResultsWriter(Callback):
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
-        rows = rows_from(
-            outputs["prediction"], batch, outputs["seconds"], inlier_threshold=self.inlier_threshold
-        )  # fmt: skip
-        self.rows += rows
+        self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
         views = views_from(outputs["prediction"], batch)
         self.chosen = select_views([*self.chosen, *views])
         self.views += map(thin, views)
@@ -93,7 +88,9 @@ class ResultsWriter(Callback):
         if trainer.is_global_zero:
             merged = {key: row for part in gathered for key, row in part.items()}
             path = self._folder(trainer, "predict") / "poses.csv"
-            _write_poses(path, [merged[key] for key in sorted(merged)])
+            rows = [POSE_COLUMNS, *(merged[key] for key in sorted(merged))]
+            with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as table:
+                csv.writer(table).writerows(rows)
             rank_zero_info(f"{len(merged)} poses in {path}")
 
     def _folder(self, trainer: Trainer, stage: str) -> Path:
@@ -115,15 +112,6 @@ def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], li
             values = numbers[i] if is_found else [""] * 7
             rows[int(batch.index[i]), name] = [batch.ids[i], name, *values, is_found, converged]
     return rows
-
-
-def _write_poses(path: Path, rows: Sequence[Sequence[Any]]) -> None:
-    table = io.StringIO(newline="")
-    writer = csv.writer(table)
-    writer.writerow(POSE_COLUMNS)
-    writer.writerows(rows)
-    with written_whole(path) as temporary:
-        temporary.write_text(table.getvalue(), encoding="utf-8")
 
 
 def _settings(trainer: Trainer) -> dict[str, Any]:

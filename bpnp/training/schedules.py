@@ -21,8 +21,7 @@ class PoseLossWarmup(Callback):
     def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:
         if start_epoch < 0 or weight < 0:
             raise ValueError(f"expected start_epoch >= 0 and weight >= 0, got {start_epoch} and {weight}")
-        self.start_epoch = start_epoch
-        self.weight = weight
+        self.start_epoch, self.weight = start_epoch, weight
         self.switched_at: int | None = None
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -58,10 +57,8 @@ class LearningRateSchedule(Callback):
                 "expected warmup_steps, decay_start >= 0, decay_steps >= 1 and final in [0, 1], got "
                 f"{warmup_steps}, {decay_start}, {decay_steps} and {final}"
             )
-        self.warmup_steps = warmup_steps
-        self.decay_start = decay_start
-        self.decay_steps = decay_steps
-        self.final = final
+        self.warmup_steps, self.decay_start = warmup_steps, decay_start
+        self.decay_steps, self.final = decay_steps, final
 
     def factor(self, step: int) -> float:
         """On the learning rate, at a step."""

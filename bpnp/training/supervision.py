@@ -39,13 +39,11 @@ class Losses:
         return matching if self.pose is None else matching + self.pose_weight * self.pose
 
 
-def matching_losses(
-    prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None, estimate: str
-) -> Losses:
+def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
     """The loss of each sample's assignment.
 
     kind: correspondence (`correspondence_losses`, with `angle`), likelihood (`matching_likelihood_loss`), or
-        reprojection, which looks at no label (`self_supervised_loss` under the pose `estimate`).
+        reprojection, which looks at no label (`self_supervised_loss` under the pose "pnp").
     Raises ValueError for a prediction without an assignment, or a batch without the labels that the kind needs.
     """
     if prediction.assignment is None:
@@ -54,7 +52,7 @@ def matching_losses(
     if kind == "likelihood":
         return Losses(matching_likelihood_loss(prediction, batch), everyone)
     if kind == "reprojection":
-        pose = prediction.poses[estimate]
+        pose = prediction.poses["pnp"]
         return Losses(self_supervised_loss(prediction.assignment, batch, pose), pose.stats.converged)
     known = correspondence_losses(prediction, batch, angle=angle)
     if known is None:
@@ -64,9 +62,7 @@ def matching_losses(
     return Losses(known, everyone)
 
 
-def correspondence_losses(
-    prediction: Prediction, batch: Batch, *, angle: float | None
-) -> Float[Tensor, " b"] | None:  # fmt: skip
+def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
     """L_c per sample (paper Eq. 9); None if there is no assignment, or nothing to compare it with.
 
     angle: None for the true pairs; else all pairs within it, radians, under the true pose.
@@ -75,19 +71,17 @@ def correspondence_losses(
         return None
     if angle is None:
         return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-    rotation, translation = _true_pose(batch)
-    return correspondence_loss_from_pose(
-        prediction.assignment, batch.points2d, batch.points3d, rotation, translation, angle=angle
-    )
+    points = batch.points2d, batch.points3d
+    return correspondence_loss_from_pose(prediction.assignment, *points, *_true_pose(batch), angle=angle)
 
 
-def pose_losses(pose: Pose, batch: Batch, *, bounds: tuple[float, float] | None) -> Float[Tensor, " b"]:
+def pose_losses(pose: Pose, batch: Batch) -> Float[Tensor, " b"]:
     """L_p per sample (paper Eq. 10); zero, without a gradient, where the pose did not converge."""
     solved, truth = pose.stats.converged, _true_pose(batch)
     # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
     rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
     translation = torch.where(solved[:, None], pose.translation, truth[1])
-    return pose_loss(rotation, translation, *truth, bounds=bounds) * solved
+    return pose_loss(rotation, translation, *truth) * solved
 
 
 def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:

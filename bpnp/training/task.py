@@ -16,12 +16,12 @@ from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.composition import AnyModule, chosen, described
 from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.weights import TrainedNet, check_solver, solver_state
-from bpnp.training.losses import RELEASED_BOUNDS
 from bpnp.training.supervision import Losses, MatchingLoss, correspondence_losses, matching_losses, pose_losses
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
+MOST_SKIPPED = 20  # steps in a row without a finite loss and gradient, which end the run
 
 
 class TrainingDivergedError(RuntimeError):
@@ -37,15 +37,13 @@ class BlindPnPTask(LightningModule):
             `match(batch)` for a prediction without poses, that is what a training step without a pose calls.
         learning_rate: of Adam; the paper has 1e-5.
         weight_decay: of Adam; the paper has 0, the released code 1e-3.
-        pose_weight: gamma_p of Eq. 13. While it is 0 no pose is solved in training; `PoseLossWarmup` raises it.
-        pose_estimate: the estimate that L_p looks at.
-        bounded_pose_loss: clamp L_p at pi/2 and 1.0 as the released code does; the paper's loss is unbounded.
+        pose_weight: gamma_p of Eq. 13, for the pose "pnp". While it is 0 no pose is solved in training;
+            `PoseLossWarmup` raises it.
         matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
             negative log likelihood of each point's partner (`matching_likelihood_loss`); reprojection for the angle
-            between the pairs under the solved pose_estimate, without labels (Eq. 2).
+            between the pairs under the solved pose, without labels (Eq. 2).
         correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
             correspondences; null for the true ones.
-        max_skipped_steps: end the run after so many steps in a row without a finite loss and gradient.
         refine_validation: whether validation refines poses, as tests do; it takes most of the time of a validation.
     """
 
@@ -56,25 +54,16 @@ class BlindPnPTask(LightningModule):
         learning_rate: float = 1e-5,
         weight_decay: float = 0.0,
         pose_weight: float = 0.0,
-        pose_estimate: str = "pnp",
-        bounded_pose_loss: bool = False,
         matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
-        max_skipped_steps: int = 20,
         refine_validation: bool = False,
     ) -> None:
         super().__init__()
         self.solver = chosen(solver, BPnPNet)
-        self.learning_rate = learning_rate
-        self.weight_decay = weight_decay
-        self.pose_weight = pose_weight
-        self.pose_estimate = pose_estimate
-        self.pose_bounds = RELEASED_BOUNDS if bounded_pose_loss else None
+        self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
-        self.matching_loss = matching_loss
-        self.correspondence_angle = correspondence_angle
-        self.max_skipped_steps = max_skipped_steps
+        self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
         # Steps left out in all, and in a row: on the device, so that counting them never waits for it.
         self.skipped: Tensor
         self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
@@ -82,14 +71,10 @@ class BlindPnPTask(LightningModule):
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
-        self.pose_metrics = nn.ModuleDict(
-            {
-                f"{stage}_{name}": MetricCollection([PoseQuartiles(), PoseRecall()])
-                for stage, names in self.estimates.items()
-                for name in names
-            }
-        )
-        self.loss_metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in ("val", "test")})
+        self.metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in self.estimates})
+        for stage, names in self.estimates.items():
+            for name in names:
+                self.metrics[f"{stage}_{name}"] = MetricCollection([PoseQuartiles(), PoseRecall()])
 
     def forward(self, batch: Batch) -> Prediction:
         return self.solver(batch)
@@ -105,7 +90,6 @@ class BlindPnPTask(LightningModule):
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """As `test_step`; without refinement unless `refine_validation`."""
         return self._evaluate(batch, "val")
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
@@ -117,18 +101,16 @@ class BlindPnPTask(LightningModule):
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
         """The matching loss and, with a weight, that of the pose; a sample whose pose did not converge has none."""
-        losses = matching_losses(
-            prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle, estimate=self.pose_estimate
-        )
+        losses = matching_losses(prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle)
         if self.pose_weight == 0:
             return losses
-        pose = prediction.poses[self.pose_estimate]
-        values = pose_losses(pose, batch, bounds=self.pose_bounds)
+        pose = prediction.poses["pnp"]
+        values = pose_losses(pose, batch)
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
     def on_train_epoch_end(self) -> None:
         """The share of the epoch's samples whose gradient a layer could not solve for."""
-        stats = [module.backward_stats for module in self.solver.modules() if hasattr(module, "backward_stats")]
+        stats = [getattr(module, "backward_stats", None) for module in self.solver.modules()]
         counts = [each for each in stats if isinstance(each, BackwardStats)]
         samples = sum(each.samples for each in counts)
         if samples:
@@ -139,16 +121,14 @@ class BlindPnPTask(LightningModule):
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
         """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
-        gradients = [p.grad for p in self.parameters() if p.grad is not None]
-        norm = torch.linalg.vector_norm(torch.stack([torch.linalg.vector_norm(g) for g in gradients]))
+        norm = torch.nn.utils.get_total_norm([p.grad for p in self.parameters() if p.grad is not None])
         broken = ~norm.isfinite()
         optimizer.found_inf = broken.float()  # type: ignore[attr-defined]
         self.skipped += broken
         self.skipped[1] *= broken
         self._log_train(gradient_norm=norm)
-        if (self.device.type == "cpu" or self.global_step % CHECK_EVERY == 0) and (
-            int(self.skipped[1]) >= self.max_skipped_steps
-        ):
+        look = self.device.type == "cpu" or self.global_step % CHECK_EVERY == 0
+        if look and int(self.skipped[1]) >= MOST_SKIPPED:
             raise TrainingDivergedError(
                 f"expected finite losses and gradients, got {int(self.skipped[1])} steps in a row without, at step "
                 f"{self.global_step}; try a lower model.learning_rate or trainer.gradient_clip_val"
@@ -176,26 +156,17 @@ class BlindPnPTask(LightningModule):
 
     def _evaluate(self, batch: Batch, stage: Stage) -> dict[str, Any]:
         with refinement_enabled(self.solver, stage == "test" or self.refine_validation):
-            prediction, seconds = self._timed(batch)
+            _wait(self.device)
+            start = time.perf_counter()
+            prediction = self.solver(batch)
+            _wait(self.device)
+        seconds = time.perf_counter() - start
         for name in self.estimates[stage]:
-            self._pose_metrics(stage, name).update(pose_errors(prediction.poses[name], batch))
+            self.metrics[f"{stage}_{name}"].update(pose_errors(prediction.poses[name], batch))  # type: ignore[operator]
         losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
-            self._loss_metric(stage).update(losses, batch.index)
+            self.metrics[stage].update(losses, batch.index)  # type: ignore[operator]
         return {"prediction": prediction, "seconds": seconds, "losses": losses}
-
-    def _pose_metrics(self, stage: Stage, estimate: str) -> MetricCollection:
-        return cast(MetricCollection, self.pose_metrics[f"{stage}_{estimate}"])
-
-    def _loss_metric(self, stage: Stage) -> MeanOverPairs:
-        return cast(MeanOverPairs, self.loss_metrics[stage])
-
-    def _timed(self, batch: Batch) -> tuple[Prediction, float]:
-        _wait(self.device)
-        start = time.perf_counter()
-        prediction = self.solver(batch)
-        _wait(self.device)
-        return prediction, time.perf_counter() - start
 
     def _log_train(self, **values: Tensor | float) -> None:
         self.log_dict({f"train/{k}": v for k, v in values.items()}, on_step=True, on_epoch=False, batch_size=1)
@@ -220,21 +191,17 @@ class BlindPnPTask(LightningModule):
 
     def _log_metrics(self, stage: Stage) -> None:
         for i, name in enumerate(self.estimates[stage]):
-            metrics = self._pose_metrics(stage, name)
+            metrics = cast(MetricCollection, self.metrics[f"{stage}_{name}"])
             values = metrics.compute()
             metrics.reset()
-            self._log_all({f"{stage}/{name}/{k}": v for k, v in values.items()})
-            if i == 0:
-                self._log_all({f"{stage}/{k}": v for k, v in values.items()})
-        loss = self._loss_metric(stage)
+            for place in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
+                # The metrics have already been gathered over processes.
+                self.log_dict({f"{place}/{key}": value.float() for key, value in values.items()})
+        loss = cast(MeanOverPairs, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
-            self._log_all({f"{stage}/correspondence_loss": loss.compute()})
+            self.log(f"{stage}/correspondence_loss", loss.compute().float())
             loss.reset()
-
-    def _log_all(self, values: dict[str, Tensor]) -> None:
-        # The metrics have already been gathered over processes.
-        self.log_dict({k: v.float() for k, v in values.items()})
 
 
 def _wait(device: torch.device) -> None:

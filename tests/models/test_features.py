@@ -217,5 +217,6 @@ def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) ->
     CompileNets(backend="eager").on_fit_start(trainer, task)
     assert [part is net.features2d or part is net.features3d for part, _ in compiled] == [True] * 2
     assert {backend for _, backend in compiled} == {"eager"}
-    with pytest.raises(ValueError, match="expected nets of BPnPNet, got"):
-        CompileNets(["features4d"]).on_fit_start(trainer, task)
+    task.solver = nn.Identity()
+    with pytest.raises(ValueError, match="expected a solver with `features2d` and `features3d`, got Identity"):
+        CompileNets().on_fit_start(trainer, task)

@@ -13,7 +13,7 @@ from planted import plant
 from small_data import small_net
 from torch.utils.data import DataLoader
 
-from bpnp import Batch, BPnPNet
+from bpnp import Batch, BPnPNet, Matcher
 from bpnp.training.feature_spread import FeatureSpread, feature_spread
 from bpnp.training.schedules import LearningRateSchedule
 from bpnp.training.task import BlindPnPTask
@@ -28,7 +28,7 @@ def collapsed_net() -> BPnPNet:
 
 def fit(
     folder: Path,
-    net: BPnPNet,
+    net: BPnPNet | Matcher,
     callback: FeatureSpread | LearningRateSchedule,
     *,
     epochs: int = 1,
@@ -89,8 +89,8 @@ def test_features_that_differ_are_not_reported(tmp_path: Path) -> None:
 
 
 def test_wrong_settings_of_the_monitor_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected nets of BPnPNet, got \\['matcher'\\]"):
-        fit(tmp_path, collapsed_net(), FeatureSpread(names=["matcher"]))
+    with pytest.raises(ValueError, match="expected a solver with `features2d` and `features3d`, got Matcher"):
+        fit(tmp_path, Matcher(channels=8, depth=1, heads=2), FeatureSpread())
     with pytest.raises(ValueError, match="got 0.05, 0 and 10"):
         FeatureSpread(patience=0)
 

@@ -9,7 +9,6 @@ from torch import Tensor
 from bpnp import Batch
 from bpnp.geometry import bearings, rotation_angle, transform
 from bpnp.training.losses import (
-    RELEASED_BOUNDS,
     correspondence_loss,
     correspondence_loss_from_pose,
     matching_likelihood_loss,
@@ -84,28 +83,6 @@ def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
     turn = Rotation.from_matrix(planted.rotation.numpy()).inv() * Rotation.from_matrix(rotation.numpy())
     distance = (translation - planted.translation).pow(2).sum(-1).sqrt()
     assert (found - torch.from_numpy(turn.magnitude()) - distance).abs().max() < 1e-12
-
-
-def turned(angle: float) -> Tensor:
-    return torch.from_numpy(Rotation.from_rotvec([0, 0, angle]).as_matrix())
-
-
-def test_beyond_its_bounds_the_released_loss_is_constant() -> None:
-    rotation = torch.stack([turned(1.5), turned(1.7), turned(1.5), turned(1.7)]).requires_grad_()
-    translation = torch.tensor([[0.9, 0, 0], [0.9, 0, 0], [0, 1.1, 0], [0, 1.1, 0]], dtype=torch.float64)
-    translation.requires_grad_()
-    truth = turned(0.0).expand(4, 3, 3), torch.zeros(4, 3, dtype=torch.float64)
-    bounded = pose_loss(rotation, translation, *truth, bounds=RELEASED_BOUNDS)
-    quarter = math.pi / 2
-    expected = torch.tensor([1.5 + 0.9, quarter + 0.9, 1.5 + 1, quarter + 1], dtype=torch.float64)
-    torch.testing.assert_close(bounded, expected)
-    bounded.sum().backward()
-    assert rotation.grad is not None
-    assert translation.grad is not None
-    assert (rotation.grad != 0).any((-2, -1)).tolist() == [True, False, True, False]
-    assert (translation.grad != 0).any(-1).tolist() == [True, True, False, False]
-    unbounded = pose_loss(rotation, translation, *truth)
-    torch.testing.assert_close(unbounded, torch.tensor([2.4, 2.6, 2.6, 2.8], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

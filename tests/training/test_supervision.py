@@ -75,19 +75,18 @@ def test_the_likelihood_is_what_its_name_says() -> None:
     torch.manual_seed(0)
     batch = plant(2, 9, outliers3d=3, dtype=torch.float32).batch()
     prediction = Matcher(channels=16, depth=1, heads=2).match(batch)
-    losses = matching_losses(prediction, batch, kind="likelihood", angle=None, estimate="pnp")
+    losses = matching_losses(prediction, batch, kind="likelihood", angle=None)
     torch.testing.assert_close(losses.total, matching_likelihood_loss(prediction, batch))
     assert losses.matched.all()
 
 
 def test_says_what_is_missing() -> None:
     batch = plant(1, 6).batch()
-    options = {"angle": None, "estimate": "pnp"}
     with pytest.raises(ValueError, match="expected a solver with an assignment to train, got none"):
-        matching_losses(Prediction(), batch, kind="likelihood", **options)
+        matching_losses(Prediction(), batch, kind="likelihood", angle=None)
     with pytest.raises(ValueError, match="expected pairs with `match3d` for matching_loss correspondence"):
         matching_losses(
-            Prediction(plant(1, 6).permutation()), replace(batch, match3d=None), kind="correspondence", **options
+            Prediction(plant(1, 6).permutation()), replace(batch, match3d=None), kind="correspondence", angle=None
         )
     with pytest.raises(ValueError, match="with matching_loss correspondence, got likelihood"):
         BlindPnPTask(matching_loss="likelihood", correspondence_angle=0.1)

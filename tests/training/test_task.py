@@ -9,6 +9,7 @@ from small_data import SMALL_MESHES, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
+import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
@@ -115,8 +116,9 @@ def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the
     assert run.callback_metrics["train/backward_failed"] == 0
 
 
-def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path) -> None:
-    task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))), max_skipped_steps=4)
+def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bpnp.training.task, "MOST_SKIPPED", 4)
+    task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))))
     with pytest.raises(TrainingDivergedError, match=r"got 4 steps in a row without.*try a lower model.learning_rate"):
         trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(task, datamodule=data(tmp_path))
     assert len(task.solver.wanted) == 4
