@@ -1,7 +1,6 @@
 """Bearings, rigid motion, projection, angles and rotations. Pure functions, any leading axes; camera = R p + t."""
 
 import numpy as np
-import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -52,11 +51,15 @@ def retract(
     >>> translation
     tensor([1., 2., 3.])
     """
+    import roma  # at its first use: it imports all of torch's compiler
+
     return roma.rotvec_to_rotmat(step[..., :3]) @ rotation, translation + step[..., 3:]
 
 
 def quaternion_rotation(quaternion: Float[Tensor, "*b 4"]) -> Float[Tensor, "*b 3 3"]:
     """Rotation of a quaternion (x, y, z, w) of any length; one of normal numbers gives a uniform rotation."""
+    import roma  # as in `retract`
+
     return roma.unitquat_to_rotmat(torch.nn.functional.normalize(quaternion, dim=-1))
 
 

@@ -8,7 +8,6 @@ import torch
 from torch import nn
 
 from bpnp.cameras import Camera, camera_from
-from bpnp.models import load_network
 
 
 def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
@@ -18,6 +17,8 @@ def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
     if solver == "search":
         return None
     if isinstance(solver, Path) or Path(str(solver)).suffix or Path(str(solver)).is_file():
+        from bpnp.models.weights import load_network  # the networks, where one is asked for
+
         return load_network(solver)
     raise ValueError(f'expected `solver` "search", a module from Batch to Prediction, or a checkpoint, got {solver!r}')
 

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
+from torch import nn
 
-from bpnp.models import TrainedNet, load_network, load_pretrained
-from bpnp.models.weights import LEARNED
 from bpnp.search.starts import GravityPrior, PosePrior
 
-Prior = PosePrior | GravityPrior | TrainedNet
+Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
+EXPECTED = "expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned'"
 
 
 def checked_prior(given: Any) -> Prior | None:
@@ -19,11 +19,10 @@ def checked_prior(given: Any) -> Prior | None:
 
     Raises ValueError for anything else.
     """
-    if given is None or isinstance(given, TrainedNet):
-        return given
-    if isinstance(given, (str, Path)):
-        learned = str(given) == "learned"
-        return load_pretrained(LEARNED) if learned else load_network(given)
+    if given is None:
+        return None
+    if isinstance(given, (nn.Module, str, Path)):
+        return _checked_net(given)
     if isinstance(given, PosePrior):
         rotation = _array("prior.rotation", given.rotation, (3, 3))
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
@@ -39,9 +38,17 @@ def checked_prior(given: Any) -> Prior | None:
         if not (camera.any() and scene.any() and given.sigma_deg > 0):
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {given}")
         return GravityPrior(camera, scene, given.sigma_deg)
-    raise ValueError(
-        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned', got {given!r:.60}"
-    )
+    raise ValueError(f"{EXPECTED}, got {given!r:.60}")
+
+
+def _checked_net(given: nn.Module | str | Path) -> nn.Module:
+    from bpnp.models.weights import LEARNED, TrainedNet, load_network, load_pretrained  # where a network is asked for
+
+    if isinstance(given, (str, Path)):
+        return load_pretrained(LEARNED) if str(given) == "learned" else load_network(given)
+    if isinstance(given, TrainedNet):
+        return given
+    raise ValueError(f"{EXPECTED}, got {given!r:.60}")
 
 
 def _array(name: str, values: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bpnp.models import TrainedNet
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT
@@ -56,10 +55,10 @@ def results_of(
             seconds = (time.perf_counter() - start) / len(group)
             yield from ((i, result, seconds) for i, result in zip(group, found, strict=True))
         return
-    nets = {id(net): evaluation_copy(net, options.device) for net in priors.values() if isinstance(net, TrainedNet)}
+    nets = {id(net): evaluation_copy(net, options.device) for net in priors.values() if isinstance(net, nn.Module)}
     for number, problem in problems.items():
         start, prior = time.perf_counter(), priors[number]
-        if isinstance(prior, TrainedNet):
+        if isinstance(prior, nn.Module):
             result = _searched_around(nets[id(prior)], problem, number, options)
         else:
             search = _search(number, options, Deadline.after(options.time_limit))
