@@ -145,6 +145,12 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
     )
 
 
+def trained_only(paths: Sequence[Path | str]) -> bool:
+    """Whether these are folders of trainings of which none has results yet."""
+    places = [place for path in paths for place in (Path(path), Path(path) / "test")]
+    return bool(paths) and not any((place / "summary.json").is_file() for place in places)
+
+
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
     """Results folders by what their paths do not share, at the start or at the end. Of a run's folder, its `test`.
 

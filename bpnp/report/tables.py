@@ -14,9 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, pose_recalls
-from bpnp.report.folder import read_results, read_runs
+from bpnp.report.folder import named_runs, read_results, read_runs, trained_only
 from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
+from bpnp.report.training_log import TrainingLog, read_training_log
 
 WIDTH = 80
 Values = Mapping[str, float]
@@ -140,6 +141,17 @@ def learning_table(before: Results, after: Results) -> Table:
     return table
 
 
+def training_table(logs: Mapping[str, TrainingLog]) -> FittedTable:
+    """The last and the smallest value of each curve of each training."""
+    rows = []
+    for name, log in logs.items():
+        for curve, (steps, values) in log.curves.items():
+            known = [value for value in values if math.isfinite(value)]
+            shown = (f"{steps[-1]:.0f}", number(values[-1]), number(min(known, default=None)))
+            rows.append((Text(curve if len(logs) == 1 else f"{name}: {curve}"), [Text(text) for text in shown]))
+    return FittedTable("Training", ["steps", "last", "smallest"], [rows], "Nothing tested yet; try `bpnp test`.")
+
+
 def report(
     paths: Sequence[Path],
     console: Console | None = None,
@@ -152,10 +164,15 @@ def report(
     `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
     columns wide. Raises ValueError if a folder cannot be read.
     """
-    runs = read_runs(paths)
     if console is None:
         console = Console()
         console.width = max(console.width, WIDTH)
+    logs = {name: read_training_log(path) for name, path in named_runs(paths).items()} if trained_only(paths) else {}
+    known = {name: log for name, log in logs.items() if log is not None}
+    if known:
+        console.print(training_table(known))
+        return
+    runs = read_runs(paths)
     console.print(results_table(runs, paper=paper))
     console.print(recall_table(runs))
     if untrained is not None:

@@ -303,6 +303,18 @@ def test_the_pose_loss_is_marked_where_it_joins(page: Callable[..., Any]) -> Non
     assert [note["text"] for note in layout["annotations"]] == ["first: pose loss", "second: pose loss"]
 
 
+def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_path: Path) -> None:
+    write_run(tmp_path, 9, 0)
+    shutil.rmtree(tmp_path / "test")
+    page = write_page([tmp_path], tmp_path / "r.html")
+    opened(browser, page.as_uri())
+    browser.execute_script("dispatchEvent(new Event('beforeprint'))")
+    browser.execute_async_script("setTimeout(arguments[0], 500)")
+    assert len(browser.find_elements("css selector", "#training .js-plotly-plot")) == 2
+    assert not browser.find_element("id", "pairs").is_displayed()
+    assert severe(browser) == []
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
 def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], width: int, scheme: str) -> None:

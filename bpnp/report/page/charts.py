@@ -144,6 +144,8 @@ def chart_text(figure: "Figure") -> str:
 
 def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) -> "dict[str, list[Figure]]":
     """The charts of the page by section; sections without one are left out."""
+    if not runs:
+        return {"training": training_charts(logs)}
     sections: dict[str, Sequence[Figure | None]] = {
         "recall": [recall_chart(runs, error) for error in ("rotation_deg", "translation", "joint", "reprojection_deg")],
         "errors": [error_chart(runs, size) for size in SIZES],

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bpnp.files import written_whole
-from bpnp.report.folder import named_runs, read_results
+from bpnp.report.folder import named_runs, read_results, trained_only
 from bpnp.report.page.charts import chart_text, page_charts
 from bpnp.report.page.points import packed, page_points, whole
 from bpnp.report.page.text import causes_html, headline_html, quartiles_html, series_buttons, visible
@@ -55,31 +55,32 @@ def page_html(
 ) -> str:  # fmt: skip
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
-    runs = {name: read_results(path) for name, path in folders.items()}
-    views = {name: read_views(path) for name, path in folders.items()}
     logs = _logs(folders)
+    only_trained = bool(logs) and trained_only(paths)
+    runs = {} if only_trained else {name: read_results(path) for name, path in folders.items()}
+    views = {name: read_views(path) for name, path in folders.items()}
     charts = page_charts(runs, logs)
     figures = [chart for section in charts.values() for chart in section]
     several = sum(len(results.estimates) for results in runs.values()) > 1
     sections = {
-        "quartiles": ("Quartiles", quartiles_html(runs, paper)),
+        **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
         **({"versus-section": ("Run against run", VERSUS)} if several else {}),
         **{name: (HEADINGS[name], _charts_html(own, figures)) for name, own in charts.items()},
-        "failures": ("Failures", causes_html(runs)),
+        **({"failures": ("Failures", causes_html(runs))} if runs else {}),
     }
     data = script_json(page_data(runs) | {
         "photos": page_photos(views, photo), "charts": [chart.to_json() for chart in figures]
     })  # fmt: skip
     plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
     places = {name: _places(results) for name, results in runs.items()}
-    links = {name: heading for name, (heading, _) in sections.items()} | {"pairs": "Pairs"}
+    links = {name: heading for name, (heading, _) in sections.items()} | ({"pairs": "Pairs"} if runs else {})
     parts = {
         "style": _colours() + (assets / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS),
         "data": data,
         "points": script_json(page_points(views, places, room=MOST_BYTES - len(data) - len(plotly) - 200_000)),
         "plotly": plotly,
-        "title": html.escape("bpnp: " + ", ".join(runs)),
+        "title": html.escape("bpnp: " + ", ".join(folders)),
         "headline": headline_html(runs),
         "series": series_buttons(runs),
         "navigation": " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in links.items()),

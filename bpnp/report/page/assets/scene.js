@@ -155,10 +155,11 @@ async function start() {
   }), { rootMargin: "300px" });
   document.querySelectorAll(".chart").forEach((node) => watcher.observe(node));
   addEventListener("beforeprint", () => document.querySelectorAll(".chart").forEach(draw));
-  dark.addEventListener("change", () => { drawSeries(); drawComparison(); drawPairs(); drawPair(); });
+  dark.addEventListener("change", () => { drawSeries(); drawComparison(); if (SERIES.length) drawPairs(); drawPair(); });
   drawSeries();
-  drawPairs();
-  const i = listed().ids.findIndex((id) => (wellFormed(id) || "(no name)") === state.pair);
+  byId("pairs").hidden = !SERIES.length;
+  if (SERIES.length) drawPairs();
+  const i = (listed()?.ids ?? []).findIndex((id) => (wellFormed(id) || "(no name)") === state.pair);
   if (state.pair && i >= 0) openPair(i);
   document.documentElement.dataset.ready = "1";
 }
