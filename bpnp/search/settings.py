@@ -111,8 +111,8 @@ class Evidence:
     translations by this share of their length, are different.
     loose_deg: standard deviation of the rotation about its least certain axis; few points that fix it less well than
         this leave the verdict ambiguous.
-    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed;
-    far_false_alarms: below it one is enough, since repeated structure does not reach it.
+    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed; or
+    matched, over_chance: this share of the points is matched, and so many times the share expected by chance.
     stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search,
     as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the bearings, and
     its matched share above plausible_matched; wrong poses of sparse points had up to a quarter.
@@ -123,8 +123,9 @@ class Evidence:
     other_deg: float = 5.0
     other_shift: float = 0.1
     loose_deg: float = 1.0
-    hits: int = 2
-    far_false_alarms: float = -60.0
+    hits: int = 4
+    matched: float = 0.2
+    over_chance: float = 6.0
     stalled: int = 4
     better: float = 0.002
     enough_hits: int = 8

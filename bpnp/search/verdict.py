@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import same_pose
 from bpnp.search.candidates import Candidates
 from bpnp.search.false_alarms import log10_false_alarms
-from bpnp.search.point_sets import PointSets
+from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
 
@@ -91,13 +91,22 @@ def is_certain(
     """Whether weighed candidates leave no doubt about the first: the verdict "confident".
 
     exhaustive: whether every pose that fits some points was looked at. Otherwise a better one may have been missed,
-    unless two batches of starts found this one, or its false alarms are far below any repeated structure's.
+    unless enough batches of starts found this one, or its matches are unique.
     """
     if not len(candidates):
         return False
-    alarms, hits = float(candidates.log10_false_alarms[0]), int(candidates.hits[0])
-    found = exhaustive or hits >= rule.hits or alarms <= rule.far_false_alarms
-    return alarms <= rule.false_alarms and found and lead(candidates, sets, rule)[0] >= rule.lead
+    found = exhaustive or int(candidates.hits[0]) >= rule.hits or is_unique(candidates, sets, rule)
+    chance = float(candidates.log10_false_alarms[0]) <= rule.false_alarms
+    return chance and found and lead(candidates, sets, rule)[0] >= rule.lead
+
+
+def is_unique(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:
+    """Whether the matched share of the best pose exceeds a floor, and several times what chance matches within 2 s.
+
+    A pose at which a part of the scene is aligned is no coincidence, but its residuals are too large for this.
+    """
+    by_chance = len(sets.points3d) / solid_angle(sets.bearings) * math.pi * (2 * float(candidates.scale[0])) ** 2
+    return bool(candidates.matched[0] > max(rule.matched, rule.over_chance * by_chance))
 
 
 def is_exhausted(candidates: Candidates, scene: Scene, stalled: int) -> bool:
@@ -134,7 +143,7 @@ def judged(
     elif alarms > rule.false_alarms:
         reason = f"{chance}: too many to be sure"
     else:
-        reason = f"{chance}, but the search came upon this pose only once, and a better one may have been missed"
+        reason = f"{chance}, but too few batches of starts came upon this pose to be sure that no better one was missed"
     return SearchResult(candidates, "ambiguous", reason, batches)
 
 
