@@ -1,4 +1,4 @@
-"""`bpnp localize`: images of a COLMAP model, solved as if nobody knew where they were taken."""
+"""`bpnp localize`: new photos in a map, or the images of a COLMAP model as if nobody knew where they were taken."""
 
 from functools import partial
 from pathlib import Path
@@ -8,13 +8,35 @@ from bpnp.commands.output import console
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.files import claimed
 from bpnp.localization.from_models import draw_image, image_source, localize_image, model_photos, write_localized
+from bpnp.localization.in_maps import (
+    PhotoOptions,
+    check_settings,
+    draw_photo,
+    finished_solution,
+    localize_photo,
+    photo_files,
+    photos_table,
+    solution_file,
+    write_poses,
+)
 from bpnp.localization.localized import Localized, localized_table, summary
+from bpnp.localization.point_files import read_camera
 from bpnp.localization.slow_progress import SlowProgress
+from bpnp.localization.solved import write_text
+from bpnp.maps.regions import read_pairs
+from bpnp.maps.scene_map import SceneMap
+from bpnp.solving.solution import Solution
 
 
 def localize(
+    map: Path | None = None,
+    photos: list[Path] | None = None,
     *,
-    model: Path,
+    camera: str | None = None,
+    views: Path | None = None,
+    keypoints: Path | None = None,
+    leave_one_out: bool = False,
+    model: Path | None = None,
     image: str = "all",
     points: Literal["seen", "clutter", "all"] = "seen",
     clutter: float = 0.25,
@@ -26,13 +48,20 @@ def localize(
     seed: int = 0,
     device: str | None = None,
 ) -> None:
-    """Solve images of a COLMAP model as if their poses were unknown, and compare with the model's.
+    """Find where photos were taken in a map, or solve the images of a COLMAP model as if their poses were unknown.
 
-    The scene is turned at random, so that nothing of a pose leaks into its search. Writes results.json, images.txt
-    (confident poses in the frame of the model) and pictures/<image>.png as it goes: an interruption loses nothing.
+    MAP PHOTO... writes solutions/<photo>.json, pictures/<photo>.png and poses.txt (confident poses in the frame of the
+    map); a run that was interrupted goes on. --model instead turns the scene at random, so that nothing of a pose
+    leaks into its search, compares with the model and writes results.json, images.txt and pictures/<image>.png.
 
     Args:
-        model: COLMAP model, such as sparse/0.
+        map: COLMAP model of the place, such as sparse/0.
+        photos: photos, or folders of them.
+        camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; EXIF by default.
+        views: text file of pairs "photo view", the views of the map to try; the whole map by default.
+        keypoints: hloc's HDF5 file of features; SIFT is detected by default.
+        leave_one_out: the photos are views of the map, and each is taken out of it first.
+        model: COLMAP model whose images are solved again, such as sparse/0.
         image: one image, or all.
         points: which 2D and 3D points to solve; "seen", the keypoints with a 3D point and these; "clutter", with
             --clutter of the others on both sides; "all", every keypoint and every 3D point.
@@ -45,6 +74,80 @@ def localize(
         seed: of the rotation and of the search.
         device: such as cuda; cpu by default.
     """
+    if map is not None and model is None:
+        options = PhotoOptions(
+            camera=None if camera is None else read_camera(camera),
+            pairs=None if views is None else read_pairs(views),
+            features=keypoints,
+            leave_one_out=leave_one_out,
+            seed=seed,
+            time_limit=time_limit,
+        )
+        asked = {"map": str(map), "camera": camera, "views": str(views), "keypoints": str(keypoints)}
+        asked |= {"leave_one_out": str(leave_one_out), "seed": str(seed), "time_limit": str(time_limit)}
+        _localize_photos(map, photos or [], options, asked, output, pictures=not no_pictures)
+    elif model is not None and map is None:
+        _localize_images(
+            model, image, points, clutter, output, no_pictures, solver, inlier_threshold, time_limit, seed, device
+        )  # fmt: skip
+    else:
+        raise ValueError("expected MAP PHOTO... or --model MODEL, got " + ("neither" if map is None else "both"))
+
+
+def _localize_photos(
+    place: Path,
+    photos: list[Path],
+    options: PhotoOptions,
+    asked: dict[str, str | None],
+    output: Path,
+    *,
+    pictures: bool,
+) -> None:
+    """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
+    files, scene = photo_files(photos), SceneMap.from_colmap(place)
+    done: dict[str, Solution] = {}
+    errors: dict[str, str] = {}
+    with claimed(output), SlowProgress("localizing", total=len(files)) as progress:
+        check_settings(output, asked)
+        for name, photo in files.items():
+            progress.describe(name)
+            solution = finished_solution(output, name)
+            try:
+                if solution is None:
+                    solution = localize_photo(scene, name, photo, options)
+                    if pictures:
+                        draw_photo(output, name, photo, solution, options.camera)
+                    write_text(solution_file(output, name), solution.to_json() + "\n")
+                done[name] = solution
+                write_poses(output, done)
+            except (ValueError, OSError) as error:
+                errors[name] = str(error)
+            progress.advance()
+    out = console()
+    if done:
+        out.print(photos_table(done))
+    for name, reason in errors.items():
+        out.print(f"{name}: {reason}", markup=False, highlight=False, soft_wrap=True)
+    out.print(f"wrote poses.txt, solutions/ in {output}", markup=False, highlight=False, soft_wrap=True)
+    if errors:
+        name, reason = next(iter(errors.items()))
+        raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
+
+
+def _localize_images(
+    model: Path,
+    image: str,
+    points: Literal["seen", "clutter", "all"],
+    clutter: float,
+    output: Path,
+    no_pictures: bool,
+    solver: str,
+    inlier_threshold: float | None,
+    time_limit: float | None,
+    seed: int,
+    device: str | None,
+) -> None:
+    """The images of a model."""
     source = image_source(read_reconstruction(model), image, points, clutter, seed)
     draw = None if no_pictures else partial(draw_image, *model_photos(model))
     done: list[Localized] = []

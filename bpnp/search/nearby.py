@@ -41,13 +41,21 @@ class Raster(NamedTuple):
 def nearby_batch(scene: Scene, prior: PosePrior, outliers: float, deadline: Deadline) -> Candidates:
     """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed."""
     rule = scene.settings.nearby
-    poses, raster = drawn_around(scene, prior, rule.starts), raster_of(scene)
+    poses, raster = drawn_around(scene, prior, starts_of(scene, prior)), raster_of(scene)
     for points, kept in zip(rule.points, rule.kept, strict=True):
         poses = looked_up(poses, raster, scene.points3d[:points], kept, deadline, rule.starts_a_check)
     first_scale, share = rule.scale * scene.spread, max(outliers, rule.outliers)
     return anneal_on_points(
         scene, poses, first_scale, share, deadline, bearings=scene.settings.fine.bearings
     )  # fmt: skip
+
+
+def starts_of(scene: Scene, prior: PosePrior) -> int:
+    """As many starts as lie as densely around a narrow prior as `Nearby.starts` do around a wide one."""
+    rule = scene.settings.nearby
+    wide = math.radians(rule.wide_deg), rule.wide_shift * _distance(scene, prior)
+    share = (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
+    return int(np.clip(rule.starts * share, rule.least_starts, rule.starts))
 
 
 def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
@@ -98,11 +106,16 @@ def raster_of(scene: Scene) -> Raster:
 
 def cooled(recipe: Recipe, prior: PosePrior, scene: Scene) -> Recipe:
     """The recipe with a first scale no wider than the prior: from a hotter one the starts leave what is known."""
-    middle = scene.bulk3d.mean(0)
-    depth = max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
+    depth = _distance(scene, prior)
     turned = math.radians(prior.rotation_sigma_deg) * float(np.sqrt(scene.bulk3d.var(0).sum())) / depth
     width = math.hypot(prior.translation_sigma / depth, turned) / scene.spread
     return replace(recipe, first_scale=float(np.clip(width, scene.settings.coarse.last_scale, recipe.first_scale)))
+
+
+def _distance(scene: Scene, prior: PosePrior) -> float:
+    """Of the middle of the points from the camera of the prior."""
+    middle = scene.bulk3d.mean(0)
+    return max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
 
 
 def _smoothed(values: NDArray[np.float64], cells: float) -> NDArray[np.float64]:

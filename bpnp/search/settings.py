@@ -70,7 +70,8 @@ class Shaking:
 class Nearby:
     """Starts around a rough pose, looked up in a raster of the view (`bpnp.search.nearby`).
 
-    starts: a batch; 2^19 poses within 15 degrees and 15 % of the distance leave few gaps over the width of a basin.
+    starts: a batch for a prior of `wide_deg` and `wide_shift` (of the distance) or more; these leave few gaps over the
+    width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
     points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each;
     the last of them are annealed on all points.
     scale: of the smoothed bearings and of the first iteration, in spreads of the bearings; at twice as much chance
@@ -80,6 +81,9 @@ class Nearby:
     """
 
     starts: int = 2**19
+    wide_deg: float = 12.0
+    wide_shift: float = 0.12
+    least_starts: int = 2**15
     points: tuple[int, ...] = (150, 600, 5000)
     kept: tuple[int, ...] = (2**16, 2**12, 300)
     scale: float = 0.04

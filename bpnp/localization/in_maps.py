@@ -1,0 +1,131 @@
+"""Photos localised in a map, one after the other, into a folder from which an interrupted run goes on."""
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.text import Text
+from scipy.spatial.transform import Rotation
+
+from bpnp.cameras import camera_from
+from bpnp.datamodules.colmap.photos import photo_crop
+from bpnp.localization.solved import write_text
+from bpnp.maps.keypoints import detected_keypoints, read_features
+from bpnp.maps.photos import camera_from_exif, photo_size
+from bpnp.maps.scene_map import SceneMap
+from bpnp.report.figures import save_figure
+from bpnp.report.pictures import VERDICTS, picture_box, solution_picture
+from bpnp.report.tables import FittedTable, number
+from bpnp.solving.solution import Solution
+
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """What applies to all photos. camera: as for `bpnp.solve`, None for that of EXIF. pairs: views to try by the name
+    of the photo, None for the whole map. features: hloc's HDF5 file, None to detect keypoints. leave_one_out: the
+    photos are views of the map and are taken out of it."""
+
+    camera: Any = None
+    pairs: Mapping[str, Sequence[str]] | None = None
+    features: Path | None = None
+    leave_one_out: bool = False
+    seed: int = 0
+    time_limit: float | None = None
+
+
+def photo_files(given: Iterable[Path]) -> dict[str, Path]:
+    """Photos by name: the files given, and those in given folders. Raises ValueError for none, or one name twice."""
+    files: dict[str, Path] = {}
+    for path in _expanded(given):
+        if files.setdefault(path.name, path) != path:
+            raise ValueError(f"expected photos of different names, got {files[path.name]} and {path}")
+    if not files:
+        raise ValueError("expected one or more photos, or folders with some, got none")
+    return files
+
+
+def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOptions) -> Solution:
+    """One photo. Raises ValueError for what is wrong with it, its camera, its keypoints or its views."""
+    size = photo_size(photo)
+    if options.leave_one_out:
+        scene = scene.without([name])
+    camera = camera_from_exif(photo) if options.camera is None else options.camera
+    found = detected_keypoints(photo) if options.features is None else read_features(options.features, name, size)
+    views = None if options.pairs is None else options.pairs.get(name)
+    if options.pairs is not None and not views:
+        raise ValueError(f"expected views for {name} among the pairs, got none; try without --views")
+    return scene.localize(
+        found.pixels, camera, views=views, scores=found.scores, seed=options.seed, time_limit=options.time_limit
+    )  # fmt: skip
+
+
+def solution_file(folder: Path, name: str) -> Path:
+    """Where the solution of a photo is kept."""
+    return folder / "solutions" / f"{_safe(name)}.json"
+
+
+def finished_solution(folder: Path, name: str) -> Solution | None:
+    """The solution of an earlier run, None if there is none that is whole."""
+    path = solution_file(folder, name)
+    try:
+        return Solution.from_json(path) if path.is_file() else None
+    except ValueError:
+        return None
+
+
+def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
+    """Keep the settings of a folder's results. Raises ValueError if it has results of other ones."""
+    path, text = folder / "settings.json", json.dumps(settings, indent=1, sort_keys=True) + "\n"
+    if path.is_file() and path.read_text(encoding="utf-8") != text and any((folder / "solutions").glob("*.json")):
+        raise ValueError(f"expected an --output without results of other settings, got {folder}; try another folder")
+    write_text(path, text)
+
+
+def write_poses(folder: Path, solutions: Mapping[str, Solution]) -> None:
+    """poses.txt: a line for each confident photo, in the frame of the map."""
+    lines = []
+    for name, solution in sorted(solutions.items()):
+        if solution.verdict == "confident":
+            x, y, z, w = Rotation.from_matrix(solution.rotation).as_quat(canonical=True).tolist()
+            lines.append(" ".join([name, *map(repr, (w, x, y, z, *solution.translation.tolist()))]) + "\n")
+    write_text(folder / "poses.txt", POSES_HEADER + "".join(lines))
+
+
+def draw_photo(folder: Path, name: str, photo: Path, solution: Solution, camera: Any) -> None:
+    """pictures/<name>.png: keypoints, reprojected points and matches over the undistorted photo."""
+    lens = camera_from(camera_from_exif(photo) if camera is None else camera)
+    seen = replace(solution, points2d=solution.points2d[np.isfinite(solution.points2d).all(-1)])
+    crop = photo_crop(photo, lens.project, picture_box(seen.points2d))
+    title = f"{name}: {solution.view}"
+    save_figure(solution_picture(solution, title=title, photo=crop), folder / "pictures" / f"{_safe(name)}.png")
+
+
+def photos_table(solutions: Mapping[str, Solution]) -> FittedTable:
+    """A row for each photo."""
+    rows = []
+    for name, solution in solutions.items():
+        cells = (str(solution.view), str(solution.inlier_count), number(solution.reprojection_error))
+        times = (f"{solution.log10_false_alarms:.0f}", number(solution.seconds))
+        rows.append((Text(name), [Text(solution.verdict, VERDICTS[solution.verdict]), *map(Text, (*cells, *times))]))
+    return FittedTable("", ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec"), [rows])
+
+
+def _expanded(given: Iterable[Path]) -> Iterator[Path]:
+    for path in given:
+        if path.is_dir():
+            yield from sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+        elif path.is_file():
+            yield path
+        else:
+            raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
+
+
+def _safe(name: str) -> str:
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", name)

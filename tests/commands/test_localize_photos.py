@@ -1,0 +1,94 @@
+"""`bpnp localize MAP PHOTO...`: photos that are taken out of their map are found again; bad ones do not stop others."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap, Solution
+from bpnp.cli import main
+
+CAMERA = "PINHOLE,1379.7,1382.1,760.3,503.4"
+
+
+@pytest.fixture(scope="module")
+def place(shared_data: Path) -> tuple[Path, Path]:
+    return shared_data / "colmap/fountain-P11/sparse/0", shared_data / "photos/fountain-P11"
+
+
+def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
+    place: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, photos = place
+    folder, output = tmp_path / "photos", tmp_path / "out"
+    folder.mkdir()
+    for name in ("0004.jpg", "0006.jpg"):
+        shutil.copy(photos / name, folder / name)
+    (folder / "0009.jpg").write_text("no photo")
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0004.jpg 0003.jpg\n0004.jpg 0005.jpg\n0006.jpg 0005.jpg\n0006.jpg 0007.jpg\n")
+    command = ["localize", str(model), str(folder), "--camera", CAMERA, "--views", str(pairs), "--output", str(output)]
+    with pytest.raises(SystemExit) as status:
+        main([*command, "--leave-one-out"])
+    assert status.value.code == 2
+    assert "1 of 3 photos could not be tried, such as 0009.jpg" in capsys.readouterr().err
+
+    scene = SceneMap.from_colmap(model)
+    lines = [line.split() for line in (output / "poses.txt").read_text().splitlines() if not line.startswith("#")]
+    assert [line[0] for line in lines] == ["0004.jpg", "0006.jpg"]
+    for name, *numbers in lines:
+        w, x, y, z, *translation = map(float, numbers)
+        (view,) = scene.named([name])
+        rotation = Rotation.from_quat([x, y, z, w])
+        assert (rotation * Rotation.from_matrix(view.rotation).inv()).magnitude() < np.radians(1)
+        centre = -rotation.as_matrix().T @ translation
+        assert (
+            np.linalg.norm(centre - view.centre)
+            < 0.05 * np.linalg.norm(scene.points3d[view.points] - centre, axis=1).min()
+        )
+        solution = Solution.from_json(output / "solutions" / f"{name}.json")
+        assert solution.view in ("0003.jpg", "0005.jpg", "0007.jpg")
+        assert set(solution.matches[:, 1].tolist()) <= set(scene.point_ids.tolist())
+        assert (output / "pictures" / f"{name}.png").stat().st_size > 20000
+
+    # Another run goes on where this one was: nothing is solved again, and other settings are refused.
+    before = (output / "solutions/0004.jpg.json").stat().st_mtime_ns
+    with pytest.raises(SystemExit):
+        main([*command, "--leave-one-out"])
+    assert (output / "solutions/0004.jpg.json").stat().st_mtime_ns == before
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        main([*command, "--leave-one-out", "--seed", "1"])
+    assert "expected an --output without results of other settings" in capsys.readouterr().err
+
+
+def failing(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    with pytest.raises(SystemExit) as status:
+        main(["localize", *arguments])
+    assert status.value.code == 2
+    return capsys.readouterr().err
+
+
+def test_bad_input_is_one_clear_error(
+    place: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model, photos = place
+    out = ("--output", str(tmp_path / "out"))
+    assert "expected MAP PHOTO... or --model MODEL, got neither" in failing(capsys)
+    assert "got both" in failing(capsys, str(model), "--model", str(model))
+    assert "expected one or more photos" in failing(capsys, str(model), *out)
+    assert "a.jpg, which does not exist" in failing(capsys, str(model), "a.jpg", *out)
+    Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
+    assert "focal length in the EXIF data" in failing(capsys, str(model), str(tmp_path / "plain.jpg"), *out)
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("0004.jpg nowhere.jpg\n")
+    error = failing(
+        capsys, str(model), str(photos / "0004.jpg"), "--camera", CAMERA, "--views", str(pairs),
+        "--output", str(tmp_path / "views"),
+    )  # fmt: skip
+    assert "expected names of views of the map, got nowhere.jpg" in error
+    assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] == "False"
