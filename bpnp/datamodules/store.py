@@ -134,8 +134,10 @@ class StoreWriter:
     parameters: kept in the manifest, must be JSON. skipped: what was left out, and why; may be added to.
     """
 
-    def __init__(self, folder: Path, bulk: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
-        self.folder, self._files, self._widths = folder, bulk, widths
+    def __init__(
+        self, folder: Path, bulk: Mapping[str, BinaryIO], widths: Mapping[str, int], *, durable: bool
+    ) -> None:  # fmt: skip
+        self.folder, self._files, self._widths, self._durable = folder, bulk, widths, durable
         self._columns: dict[str, list[NDArray[Any]]] = defaultdict(list)
         self.parameters: dict[str, Any] = {}
         self.skipped: dict[str, str] = {}
@@ -176,7 +178,7 @@ class StoreWriter:
             whole = np.broadcast_to(np.zeros((), BULK), (int(self._end(name)), self._widths[name]))
             file.seek(0)
             _write_header(file, whole)
-            _synced(file)
+            self._sync(file)
             entries[name] = {"bulk": True, "dtype": BULK.str, "shape": list(whole.shape)}
         for name, parts in self._columns.items():
             column = np.concatenate(parts)
@@ -185,24 +187,32 @@ class StoreWriter:
             with (self.folder / f"{name}.npy").open("wb") as file:
                 _write_header(file, column)
                 file.write(column.data)  # np.save hides the reason why a write fails
-                _synced(file)
+                self._sync(file)
         for name, entry in entries.items():
             entry["bytes"] = (self.folder / f"{name}.npy").stat().st_size
         manifest = {"format": FORMAT, "kind": kind, "rows": entries["name"]["shape"][0], "columns": entries}
         manifest |= {"parameters": self.parameters, "skipped": self.skipped}
         with (self.folder / MANIFEST).open("wb") as file:
             file.write(json.dumps(manifest | {"checksum": _checksum(manifest)}, indent=1).encode())
-            _synced(file)
+            self._sync(file)
+
+    def _sync(self, file: BinaryIO) -> None:
+        file.flush()
+        if self._durable:
+            os.fsync(file.fileno())
 
     def _end(self, bulk: str) -> np.int64:
         return np.int64(self._columns[f"{bulk}_start"][-1][-1])
 
 
 @contextmanager
-def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[StoreWriter]:
+def new_store(
+    folder: Path, kind: str, widths: Mapping[str, int], *, durable: bool = True
+) -> Iterator[StoreWriter]:  # fmt: skip
     """A writer of the new `folder`, which is there, complete, when the block has ended without an error.
 
     widths: coordinates of a point in each bulk column. Points are written as they come; memory holds the other columns.
+    durable: wait until the disk has everything, so that not even a loss of power can cut the store.
     Raises StoreError if the folder exists, OSError that names it if the disk is full.
     """
     if folder.exists():
@@ -211,7 +221,7 @@ def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[St
         temporary.mkdir()
         with ExitStack() as stack:
             files = {name: stack.enter_context((temporary / f"{name}.npy").open("wb")) for name in widths}
-            writer = StoreWriter(temporary, files, widths)
+            writer = StoreWriter(temporary, files, widths, durable=durable)
             yield writer
             writer.finish(kind)
 
@@ -220,11 +230,6 @@ def _write_header(file: BinaryIO, column: NDArray[Any]) -> None:
     """The header of a .npy file; numpy pads it, so that it has the same size for any number of rows."""
     header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
     np.lib.format.write_array_header_1_0(file, header)
-
-
-def _synced(file: Any) -> None:
-    file.flush()
-    os.fsync(file.fileno())
 
 
 def _checksum(content: Mapping[str, Any]) -> int:

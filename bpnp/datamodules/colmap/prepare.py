@@ -43,7 +43,7 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
 def read_part(job: tuple[str, str, Path, int, float], output: Path) -> None:
     """Write the store of one COLMAP model; an empty one if it cannot be used."""
     scene, name, folder, min_points, clutter = job
-    with new_store(output, PAIRS, WIDTHS) as writer:
+    with new_store(output, PAIRS, WIDTHS, durable=False) as writer:
         try:
             reconstruction = read_reconstruction(folder, name=name)
             with warnings.catch_warnings():

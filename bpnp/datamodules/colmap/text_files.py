@@ -31,10 +31,10 @@ def read_text(
         files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
         raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
     cameras = {key: CameraRecord(camera.model.name, np.array(camera.params)) for key, camera in model.cameras.items()}
-    points = np.zeros(len(model.points3D), POINT)
-    for row, (key, point) in zip(points, model.points3D.items(), strict=True):
-        row["point_id"], row["position"], row["colour"], row["error"] = key, point.xyz, point.color, point.error
-        row["track_length"] = point.track.length()
+    points = np.zeros(len(model.points3D), POINT)  # colours and errors stay 0
+    found = [(key, point.xyz, point.track.length()) for key, point in model.points3D.items()]
+    if found:
+        points["point_id"], points["position"], points["track_length"] = zip(*found, strict=True)
     return cameras, images, points
 
 
@@ -71,7 +71,8 @@ def _image_names(content: bytes) -> dict[int, str]:
 
 def _image(image: Any, name: str) -> ImageRecord:
     pose = image.cam_from_world()
-    keypoints = np.array([point.xy for point in image.points2D], np.float64).reshape(-1, 2)
-    ids = np.array([point.point3D_id for point in image.points2D], np.uint64).astype(np.int64)  # none: 2^64 - 1
+    found = [(point.xy, point.point3D_id) for point in image.points2D]
+    keypoints = np.array([xy for xy, _ in found], np.float64).reshape(-1, 2)
+    ids = np.array([number for _, number in found], np.uint64).astype(np.int64)  # none: 2^64 - 1
     quaternion = np.roll(pose.rotation.quat, 1)  # pycolmap's has the real part last
     return ImageRecord(name, image.image_id, image.camera_id, quaternion, pose.translation, keypoints, ids)

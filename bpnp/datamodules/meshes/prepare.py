@@ -47,7 +47,7 @@ def surfaces_recipe(archive: MeshArchive, *, points: int, normalisation: Normali
 def sample_part(job: tuple[MeshArchive, int, Normalisation], folder: Path) -> None:
     """Write the store of some meshes."""
     archive, count, mode = job
-    with new_store(folder, SURFACES, WIDTHS) as writer:
+    with new_store(folder, SURFACES, WIDTHS, durable=False) as writer:
         for name in archive.names:
             try:
                 samples = archive.samples(name, count, mode)

@@ -41,7 +41,7 @@ def released_recipe(source: Path, dataset: str | None) -> Recipe:
 def convert_part(job: tuple[AuthorsPart, float], output: Path) -> None:
     """Write the store of the pickles of one folder."""
     part, focal = job
-    with new_store(output, PAIRS, WIDTHS) as writer:
+    with new_store(output, PAIRS, WIDTHS, durable=False) as writer:
         for sample, pair in read_part(part, focal=focal):
             if isinstance(pair, Pair):
                 add_pair(writer, part.scene, pair)
