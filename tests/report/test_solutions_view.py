@@ -72,7 +72,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Pat
             read_solution(path)
 
 
-def photographed(folder: Path) -> Any:
+def photographed(folder: Path, shrink: int = 1) -> Any:
     """A distorted camera's photos of the planted points: a red disc at each keypoint, on grey."""
     planted = plant_model(folder / "castle" / "sparse" / "0", seed=1)
     import pycolmap
@@ -87,12 +87,15 @@ def photographed(folder: Path) -> Any:
             if point.has_point3D():
                 x, y = point.xy
                 pixels[np.hypot(columns - x, rows - y) < 6] = (255, 0, 0)
-        Image.fromarray(pixels).save(images / image.name, quality=98)
+        small = Image.fromarray(pixels).resize((WIDTH // shrink, HEIGHT // shrink))
+        small.save(images / image.name, quality=98)
     return planted
 
 
-def test_the_photo_lies_under_the_normalised_points(tmp_path: Path) -> None:
-    planted = photographed(tmp_path)
+@pytest.mark.parametrize("shrink", [1, 2])
+def test_the_photo_lies_under_the_normalised_points(tmp_path: Path, shrink: int) -> None:
+    """Of the camera's size, or made smaller after the reconstruction."""
+    planted = photographed(tmp_path, shrink)
     find = photo_finder(tmp_path)
     points = planted.points2d[0]
     box = Box(*(points.min(0) - 0.05).tolist(), *(points.max(0) + 0.05).tolist())

@@ -124,14 +124,14 @@ CHUNK = 2**16  # points that are copied at a time
 
 def _binary_cameras(cursor: _Cursor, models: Mapping[int, tuple[str, int]]) -> Iterator[tuple[int, CameraRecord]]:
     for _ in cursor.records():
-        camera_id, model_id, _, _ = cursor.take(_CAMERA)
+        camera_id, model_id, width, height = cursor.take(_CAMERA)
         if model_id not in models:
             raise ColmapError(
                 f"expected a camera model among {', '.join(name for name, _ in models.values())}, got id {model_id} in "
                 f"{cursor.path}: it is not a COLMAP file, or newer than this pycolmap"
             )
         name, count = models[model_id]
-        yield camera_id, CameraRecord(name, cursor.array(np.dtype("<f8"), count))
+        yield camera_id, CameraRecord(name, cursor.array(np.dtype("<f8"), count), (width, height))
     cursor.finish()
 
 

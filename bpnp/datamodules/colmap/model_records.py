@@ -19,6 +19,7 @@ class ColmapError(ValueError):
 class CameraRecord:
     model: str
     params: NDArray[np.float64]
+    size: tuple[int, int]  # width and height of the image, pixels
 
 
 @dataclass(frozen=True)

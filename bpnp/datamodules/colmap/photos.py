@@ -87,6 +87,7 @@ def _resampled(
     x = left + (np.arange(WIDTH) + 0.5) / WIDTH * (right - left)
     y = top + (np.arange(height) + 0.5) / height * (bottom - top)
     rays = np.stack([*np.meshgrid(x, y), np.ones((height, WIDTH))], -1).reshape(-1, 3)
-    column, row = (project(rays) - 0.5).T  # COLMAP's origin is the corner of the first pixel
+    size = np.array(photo.shape[1::-1])
+    column, row = (project(rays) * size - 0.5).T  # COLMAP's origin is the corner of the first pixel
     channels = [map_coordinates(photo[..., c], [row, column], order=1, cval=0) for c in range(3)]
     return np.stack(channels, -1).reshape(height, WIDTH, 3).astype(np.uint8)

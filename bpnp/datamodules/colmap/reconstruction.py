@@ -4,6 +4,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -91,14 +92,22 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
 
 
 def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """By image name, the function from rays (k, 3) in camera coordinates to pixels (k, 2), distortion included.
+    """By image name, the function from rays (k, 3) in camera coordinates to places (k, 2) in the image, as shares of
+    its width and height, distortion included. A photo may have another size than the camera's image.
 
     Raises ColmapError as `read_reconstruction`.
     """
     records = read_records(folder, camera_models=camera_models())
     cameras = {image.camera_id: image for image in records.images}
     lenses = {key: _camera(folder, image, records.cameras.get(key)) for key, image in cameras.items()}
-    return {image.name: lenses[image.camera_id].project for image in records.images}
+    sizes = {key: np.array(records.cameras[key].size, np.float64) for key in lenses}
+    if not all((size > 0).all() for size in sizes.values()):
+        raise ColmapError(f"expected cameras with a width and a height in {folder}, got 0; try another model")
+
+    def place(rays: NDArray[np.float64], *, key: int) -> NDArray[np.float64]:
+        return lenses[key].project(rays) / sizes[key]
+
+    return {image.name: partial(place, key=image.camera_id) for image in records.images}
 
 
 def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> Camera:

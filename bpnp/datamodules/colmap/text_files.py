@@ -30,7 +30,10 @@ def read_text(
     except ValueError as error:
         files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
         raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
-    cameras = {key: CameraRecord(camera.model.name, np.array(camera.params)) for key, camera in model.cameras.items()}
+    cameras = {
+        key: CameraRecord(camera.model.name, np.array(camera.params), (camera.width, camera.height))
+        for key, camera in model.cameras.items()
+    }
     points = np.zeros(len(model.points3D), POINT)  # colours and errors stay 0
     found = [(key, point.xyz, point.track.length()) for key, point in model.points3D.items()]
     if found:
