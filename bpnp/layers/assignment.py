@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.checks import checked_shapes
-from bpnp.layers.adjoint import project, solve_multipliers
+from bpnp.layers.adjoint import solve_multipliers
 from bpnp.layers.implicit import BackwardStats, entropic_plan, record
 from bpnp.layers.transport import solve_plan
 from bpnp.precision import full_precision
@@ -59,21 +59,31 @@ def sinkhorn(
     >>> stats.converged
     tensor([True])
     """
-    real2d, real3d = _checked(cost, mu, mask2d, mask3d, dustbin)
-    _, m, n = cost.shape
+    for name, scalar in (("mu", mu), ("dustbin", dustbin)):
+        if isinstance(scalar, Tensor) and scalar.ndim:
+            raise ValueError(f"expected `{name}` as a number or a scalar tensor, got shape {tuple(scalar.shape)}")
+    _check_mu(mu)
+    for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
+        if mask is not None and not bool(mask.any(-1).all()):
+            raise ValueError(f"expected at least one real point on each side of every sample, got an empty `{name}`")
+    b, m, n = cost.shape
+    real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
+    real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     rows = uniform_marginal(real2d, cost.dtype) if row_marginal is None else row_marginal * real2d
     cols = uniform_marginal(real3d, cost.dtype) if col_marginal is None else col_marginal * real3d
     if dustbin is not None:
-        cost = _with_dustbin(cost, torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device))
+        bin_cost = torch.as_tensor(dustbin, dtype=cost.dtype, device=cost.device)
+        cost = torch.cat([cost, bin_cost.expand(b, m, 1)], 2)
+        cost = torch.cat([cost, bin_cost.expand(b, 1, n + 1)], 1)
         rows, cols = dustbin_marginals(rows, cols, real2d, real3d)
     exact_mu = torch.as_tensor(mu, dtype=torch.float64, device=cost.device)
     with torch.no_grad():
         plan, stats = solve_plan(cost, rows, cols, mu=exact_mu, tolerance=tolerance, max_iterations=max_iterations)
 
-    def solve_adjoint(plan: Tensor, gradient: Tensor, factor: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def solve_adjoint(plan: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, converged = solve_multipliers(plan, gradient)
         record(backward_stats, "sinkhorn", converged)
-        return project(plan, gradient, a, b, factor), a, b
+        return a, b
 
     plan = entropic_plan(plan, cost, exact_mu.to(cost.dtype), rows, cols, solve_adjoint)
     return (plan if dustbin is None else plan[:, :m, :n]), stats
@@ -97,31 +107,9 @@ def dustbin_marginals(
     return torch.cat([rows * share2d, share3d], -1), torch.cat([cols * share3d, share2d], -1)
 
 
-def _with_dustbin(cost: Float[Tensor, "b m n"], bin_cost: Float[Tensor, ""]) -> Float[Tensor, "b rows cols"]:
-    cost = torch.cat([cost, bin_cost.expand(*cost.shape[:2], 1)], -1)
-    return torch.cat([cost, bin_cost.expand(cost.shape[0], 1, cost.shape[2])], -2)
-
-
-def _checked(
-    cost: Tensor,
-    mu: float | Tensor,
-    mask2d: Tensor | None,
-    mask3d: Tensor | None,
-    dustbin: float | Tensor | None,
-) -> tuple[Bool[Tensor, "b m"], Bool[Tensor, "b n"]]:
-    """Raise ValueError for arguments that mean nothing; return which points are real."""
-    for name, scalar in (("mu", mu), ("dustbin", dustbin)):
-        if isinstance(scalar, Tensor) and scalar.ndim:
-            raise ValueError(f"expected `{name}` as a number or a scalar tensor, got shape {tuple(scalar.shape)}")
+def _check_mu(mu: float | Tensor) -> None:
     if not mu > 0:
         raise ValueError(f"expected `mu` > 0, got {float(mu)}; try 0.1")
-    b, m, n = cost.shape
-    real2d = cost.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
-    real3d = cost.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
-    for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
-        if mask is not None and not bool(mask.any(-1).all()):
-            raise ValueError(f"expected at least one real point on each side of every sample, got an empty `{name}`")
-    return real2d, real3d
 
 
 class Sinkhorn(nn.Module):
@@ -153,31 +141,19 @@ class Sinkhorn(nn.Module):
         max_iterations: int = 1000,
     ) -> None:
         super().__init__()
-        if not mu > 0:
-            raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+        _check_mu(mu)
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu))) if learn_mu else None
-        self.mu, self.learn_mu = mu, learn_mu
-        self.dustbin = dustbin
-        self.tolerance = tolerance
-        self.max_iterations = max_iterations
+        self.mu, self.learn_mu, self.dustbin = mu, learn_mu, dustbin
+        self.tolerance, self.max_iterations = tolerance, max_iterations
         self.backward_stats = BackwardStats()
 
     def forward(
-        self,
-        cost: Float[Tensor, "b m n"],
-        mask2d: Bool[Tensor, "b m"] | None = None,
-        mask3d: Bool[Tensor, "b n"] | None = None,
+        self, cost: Tensor, mask2d: Tensor | None = None, mask3d: Tensor | None = None
     ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
         return sinkhorn(
-            cost,
-            mu=self.entropy,
-            mask2d=mask2d,
-            mask3d=mask3d,
-            dustbin=self.dustbin,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-            backward_stats=self.backward_stats,
-        )
+            cost, mu=self.entropy, mask2d=mask2d, mask3d=mask3d, dustbin=self.dustbin, tolerance=self.tolerance,
+            max_iterations=self.max_iterations, backward_stats=self.backward_stats,
+        )  # fmt: skip
 
     @property
     def entropy(self) -> float | Tensor:

@@ -1,8 +1,8 @@
-"""Passes over a transport plan, compiled for the CPU. Elsewhere `plan`, `laplacian` and `adjoint` do them in torch.
+"""Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU: `bpnp.layers.laplacian` in one pass.
 
-A row of the plan is used for both products of a conjugate gradient step while it is in the cache, so that a step reads
-the plan once where torch reads it twice; sums of float32 are added up in float64 in short parts. Samples are divided
-among torch's threads; each stops by itself. Loops take contiguous arrays and the range of samples to work on.
+A row of the plan is used for both products of a step while it is in the cache, so that a step reads the plan once where
+torch reads it twice; sums of float32 are added up in float64 in short parts. Samples are divided among torch's threads;
+each stops by itself.
 """
 
 from typing import Any
@@ -13,128 +13,34 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.compilation import compiler, in_threads
+from bpnp.layers.plan import SHORT_SUM, Plan
 
 # Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
-SHORT_ROW, SHORT_COLUMN = 2048, 256  # terms that are added up in the precision of the data
+SHORT_COLUMN = 256  # rows that are added up in the precision of the data
 
 
 def applies_to(tensor: Tensor) -> bool:
-    """Whether the compiled passes can read this tensor; torch's are used elsewhere."""
+    """Whether the compiled loop can read this tensor."""
     return tensor.is_cpu
 
 
-def moments(
-    plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
-) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b m"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
-    """P 1, the means w of the gradient V over the rows of P, P^T 1, and P^T (V - w 1^T), in one pass."""
-    b, m, n = plan.shape
-    rows, means, cols, centred = (plan.new_empty(b, k) for k in (m, m, n, n))
-    run(_moments, (plan, gradient), (rows, means, cols, centred))
-    return rows, means, cols, centred
-
-
-def square_product(kernel: Float[Tensor, "b m n"], weight: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
-    """sum_i weight_i K_ij^2."""
-    total = kernel.new_empty(len(kernel), kernel.shape[2])
-    run(_squares, (kernel, weight), (total,))
-    return total
-
-
-def projected(
-    plan: Float[Tensor, "b m n"],
-    gradient: Float[Tensor, "b m n"],
-    a: Float[Tensor, "b m"],
-    b: Float[Tensor, "b n"],
-    factor: Float[Tensor, " b"],
-) -> Float[Tensor, "b m n"]:
-    """factor P . (V - a 1^T - 1 b^T)."""
-    result = plan.new_empty(plan.shape)
-    run(_project, (plan, gradient, a, b, factor), (result,))
-    return result
-
-
 def conjugate_gradients(
-    kernel: Float[Tensor, "b m n"],
-    scalings: tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]],
-    sums: tuple[Float[Tensor, "b m"], Float[Tensor, "b n"]],
+    plan: Plan,
+    rows: Float[Tensor, "b m"],
+    cols: Float[Tensor, "b n"],
     degree: Float[Tensor, "b n"],
     rhs: Float[Tensor, "b n"],
     tolerance: Float[Tensor, " b"],
     limit: int,
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
-    """x with S x = rhs for P = diag(alpha) K diag(beta), P x / rows, and which samples met the tolerance.
-
-    S = diag(cols) - P^T diag(1 / rows) P; degree: its diagonal, the preconditioner. The residual is measured in the
-    norm with the weights 1 / cols, relative to the right-hand side.
-    """
-    x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(sums[0].shape)
+    """`bpnp.layers.laplacian.conjugate_gradients`, same arguments and results; the inputs may have any strides."""
+    inputs = plan.kernel, plan.alpha, plan.beta, rows, cols, degree, rhs, tolerance
+    x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(rows.shape)
     solved = torch.zeros(len(rhs), dtype=torch.bool)
-    limits = torch.full((len(rhs),), limit)
-    run(_solve, (kernel, *scalings, *sums, degree, rhs, tolerance, limits), (x, mean, solved))
+    arrays = [value.detach().contiguous().numpy() for value in (*inputs, x, mean, solved)]
+    in_threads(lambda first, last: _solve(first, last, limit, *arrays), len(rhs))
     return x, mean, solved
-
-
-def run(loop: Any, inputs: tuple[Tensor, ...], outputs: tuple[Tensor, ...]) -> None:
-    """Call loop(first, last, *inputs, *outputs) on shares of the samples, in as many threads as torch uses.
-
-    Inputs may have any strides; outputs are written in place and have to be contiguous.
-    """
-    if not all(x.is_contiguous() for x in outputs):
-        raise ValueError(f"expected contiguous outputs, got strides {[x.stride() for x in outputs]}")
-    arrays = [x.detach().contiguous().numpy() for x in (*inputs, *outputs)]
-    in_threads(lambda first, last: loop(first, last, *arrays), len(outputs[0]))
-
-
-@compiled
-def _moments(start: int, stop: int, plan: Any, gradient: Any, rows: Any, means: Any, cols: Any, centred: Any) -> None:
-    """plan, gradient (b, m, n) -> rows, means (b, m), cols, centred (b, n)."""
-    m, n = plan.shape[1:]
-    for s in range(start, stop):
-        mass, pull = cols[s], centred[s]
-        short_mass, short_pull = np.zeros_like(mass), np.zeros_like(pull)
-        long_mass, long_pull = np.zeros(n), np.zeros(n)
-        for i in range(m):
-            row, slope = plan[s, i], gradient[s, i]
-            total, weighted = mass.dtype.type(0), mass.dtype.type(0)
-            for j in range(n):
-                total += row[j]
-                weighted += row[j] * slope[j]
-            mean = weighted / total if total > 0 else mass.dtype.type(0)
-            rows[s, i], means[s, i] = total, mean
-            for j in range(n):
-                short_mass[j] += row[j]
-                short_pull[j] += row[j] * (slope[j] - mean)
-            if i % SHORT_COLUMN == SHORT_COLUMN - 1 or i == m - 1:
-                _flush(short_mass, long_mass)
-                _flush(short_pull, long_pull)
-        mass[:] = long_mass
-        pull[:] = long_pull
-
-
-@compiled
-def _squares(start: int, stop: int, kernel: Any, weight: Any, totals: Any) -> None:
-    """kernel (b, m, n), weight (b, m) -> totals (b, n)."""
-    m, n = kernel.shape[1:]
-    for s in range(start, stop):
-        total = totals[s]
-        total[:] = 0
-        for i in range(m):
-            row, value = kernel[s, i], weight[s, i]
-            for j in range(n):
-                total[j] += value * row[j] * row[j]
-
-
-@compiled
-def _project(start: int, stop: int, plan: Any, gradient: Any, a: Any, b: Any, factor: Any, result: Any) -> None:
-    """plan, gradient (b, m, n), a (b, m), b (b, n), factor (b,) -> result (b, m, n)."""
-    m, n = plan.shape[1:]
-    for s in range(start, stop):
-        column = b[s]
-        for i in range(m):
-            out, row, slope, mean = result[s, i], plan[s, i], gradient[s, i], a[s, i]
-            for j in range(n):
-                out[j] = factor[s] * row[j] * (slope[j] - mean - column[j])
 
 
 @compiled
@@ -153,9 +59,9 @@ def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, t
     for i in range(0, whole, 4):
         row0, row1, row2, row3 = kernel[i], kernel[i + 1], kernel[i + 2], kernel[i + 3]
         dot0 = dot1 = dot2 = dot3 = 0.0
-        for start in range(0, n, SHORT_ROW):
+        for start in range(0, n, SHORT_SUM):
             sum0 = sum1 = sum2 = sum3 = zero
-            for j in range(start, min(start + SHORT_ROW, n)):
+            for j in range(start, min(start + SHORT_SUM, n)):
                 sum0 += row0[j] * x[j]
                 sum1 += row1[j] * x[j]
                 sum2 += row2[j] * x[j]
@@ -195,11 +101,11 @@ def _flush(part: Any, total: Any) -> None:
 
 @compiled
 def _solve(
-    start: int, stop: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
-    tolerance: Any, limit: Any, x: Any, mean: Any, solved: Any,
+    start: int, stop: int, limit: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
+    tolerance: Any, x: Any, mean: Any, solved: Any,
 ) -> None:  # fmt: skip
-    """kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance, limit (b,)
-    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start."""
+    """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
+    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations."""
     for s in range(start, stop):
         inverse = np.where(degree[s] > 0, 1 / degree[s], 0).astype(rhs.dtype)
         unit = np.where(cols[s] > 0, 1 / cols[s], 0).astype(rhs.dtype)
@@ -208,7 +114,7 @@ def _solve(
         y, part, total = np.empty_like(rows[s]), np.empty_like(r), np.empty(len(r))
         rz, target = (r * p).sum(), (unit * r * r).sum() * tolerance[s] ** 2
         solved[s] = not rz > 0
-        for _ in range(limit[s]):
+        for _ in range(limit):
             if solved[s]:
                 break
             _products(kernel[s], beta[s] * p, before, alpha[s], y, part, total)

@@ -89,13 +89,7 @@ def at_optimum(
 
 class _AtOptimum(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        solution: Tensor,
-        optimality: Callable[..., Tensor],
-        solve_adjoint: Callable[[Tensor], Tensor],
-        *parameters: Tensor,
-    ) -> Tensor:
+    def forward(ctx: Any, solution: Tensor, optimality: Any, solve_adjoint: Any, *parameters: Tensor) -> Tensor:
         ctx.save_for_backward(solution, *parameters)
         ctx.optimality, ctx.solve_adjoint = optimality, solve_adjoint
         return solution.clone()
@@ -105,18 +99,15 @@ class _AtOptimum(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         solution, *parameters = ctx.saved_tensors
         adjoint = ctx.solve_adjoint(gradient)
-        needed = [i for i, wanted in enumerate(ctx.needs_input_grad[3:]) if wanted]
+        wanted = ctx.needs_input_grad[3:]
         with torch.enable_grad():
-            variables = [p.detach().requires_grad_(i in needed) for i, p in enumerate(parameters)]
+            variables = [p.detach().requires_grad_(w) for p, w in zip(parameters, wanted, strict=True)]
             residual = ctx.optimality(solution, *variables)
-            pulled = torch.autograd.grad(residual, [variables[i] for i in needed], -adjoint)
-        gradients: list[Tensor | None] = [None] * len(parameters)
-        for i, value in zip(needed, pulled, strict=True):
-            gradients[i] = value
-        return None, None, None, *gradients
+            pulled = iter(torch.autograd.grad(residual, [v for v in variables if v.requires_grad], -adjoint))
+        return None, None, None, *(next(pulled) if w else None for w in wanted)
 
 
-PlanAdjoint = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+PlanAdjoint = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def entropic_plan(
@@ -134,9 +125,14 @@ def entropic_plan(
     (up to one constant added to a and taken from b, chosen so that the mean of b, weighted by c, is zero).
     The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
 
-    solve_adjoint: maps P, V and a factor s () to s P.(V - a1^T - 1b^T), a and b.
+    solve_adjoint: maps P and V to a and b.
     """
     return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, solve_adjoint)
+
+
+def projected(plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor) -> Float[Tensor, "b m n"]:
+    """P.(V - a1^T - 1b^T)."""
+    return (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan)
 
 
 class _EntropicPlan(torch.autograd.Function):
@@ -152,6 +148,7 @@ class _EntropicPlan(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         plan, mu = ctx.saved_tensors
-        to_cost, a, b = ctx.solve_adjoint(plan, gradient, -1 / mu)
+        a, b = ctx.solve_adjoint(plan, gradient)
+        to_cost = projected(plan, gradient, a, b).div_(-mu)
         to_mu = torch.special.xlogy(to_cost, plan).sum() if ctx.needs_input_grad[2] else None
         return None, to_cost, to_mu, a, b, None

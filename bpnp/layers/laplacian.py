@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 import bpnp.layers.compiled as compiled
-from bpnp.layers.plan import Plan, divide
+from bpnp.layers.plan import Plan, divide, times, transpose_times
 
 ITERATIONS = 150  # of conjugate gradients; slower systems are factorised
 BETWEEN_TESTS = 8  # iterations in torch between two tests for the end: a test makes the host wait for a GPU
@@ -41,27 +41,19 @@ def solve_laplacian(
     mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side: in the preconditioner's own norm columns
     with weak links would outweigh all others.
     """
-    if compiled.applies_to(rhs):
-        x, mean, solved = compiled.conjugate_gradients(
-            plan.kernel, (plan.alpha, plan.beta), (rows, cols), degree, rhs, tolerance, ITERATIONS
-        )
-    else:
-        x, mean, solved = conjugate_gradients(plan, rows, cols, degree, rhs, tolerance)
+    solve = compiled.conjugate_gradients if compiled.applies_to(rhs) else conjugate_gradients
+    x, mean, solved = solve(plan, rows, cols, degree, rhs, tolerance, ITERATIONS)
     shift = _mean(x, cols)
     b, mean = torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0)
     if rhs.dtype != torch.float64 or bool(solved.all()):
         return Solution(b, mean, solved)
     hard = (~solved).nonzero().squeeze(-1)
-    part = Plan(plan.kernel[hard], plan.alpha[hard], plan.beta[hard])
-    exact, exact_solved = _factorised(part.formed(), rows[hard], cols[hard], rhs[hard])
-    exact_mean = divide(part.times(exact), rows[hard])
-    return Solution(
-        b.index_copy(0, hard, exact), mean.index_copy(0, hard, exact_mean), solved.index_copy(0, hard, exact_solved)
-    )
+    exact = _factorised(plan.samples(hard).formed(), rows[hard], cols[hard], rhs[hard])
+    return Solution(*(old.index_copy(0, hard, new) for old, new in zip((b, mean, solved), exact, strict=True)))
 
 
 def conjugate_gradients(
-    plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"]
+    plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
     """x with S x = rhs, P x / rows, and which samples met the tolerance; each keeps the x at which it did."""
     inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
@@ -71,7 +63,7 @@ def conjugate_gradients(
     target = torch.linalg.vecdot(unit * r, r) * tolerance**2
     active = rz > 0
     solved = ~active
-    for k in range(ITERATIONS):
+    for k in range(limit):
         if k % BETWEEN_TESTS == 0 and not bool(active.any()):
             break
         mean_p = per_row * plan.times(p)
@@ -88,31 +80,28 @@ def conjugate_gradients(
     return x, mean, solved
 
 
-def _factorised(
-    plan: Float[Tensor, "b m n"], rows: Float[Tensor, "b m"], cols: Float[Tensor, "b n"], rhs: Float[Tensor, "b n"]
-) -> tuple[Float[Tensor, "b n"], Bool[Tensor, " b"]]:
-    """b by a Cholesky factorisation of S and one refinement, in float64, and which samples are solved.
+def _factorised(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: Tensor) -> Solution:
+    """The solution by a Cholesky factorisation of S and one refinement, in float64.
 
     The diagonal is the sum of the other entries of its row: as a difference from `cols` it would be noise when P is
     almost a permutation.
     """
-    links = plan.mT @ (plan * divide(torch.ones_like(rows), rows).unsqueeze(-1))
-    links.diagonal(dim1=-2, dim2=-1).zero_()
-    degree = links.sum(-1)
+    per_row, unit = (divide(torch.ones_like(x), x) for x in (rows, cols))
+    system = plan.mT @ (plan * -per_row.unsqueeze(-1))
+    diagonal = system.diagonal(dim1=-2, dim2=-1)
+    diagonal.zero_()
     # Between groups of columns that hardly share a row, the right-hand side is rounding and S nearly singular. The
     # ridge, relative to the marginals, keeps the difference of their b small where it hardly matters.
-    diagonal = torch.where(cols > 0, RIDGE * cols + degree, 1)
-    factor, _ = torch.linalg.cholesky_ex(torch.diag_embed(diagonal) - links)
-
-    def residual(b: Tensor) -> Tensor:
-        return rhs - degree * b + (links @ b.unsqueeze(-1)).squeeze(-1)
-
-    b = torch.cholesky_solve(rhs.unsqueeze(-1), factor).squeeze(-1)
-    b = b + torch.cholesky_solve(residual(b).unsqueeze(-1), factor).squeeze(-1)
+    ridge = RIDGE * cols
+    diagonal.copy_(torch.where(cols > 0, ridge - system.sum(-1), 1))
+    factor, _ = torch.linalg.cholesky_ex(system)
+    b, left = torch.zeros_like(rhs), rhs
+    for _ in range(2):
+        b = b + torch.cholesky_solve(left.unsqueeze(-1), factor).squeeze(-1)
+        left = rhs - torch.where(cols > 0, transpose_times(system, b) - ridge * b, 0)
     b = torch.where(cols > 0, b - _mean(b, cols), 0)
-    unit = divide(torch.ones_like(cols), cols)
-    left, given = (torch.linalg.vecdot(unit * r, r) for r in (residual(b), rhs))
-    return b, left <= FACTORISED**2 * given
+    solved = torch.linalg.vecdot(unit * left, left) <= FACTORISED**2 * torch.linalg.vecdot(unit * rhs, rhs)
+    return Solution(b, per_row * times(plan, b), solved)
 
 
 def _mean(b: Float[Tensor, "b n"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b 1"]:

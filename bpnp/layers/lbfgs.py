@@ -7,19 +7,19 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bpnp.layers.objective import dense_objective
+from bpnp.layers.objective import Rotations, Translations, dense_objective
 
 
 def lbfgs(
     assignment: Float[Tensor, "b m n"],
     bearings: Float[Tensor, "b m 3"],
     points3d: Float[Tensor, "b n 3"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
+    rotation: Rotations,
+    translation: Translations,
     *,
     tolerance: float,
     max_iterations: int,
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Int[Tensor, " b"]]:
+) -> tuple[Rotations, Translations, Int[Tensor, " b"]]:
     """Pose near the start at which the gradient's norm per unit of weight is at most `tolerance`, and iterations.
 
     One sample at a time, so that no pose depends on its neighbours' line searches. The pose is an angle-axis vector

@@ -1,24 +1,24 @@
 """Newton's method with Levenberg's damping on the aggregated PnP objective, for all samples of a batch at once."""
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from bpnp.geometry import retract
-from bpnp.layers.objective import Derivatives, derivatives
+from bpnp.layers.objective import Columns, Derivatives, Rotations, Translations, derivatives
 
 EQUAL = 1e-13  # values of the objective (weights sum to one) that agree to this differ by rounding only
 
 
 def newton(
-    q: Float[Tensor, "b 3 n"],
-    points: Float[Tensor, "b 3 n"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
+    q: Columns,
+    points: Columns,
+    rotation: Rotations,
+    translation: Translations,
     *,
     tolerance: float,
     max_iterations: int,
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], Int[Tensor, " b"]]:
+) -> tuple[Rotations, Translations, Int[Tensor, " b"]]:
     """Pose near the start at which the gradient's norm is at most `tolerance`, and the iterations of each sample.
 
     q, points: weighted bearings and points of unit size, the weights of a sample summing to one. Each sample has its
@@ -42,18 +42,14 @@ def newton(
         flat = (trial.value - current.value).abs() <= EQUAL
         lower = (trial.value < current.value) | (flat & (trial.gradient.norm(dim=-1) < current.gradient.norm(dim=-1)))
         accept = usable & lower
-        rotation = torch.where(accept[:, None, None], new_rotation, rotation)
-        translation = torch.where(accept[:, None], new_translation, translation)
-        current = _choose(accept, trial, current)
+        rotation, translation = _where(accept, new_rotation, rotation), _where(accept, new_translation, translation)
+        current = Derivatives(*(_where(accept, *pair) for pair in zip(trial, current, strict=True)))
         raised = (10 * damping).clamp_min(1e-3)
         lowered = torch.where(damping > 1e-6, damping / 10, 0)
         damping = torch.where(active, torch.where(accept, lowered, raised), damping)
     return rotation, translation, iterations
 
 
-def _choose(accept: Tensor, trial: Derivatives, current: Derivatives) -> Derivatives:
-    return Derivatives(
-        torch.where(accept, trial.value, current.value),
-        torch.where(accept[:, None], trial.gradient, current.gradient),
-        torch.where(accept[:, None, None], trial.hessian, current.hessian),
-    )
+def _where(accept: Tensor, new: Tensor, old: Tensor) -> Tensor:
+    """`new` for the samples that accept it."""
+    return torch.where(accept.view(-1, *(1 for _ in old.shape[1:])), new, old)

@@ -6,8 +6,7 @@ cost of an evaluation is O(n), not O(m n). A step (w, s) acts on the left: y = e
 The q_j and p_j are the columns of (b, 3, n) tensors: torch adds up three rows of n numbers faster than n rows of three.
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,6 +15,8 @@ from torch import Tensor
 from bpnp.geometry import hat, transform
 from bpnp.layers.implicit import first_derivative
 
+Columns = Float[Tensor, "b 3 n"]
+Rotations, Translations = Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]
 NEAR = 1e-12  # scene radii; smaller distances are set to this: a point at the camera centre has no direction
 
 
@@ -23,17 +24,15 @@ def dense_objective(
     assignment: Float[Tensor, "b m n"],
     bearings: Float[Tensor, "b m 3"],
     points3d: Float[Tensor, "b n 3"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
+    rotation: Rotations,
+    translation: Translations,
 ) -> Float[Tensor, " b"]:
     """Eq. 7 as it is written, over all m n pairs."""
     directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1, eps=NEAR)
     return (assignment * (1 - bearings @ directions.mT)).sum((-2, -1))
 
 
-def aggregate(
-    assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]
-) -> Float[Tensor, "b 3 n"]:  # fmt: skip
+def aggregate(assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]) -> Columns:
     """q_j = sum_i P_ij f_i: the mean bearing of each 3D point, its length the point's weight."""
     return _Aggregate.apply(assignment, bearings.to(assignment.dtype))
 
@@ -51,14 +50,10 @@ class _Aggregate(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
         assignment, bearings = ctx.saved_tensors
         to_assignment, to_bearings = ctx.needs_input_grad
-        return (
-            bearings @ gradient if to_assignment else None,
-            assignment @ gradient.mT if to_bearings else None,
-        )
+        return bearings @ gradient if to_assignment else None, assignment @ gradient.mT if to_bearings else None
 
 
-@dataclass(frozen=True)
-class Derivatives:
+class Derivatives(NamedTuple):
     """Value, gradient and Hessian of -sum_j q_j . g(R p_j + t) in the step (w, s) at zero."""
 
     value: Float[Tensor, " b"]
@@ -67,23 +62,15 @@ class Derivatives:
 
 
 def pose_gradient(
-    q: Float[Tensor, "b 3 n"],
-    points: Float[Tensor, "b 3 n"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
-) -> Float[Tensor, "b 6"]:
+    q: Columns, points: Columns, rotation: Rotations, translation: Translations
+) -> Float[Tensor, "b 6"]:  # fmt: skip
     """Gradient in the step (w, s), differentiable in all arguments: the optimality condition of the layer."""
     rotated = rotation @ points
     _, _, h = _point_gradient(q, rotated + translation.unsqueeze(-1))
     return _gradient(rotated @ h.mT, h)
 
 
-def derivatives(
-    q: Float[Tensor, "b 3 n"],
-    points: Float[Tensor, "b 3 n"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
-) -> Derivatives:
+def derivatives(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Derivatives:
     """Value, gradient and Hessian together.
 
     With x = R p, y = x + t, d = |y|, u = y/d, the derivative of a term in y is h = ((q.u) u - q)/d, and its second

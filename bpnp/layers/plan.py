@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-import bpnp.layers.compiled as compiled
-
+SHORT_SUM = 2048  # terms of a sum that are added up in float32
 LOST = 100.0  # a difference of so many units of rounding has no digits
 
 
@@ -53,7 +52,7 @@ class Plan:
         formed for the sum of the positive terms P (1 - P / rows).
         """
         weight = divide(torch.ones_like(rows), rows)
-        degree = cols - self.beta**2 * _square_product(self.kernel, self.alpha**2 * weight)
+        degree = cols - self.beta**2 * transpose_times(self.kernel.square(), self.alpha**2 * weight)
         weak = (degree < LOST * torch.finfo(cols.dtype).eps * cols).any(-1)
         if bool(weak.any()):
             plan = self.formed()
@@ -80,19 +79,12 @@ def divide(numerator: Tensor, denominator: Tensor) -> Tensor:
     return torch.where(denominator > 0, numerator / denominator, 0)
 
 
-def _square_product(kernel: Float[Tensor, "b m n"], weight: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
-    """sum_i weight_i K_ij^2."""
-    if compiled.applies_to(kernel):
-        return compiled.square_product(kernel, weight)
-    return transpose_times(kernel.square(), weight)
-
-
 def _is_long(matrix: Tensor) -> bool:
-    return matrix.dtype == torch.float32 and max(matrix.shape[-2:]) > 2 * compiled.SHORT_ROW
+    return matrix.dtype == torch.float32 and max(matrix.shape[-2:]) > 2 * SHORT_SUM
 
 
 def _long_product(matrix: Float[Tensor, "b m n"], a: Float[Tensor, "b m"]) -> Float[Tensor, "b n"]:
     """M^T a, its short sums added up in float64: one float32 sum of 15,000 terms is wrong by 1e-6."""
-    parts = zip(matrix.split(compiled.SHORT_ROW, -2), a.split(compiled.SHORT_ROW, -1), strict=True)
+    parts = zip(matrix.split(SHORT_SUM, -2), a.split(SHORT_SUM, -1), strict=True)
     total = torch.stack([(vector.unsqueeze(-2) @ rows).squeeze(-2) for rows, vector in parts])
     return total.sum(0, dtype=torch.float64).to(matrix.dtype)

@@ -4,11 +4,11 @@ The solver is Newton's method on the aggregated objective, or the paper's L-BFGS
 optimum; its gradient (`bpnp.layers.implicit`) does not depend on the solver.
 """
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import roma
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.checks import checked_shapes
@@ -16,7 +16,7 @@ from bpnp.geometry import hat, is_finite
 from bpnp.layers.implicit import at_optimum
 from bpnp.layers.lbfgs import lbfgs
 from bpnp.layers.newton import newton
-from bpnp.layers.objective import aggregate, derivatives, pose_gradient
+from bpnp.layers.objective import Columns, Derivatives, Rotations, Translations, aggregate, derivatives, pose_gradient
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
@@ -67,95 +67,72 @@ def weighted_pnp(
     """
     if method not in ("newton", "lbfgs"):
         raise ValueError(f"expected `method` 'newton' or 'lbfgs', got {method!r}")
-    return _optimum(assignment, bearings, points3d, rotation, translation, method, tolerance, max_iterations)
-
-
-def _optimum(
-    assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor, method: Method,
-    tolerance: float, max_iterations: int,
-) -> tuple[Tensor, Tensor, SolveStats]:  # fmt: skip
-    """The optimum in float64, linked to the arguments that it depends on."""
-    q = _unit_weight(aggregate(assignment, bearings).double())
-    points, frame = _normalise(points3d.double().mT.contiguous(), q.detach())
+    q = aggregate(assignment, bearings).double()
+    # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
+    q = q / _lengths(q.detach()).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
+    points, centre, scale = _normalised(points3d.double().mT.contiguous(), _lengths(q.detach()))
     with torch.no_grad():
         found = is_finite(rotation, translation)
-        start = _start(rotation.double(), translation.double(), found, frame)
+        # The rotation nearest to a rounded one; any pose for samples that have none.
+        r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
+        r = roma.special_procrustes(r)
+        t = (torch.where(found[:, None], translation.double(), 1) + _turned(r, centre)) / scale
         if method == "newton":
-            r, t, iterations = newton(q, points, *start, tolerance=tolerance, max_iterations=max_iterations)
+            r, t, iterations = newton(q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
         else:
             tolerance = max(tolerance, LINE_SEARCH_TOLERANCE)
             dense = assignment.double(), bearings.double(), points.mT
-            r, t, iterations = lbfgs(*dense, *start, tolerance=tolerance, max_iterations=max_iterations)
-        stats, factor = _judge(q, points, r, t, found, iterations, tolerance)
+            r, t, iterations = lbfgs(*dense, r, t, tolerance=tolerance, max_iterations=max_iterations)
+        residual, well_posed, factor = _judge(derivatives(q, points, r, t))
+        converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
 
     def solve_adjoint(gradient: Tensor) -> Tensor:
         adjoint = torch.cholesky_solve(gradient.unsqueeze(-1), factor).squeeze(-1)
-        return torch.where(stats.converged[:, None], adjoint, 0)
+        return torch.where(converged[:, None], adjoint, 0)
 
     zero = torch.zeros_like(factor[:, 0])
     step = at_optimum(zero, lambda _, q, p: pose_gradient(q, p, r, t), solve_adjoint, q, points)
     # The step is zero: exp([w]x) R = R + [w]x R is exact, in the derivative too.
     moved_r = r + hat(step[:, :3]) @ r
-    moved_t = frame.leave(moved_r, t + step[:, 3:])
-    moved_r = torch.where(found[:, None, None], moved_r, torch.nan)
-    moved_t = torch.where(found[:, None], moved_t, torch.nan)
-    return moved_r.to(assignment.dtype), moved_t.to(assignment.dtype), stats
+    moved_t = (t + step[:, 3:]) * scale - _turned(moved_r, centre)
+    moved_r = torch.where(found[:, None, None], moved_r, torch.nan).to(assignment.dtype)
+    moved_t = torch.where(found[:, None], moved_t, torch.nan).to(assignment.dtype)
+    return moved_r, moved_t, SolveStats(iterations, torch.where(found, residual, torch.inf), converged)
 
 
-class _Frame(NamedTuple):
-    """Scene coordinates p = scale * p' + centre in which the points have unit size; keeps the Hessian well scaled."""
-
-    centre: Float[Tensor, "b 3"]
-    scale: Float[Tensor, "b 1"]
-
-    def enter(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        return (translation + (rotation @ self.centre.unsqueeze(-1)).squeeze(-1)) / self.scale
-
-    def leave(self, rotation: Tensor, translation: Tensor) -> Tensor:
-        return translation * self.scale - (rotation @ self.centre.unsqueeze(-1)).squeeze(-1)
-
-
-def _lengths(columns: Float[Tensor, "b 3 n"]) -> Float[Tensor, "b 1 n"]:
+def _lengths(columns: Columns) -> Float[Tensor, "b 1 n"]:
     return columns.square().sum(-2, keepdim=True).sqrt()
 
 
-def _unit_weight(q: Float[Tensor, "b 3 n"]) -> Float[Tensor, "b 3 n"]:
-    """q_j times a constant, so that their lengths sum to one: the optimum is the same, for the objective is linear."""
-    total = _lengths(q.detach()).sum(-1, keepdim=True)
-    return q / total.clamp_min(torch.finfo(q.dtype).tiny)
+def _turned(rotation: Rotations, vector: Translations) -> Translations:
+    return (rotation @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def _normalise(points: Float[Tensor, "b 3 n"], q: Float[Tensor, "b 3 n"]) -> tuple[Float[Tensor, "b 3 n"], _Frame]:
-    """Points with weighted mean zero and weighted mean square one, and the frame that they are in."""
-    weight, fixed = _lengths(q), points.detach()
+def _normalised(
+    points: Columns, weight: Float[Tensor, "b 1 n"]
+) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:  # fmt: skip
+    """Points p' with weighted mean zero and mean square one, centre and scale in p = scale p' + centre.
+
+    The Hessian is well scaled in these coordinates.
+    """
+    fixed = points.detach()
     centre = (weight * fixed).sum(-1)
     scale = (weight * (fixed - centre.unsqueeze(-1)).square()).sum((-2, -1)).sqrt().unsqueeze(-1)
     scale = torch.where(scale > 0, scale, 1)
-    return (points - centre.unsqueeze(-1)) / scale.unsqueeze(-1), _Frame(centre, scale)
+    return (points - centre.unsqueeze(-1)) / scale.unsqueeze(-1), centre, scale
 
 
-def _start(rotation: Tensor, translation: Tensor, found: Bool[Tensor, " b"], frame: _Frame) -> tuple[Tensor, Tensor]:
-    """The start in the frame; any pose for samples that have none. The nearest rotation to a rounded one."""
-    eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-    r = roma.special_procrustes(torch.where(found[:, None, None], rotation, eye))
-    return r, frame.enter(r, torch.where(found[:, None], translation, 1))
-
-
-def _judge(
-    q: Tensor, points: Tensor, r: Tensor, t: Tensor, found: Tensor, iterations: Int[Tensor, " b"], tolerance: float
-) -> tuple[SolveStats, Float[Tensor, "b 6 6"]]:
-    """Whether each sample is a well-posed minimum, and the Cholesky factor of its Hessian (the identity if not)."""
-    end = derivatives(q, points, r, t)
-    residual = end.gradient.norm(dim=-1)
-    eye = torch.eye(6, dtype=q.dtype, device=q.device)
+def _judge(end: Derivatives) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"], Float[Tensor, "b 6 6"]]:
+    """Norm of the gradient, which samples are well-posed minima, and the Cholesky factor of their Hessians (the
+    identity for the others)."""
+    eye = torch.eye(6).to(end.hessian)
     trace = end.hessian.diagonal(dim1=-2, dim2=-1).sum(-1)
     # A Cholesky factor of H - c I exists if and only if every eigenvalue of H exceeds c.
     margin = (WELL_POSED * trace)[:, None, None] * eye
     _, info = torch.linalg.cholesky_ex(torch.nan_to_num(end.hessian) - margin)
-    definite = (info == 0) & (trace > 0) & end.hessian.isfinite().all((-2, -1))
-    converged = found & (residual <= tolerance) & definite & (t.norm(dim=-1) < FARTHEST)
-    factor, _ = torch.linalg.cholesky_ex(torch.where(converged[:, None, None], end.hessian, eye))
-    return SolveStats(iterations, torch.where(found, residual, torch.inf), converged), factor
+    well_posed = (info == 0) & (trace > 0) & end.hessian.isfinite().all((-2, -1))
+    factor, _ = torch.linalg.cholesky_ex(torch.where(well_posed[:, None, None], end.hessian, eye))
+    return end.gradient.norm(dim=-1), well_posed, factor
 
 
 class WeightedPnP(nn.Module):
@@ -176,25 +153,12 @@ class WeightedPnP(nn.Module):
 
     def __init__(self, *, method: Method = "newton", tolerance: float = 1e-9, max_iterations: int = 50) -> None:
         super().__init__()
-        self.method = method
-        self.tolerance = tolerance
-        self.max_iterations = max_iterations
+        self.method, self.tolerance, self.max_iterations = method, tolerance, max_iterations
 
     def forward(
-        self,
-        assignment: Float[Tensor, "b m n"],
-        bearings: Float[Tensor, "b m 3"],
-        points3d: Float[Tensor, "b n 3"],
-        rotation: Float[Tensor, "b 3 3"],
-        translation: Float[Tensor, "b 3"],
+        self, assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
         return weighted_pnp(
-            assignment,
-            bearings,
-            points3d,
-            rotation,
-            translation,
-            method=self.method,
-            tolerance=self.tolerance,
-            max_iterations=self.max_iterations,
-        )
+            assignment, bearings, points3d, rotation, translation,
+            method=self.method, tolerance=self.tolerance, max_iterations=self.max_iterations,
+        )  # fmt: skip

@@ -131,13 +131,9 @@ class RansacPnP(nn.Module):
         self.max_iterations, self.seed = max_iterations, seed
 
     def forward(
-        self,
-        assignment: Float[Tensor, "b m n"],
-        points2d: Float[Tensor, "b m 2"],
-        points3d: Float[Tensor, "b n 3"],
-        mask2d: Bool[Tensor, "b m"] | None = None,
-        mask3d: Bool[Tensor, "b n"] | None = None,
-    ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
+        self, assignment: Tensor, points2d: Tensor, points3d: Tensor, mask2d: Tensor | None = None,
+        mask3d: Tensor | None = None,
+    ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:  # fmt: skip
         return ransac_pnp(
             assignment, points2d, points3d, mask2d=mask2d, mask3d=mask3d, backend=self.backend, seed=self.seed,
             pairs_factor=self.pairs_factor, threshold=self.threshold, max_iterations=self.max_iterations,
