@@ -16,7 +16,8 @@ from bpnp.geometry import hat, transform
 from bpnp.layers.implicit import first_derivative
 
 Columns = Float[Tensor, "b 3 n"]
-Rotations, Translations = Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]
+Rotations = Float[Tensor, "b 3 3"]
+Translations = Float[Tensor, "b 3"]
 NEAR = 1e-12  # scene radii; smaller distances are set to this: a point at the camera centre has no direction
 
 
