@@ -126,7 +126,7 @@ class Evidence:
     lead: float = 2.0
     other_deg: float = 5.0
     other_shift: float = 0.1
-    loose_deg: float = 1.0
+    loose_deg: float = 0.8
     hits: int = 4
     matched: float = 0.2
     over_chance: float = 6.0

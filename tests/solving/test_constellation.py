@@ -123,8 +123,10 @@ def test_a_predicted_pose_is_taken_without_a_search_if_it_fits_and_left_if_not()
     assert solution.verdict == "confident"
     assert degrees(solution.rotation, rotation) < 0.5
     far = Rotation.from_rotvec([0.0, 1.5, 0.0]).as_matrix() @ rotation
-    wrong = solve(image, points, CAMERA, normals3d=normals, prior=PosePrior(far, translation, 2.0, 0.02))
-    assert wrong.verdict != "confident"
+    lost = solve(image, points, CAMERA, normals3d=normals, prior=PosePrior(far, translation, 2.0, 0.02))
+    assert degrees(lost.rotation, rotation) < 0.5
+    rough = solve(image, points, CAMERA, normals3d=normals, prior=PosePrior(far, translation, 10.0, 0.1))
+    assert degrees(rough.rotation, rotation) < 0.5
 
 
 @pytest.mark.parametrize(

@@ -40,6 +40,13 @@ def pairs_that_fix(prior: Prior | None) -> int:
     return 2 if turned or isinstance(prior, GravityPrior) else 3
 
 
+def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
+    """Rotation and translation, if the prior tells both."""
+    if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
+        return None
+    return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
+
+
 def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) -> Knowledge:
     """The prior, around the centre of the scene and in its unit, and in the frame of the image's rays."""
     directions, place, turned = np.empty((0, 8)), np.array([0, 0, 0, math.inf]), np.zeros(11)
@@ -59,8 +66,8 @@ def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) ->
     rotation = image.turn @ known
     directions = _rows(np.eye(3), rotation.T, math.sqrt(2) * sigma)
     turned = np.concatenate([rotation.ravel(), [min(SIGMAS * sigma, 1.0), float((1 / image.rays[:, 3]).mean()) / 3]])
-    if prior.translation is not None and math.isfinite(prior.translation_sigma):
-        middle = image.turn @ (known @ scene.centre + np.asarray(prior.translation, np.float64))
+    if (predicted := predicted_pose(prior)) is not None:
+        middle = image.turn @ (known @ scene.centre + predicted[1])
         place = np.append(middle, (SIGMAS * prior.translation_sigma) ** 2) / [*[scene.size] * 3, scene.size**2]
     allowed = min(SIGMAS * sigma, math.pi)
     log_share = math.log((allowed - math.sin(allowed)) / math.pi)

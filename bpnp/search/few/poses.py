@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays, scene_arrays
-from bpnp.search.few.knowledge import knowledge_of
+from bpnp.search.few.knowledge import knowledge_of, predicted_pose
 from bpnp.search.few.state import Enumeration, Stage
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import PosePrior, Prior
@@ -111,18 +111,18 @@ def enumerate_poses(
     image = ImageArrays(sets.bearings, radius, sets.labels2d, lookup)
     run = Enumeration(scene, image, knowledge_of(prior, scene, image), settings.kept, lookup)
 
-    def enough() -> FewPoses | None:
+    def enough(safe: float = settings.safe) -> FewPoses | None:
         if run.best < run.tests:
             return None
         run.vary_best()
         found = _found(run, exhausted=False)
-        needed = settings.safe * (1 - run.solved / settings.patience)
+        needed = safe * (1 - run.solved / settings.patience)
         doubtful = margin(found, settings) < needed or not (is_safe is None or is_safe(found))
         return None if doubtful and run.solved < 2 * settings.patience else found
 
-    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
-        run.refine(run.enter(np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)), lookup)
-        if (found := enough()) is not None:
+    if (predicted := predicted_pose(prior)) is not None:
+        run.refine(run.enter(*predicted), lookup)
+        if (found := enough(0.0)) is not None:
             return found
     complete = False
     for stage in settings.stages:
@@ -145,9 +145,9 @@ def enumerate_poses(
 
 def _lookup(prior: Prior | None, scene: SceneArrays, radius: float | Array, settings: FewSettings) -> float:
     """Radii within which points are looked up: as far as a predicted pose may be off, `settings.widest` at most."""
-    needed = max(stage.reach for stage in settings.stages)
-    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
-        middle = np.asarray(prior.rotation) @ scene.centre + np.asarray(prior.translation)
+    needed = max([1.0, *(stage.reach for stage in settings.stages)])
+    if (predicted := predicted_pose(prior)) is not None and isinstance(prior, PosePrior):
+        middle = predicted[0] @ scene.centre + predicted[1]
         distance = max(float(np.linalg.norm(middle)), 1e-12)
         turn = math.radians(prior.rotation_sigma_deg) * min(scene.size / distance, 1.0)
         off = 2 * math.hypot(turn, prior.translation_sigma / distance)

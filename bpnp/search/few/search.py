@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bpnp.search.annealing import Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.knowledge import pairs_that_fix
-from bpnp.search.few.poses import FewPoses, enumerate_poses
+from bpnp.search.few.knowledge import pairs_that_fix, predicted_pose
+from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
 from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -31,15 +31,27 @@ def is_few(sets: PointSets) -> bool:
 
 
 def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
-    """Candidates in the user's coordinates, likeliest first, and whether every hypothesis was tried."""
+    """Candidates in the user's coordinates, likeliest first, and whether every hypothesis was tried.
+
+    Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
+    goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
+    """
 
     def is_safe(found: FewPoses) -> bool:
         candidates = weighed(_candidates(found, sets, settings), sets, settings.evidence)
         return is_certain(candidates, sets, settings.evidence, exhaustive=True)
 
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
-    found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe)
-    return _candidates(found, sets, settings), found.exhausted
+    tracked = predicted_pose(sets.prior) is not None
+    near = tracked and pairs_that_fix(sets.prior) == 2
+    chosen = SETTINGS._replace(stages=()) if near else SETTINGS
+    found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
+    candidates = _candidates(found, sets, settings)
+    if not tracked or is_safe(found) or not (near or margin(found) < 0):
+        return candidates, found.exhausted
+    free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
+    candidates = Candidates.concatenated([candidates, _candidates(free, sets, settings)])
+    return candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]], free.exhausted
 
 
 def judged_few(sets: PointSets, few: Candidates, settings: SearchSettings) -> SearchResult:
@@ -47,7 +59,11 @@ def judged_few(sets: PointSets, few: Candidates, settings: SearchSettings) -> Se
     result = judged(few, sets, batches=0, exhaustive=True, rule=settings.evidence)
     if result.verdict != "confident":
         return result
-    sigma = math.degrees(rotation_sigma(sets, *result.best, result.residual))
+    # The scale itself is uncertain: of so few residuals it may be half of what it should be.
+    count = float(result.candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
+    measured = max(2 * count - 2 * pairs_that_fix(sets.prior), 1.0)
+    scale = result.residual * (1 + 1 / math.sqrt(measured))
+    sigma = math.degrees(rotation_sigma(sets, *result.best, scale))
     if sigma <= settings.evidence.loose_deg:
         return result
     reason = f"the pose fits, but so few and near matches leave its rotation loose: {sigma:.1f} deg, one sigma"
