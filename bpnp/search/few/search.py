@@ -37,9 +37,13 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
     """
 
+    certain = False
+
     def is_safe(found: FewPoses) -> bool:
+        nonlocal certain
         candidates = weighed(_candidates(found, sets, settings), sets, settings.evidence)
-        return is_certain(candidates, sets, settings.evidence, exhaustive=True)
+        certain = is_certain(candidates, sets, settings.evidence, exhaustive=True)
+        return certain
 
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
     tracked = predicted_pose(sets.prior) is not None
@@ -47,7 +51,7 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
     chosen = SETTINGS._replace(stages=()) if near else SETTINGS
     found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
     candidates = _candidates(found, sets, settings)
-    if not tracked or is_safe(found) or not (near or margin(found) < 0):
+    if certain or not tracked or not (near or margin(found) < 0):
         return candidates, found.exhausted
     free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
     candidates = Candidates.concatenated([candidates, _candidates(free, sets, settings)])
