@@ -1,4 +1,4 @@
-"""Track a controller with 17 LEDs through 60 seconds at 60 pictures a second, lose it behind an occluder, find it again.
+"""Track a controller with 17 LEDs for a minute, 60 pictures a second; lose it behind an occluder and find it again.
 
     python examples/constellation.py [--seconds 60] [--seed 0] [--out constellation.png]
 
