@@ -72,6 +72,6 @@ def test_triples_are_those_of_a_loop() -> None:
 
 
 def test_options_out_of_range_are_named() -> None:
-    for options in ({"neighbours2d": 1}, {"neighbours3d": 0}, {"min_matches": 3}, {"radius": 0.0}, {"shortlist": 0}):
+    for options in ({"neighbours2d": 1}, {"neighbours3d": 0}, {"min_matches": 3}, {"radius": 0.0}):
         with pytest.raises(ValueError, match="expected .* got"):
             Constellation(**options)

@@ -17,6 +17,7 @@ from bpnp.robust.scoring import Pairs
 from bpnp.types import Pose
 
 CHUNK = 2**14  # triples solved at a time
+SHORTLIST = 64  # poses that are matched one to one and refined
 REFINE_STEPS = 10  # Gauss-Newton steps on the one-to-one matches of a pose
 
 
@@ -33,7 +34,6 @@ class Constellation(PairSolver):
         radius: largest distance of a match in the normalised image (0.003 is 2.4 px at a focal length of 800).
         neighbours2d: nearest image points from which the triples of an image point are made.
         neighbours3d: nearest scene points from which the triples of a scene point are made.
-        shortlist: poses that are matched one to one and refined.
         min_matches: fewest matches of a pose that counts as found; three are explained by the triple itself.
         time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
     """
@@ -46,16 +46,15 @@ class Constellation(PairSolver):
         radius: float = 0.003,
         neighbours2d: int = 5,
         neighbours3d: int = 6,
-        shortlist: int = 64,
         min_matches: int = 6,
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
-        check_positive(radius=radius, shortlist=shortlist)
+        check_positive(radius=radius)
         if min(neighbours2d, neighbours3d) < 2 or min_matches < MIN_POINTS:
             got = f"{neighbours2d}, {neighbours3d} and {min_matches}"
             raise ValueError(f"expected 2 or more neighbours and `min_matches` of {MIN_POINTS} or more, got {got}")
-        self.radius, self.shortlist, self.min_matches = radius, shortlist, min_matches
+        self.radius, self.min_matches = radius, min_matches
         self.neighbours2d, self.neighbours3d = neighbours2d, neighbours3d
 
     def solve(self, pair: SinglePair, deadline: float) -> Pose:
@@ -68,13 +67,13 @@ class Constellation(PairSolver):
             solution = p3p(bearings(pair.points2d)[triples2d[part[:, 0]]], pair.points3d[triples3d[part[:, 1]]])
             rotation, translation = solution.rotation[solution.valid], solution.translation[solution.valid]
             count = agreement(pair.points2d, pair.points3d, rotation, translation, threshold=self.radius).pairs
-            best = count.topk(min(self.shortlist, len(count))).indices
+            best = count.topk(min(SHORTLIST, len(count))).indices
             poses.append(torch.cat([rotation, translation.unsqueeze(-1)], -1)[best])
             counts.append(count[best])
             tried += len(part)
         if tried == 0 or len(candidates := torch.cat(poses)) == 0:
             return no_pose(pair.points3d, tried)
-        shortlist = torch.cat(counts).topk(min(self.shortlist, len(candidates))).indices
+        shortlist = torch.cat(counts).topk(min(SHORTLIST, len(candidates))).indices
         results = [self._refined(pair, pose) for pose in candidates[shortlist]]
         pose, matches, squared = max(results, key=lambda result: (result[1], -result[2]))
         if matches < MIN_POINTS:

@@ -10,21 +10,21 @@ from bpnp.geometry import random_rotations, retract
 from bpnp.models.baselines.single_pairs import SinglePair, pair_seed
 
 
-def mean_pose(pair: SinglePair, euler_deg: tuple[float, ...], translation: tuple[float, ...]) -> tuple[Tensor, Tensor]:
-    """R = Rz Ry Rx of the mean Euler angles (x, y, z), and the mean translation: the paper's for ModelNet40."""
-    rotation = roma.euler_to_rotmat("xyz", torch.tensor(euler_deg, dtype=torch.float64), degrees=True)
-    return rotation.unsqueeze(0).to(pair.points3d), pair.points3d.new_tensor([translation])
+def mean_pose(pair: SinglePair) -> tuple[Tensor, Tensor]:
+    """R = Rz Ry Rx of 22.5 degrees each, t = (0, 0, 4.5): the mean of the paper's cameras for ModelNet40."""
+    rotation = roma.euler_to_rotmat("xyz", torch.full((3,), 22.5, dtype=torch.float64), degrees=True)
+    return rotation.unsqueeze(0).to(pair.points3d), pair.points3d.new_tensor([[0.0, 0.0, 4.5]])
 
 
-def near_truth(pair: SinglePair, degrees: float, distance: float, seed: int) -> tuple[Tensor, Tensor]:
-    """The true pose turned by U[-degrees, degrees] about a random axis and moved by U[-distance, distance] in a random
-    direction: the paper's for MegaDepth. Raises ValueError where the true pose is not known."""
+def near_truth(pair: SinglePair, seed: int) -> tuple[Tensor, Tensor]:
+    """The true pose turned by up to 10 degrees about a random axis and moved by up to 0.5 in a random direction,
+    uniformly: the paper's start for MegaDepth. Raises ValueError where the true pose is not known."""
     if pair.rotation is None or pair.translation is None:
         raise ValueError("expected a batch with its true poses to start near them, got none; try start 'random'")
     generator = torch.Generator().manual_seed(pair_seed(seed, pair.index))
     directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
     amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
-    step = (amounts * torch.tensor([math.radians(degrees), distance])).unsqueeze(-1) * directions
+    step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
     rotation, translation = retract(step.flatten().to(pair.points3d), pair.rotation, pair.translation)
     return rotation.unsqueeze(0), translation.unsqueeze(0)
 

@@ -24,6 +24,9 @@ from bpnp.models.baselines.initial_poses import weak_perspective_distance
 from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
 from bpnp.types import Pose
 
+DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
+SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
+
 
 class MostInliers(NamedTuple):
     """A pose, camera = R (p - c), and the number of its inliers; no pose of the domain has more than `bound`."""
@@ -41,8 +44,6 @@ def maximise_inliers(
     domain: Boxes,
     *,
     angle: float,
-    smallest_turn: float = 1e-3,
-    smallest_place: float = 1e-3,
     max_boxes: int | None = None,
     deadline: float = math.inf,
 ) -> MostInliers:
@@ -51,7 +52,7 @@ def maximise_inliers(
     Outer search over the camera centre c in the one box of the domain, most promising box first; for each box two inner
     searches over R: at its centre, for a better pose, and with every angle widened by the box's uncertainty psi_t(p_j),
     for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
-    `smallest_place` are not split: where one might hold more than the best pose, the bound stays above the count.
+    SMALLEST are not split: where one might hold more than the best pose, the bound stays above the count.
     """
     rotation, place, count, done = None, domain.place[0], 0, 1
     order = itertools.count()
@@ -67,24 +68,19 @@ def maximise_inliers(
             child = children.pick(torch.tensor([k], device=points.device))
             directions = torch.nn.functional.normalize(points - child.place[0], dim=-1)
             reach = torch.full_like(points[:, 0], angle)
-            searching = {"domain": _turns(domain), "smallest": smallest_turn, "deadline": deadline}
-            here = best_rotation(rays, directions, reach, floor=count, **searching)  # type: ignore[arg-type]
+            here = best_rotation(rays, directions, reach, domain, floor=count, deadline=deadline)
             if here.rotation is not None:
                 rotation, place, count = _refined(rays, points, here.rotation, child.place[0], angle)
             wide = (reach + uncertainty[k]).clamp_max(math.pi)
-            there = best_rotation(rays, directions, wide, floor=count, first=True, **searching)  # type: ignore[arg-type]
+            there = best_rotation(rays, directions, wide, domain, floor=count, first=True, deadline=deadline)
             done += 1 + here.boxes + there.boxes
             if there.bound > count:
-                if float(child.place_half.max()) < smallest_place:
+                if float(child.place_half.max()) < SMALLEST:
                     unresolved = max(unresolved, there.bound)
                 else:
                     heapq.heappush(queue, (-there.bound, next(order), child))
     left = -queue[0][0] if queue else 0
     return MostInliers(rotation, place, count, max(count, left, unresolved), done)
-
-
-def _turns(domain: Boxes) -> Boxes:
-    return Boxes(domain.turn, domain.turn_half, domain.place[:1], domain.place_half[:1])
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
@@ -112,9 +108,6 @@ class GOPAC(PairSolver):
 
     Args:
         angle: largest angle between an inlier's ray and its scene point, radians.
-        domain: half side of the cube of camera centres, in weak-perspective distances.
-        smallest_turn: half side of the smallest rotation boxes, radians.
-        smallest_place: half side of the smallest boxes of camera centres, in root mean square radii of the scene.
         max_boxes: most boxes, inner ones included; null for as many as the time allows.
         time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
     """
@@ -125,22 +118,19 @@ class GOPAC(PairSolver):
         self,
         *,
         angle: float = 0.005,
-        domain: float = 1.5,
-        smallest_turn: float = 1e-3,
-        smallest_place: float = 1e-3,
         max_boxes: int | None = None,
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
-        check_positive(angle=angle, domain=domain)
-        self.angle, self.domain, self.max_boxes = angle, domain, max_boxes
-        self.smallest = {"smallest_turn": smallest_turn, "smallest_place": smallest_place}
+        check_positive(angle=angle)
+        self.angle, self.max_boxes = angle, max_boxes
 
     def solve(self, pair: SinglePair, deadline: float) -> Pose:
         points, centre, radius = unit_scene(pair.points3d)
-        domain = whole_domain(points, self.domain * weak_perspective_distance(pair.points2d, points))
-        options = {"angle": self.angle, "max_boxes": self.max_boxes, "deadline": deadline, **self.smallest}
-        found = maximise_inliers(bearings(pair.points2d), points, domain, **options)  # type: ignore[arg-type]
+        domain = whole_domain(points, DOMAIN * weak_perspective_distance(pair.points2d, points))
+        found = maximise_inliers(
+            bearings(pair.points2d), points, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline
+        )
         if found.rotation is None:
             return no_pose(points, found.boxes)
         translation = -found.rotation @ (radius * found.place + centre)

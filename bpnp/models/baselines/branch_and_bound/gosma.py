@@ -28,6 +28,9 @@ from bpnp.models.baselines.initial_poses import weak_perspective_distance
 from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, one_pose, over
 from bpnp.types import Pose
 
+DOMAIN = 1.5
+CLOSEST = 0.5
+GAP = 0.1  # share of the image mixture's squared norm by which the answer may miss the optimum
 POLISH_STEPS = 50
 DESCENTS = 32  # best box centres of an iteration, from which Adam descends
 DESCENT_STEPS = 30
@@ -50,7 +53,7 @@ def align_mixtures(
     rays: RayMixture,
     domain: Boxes,
     *,
-    gap: float = 0.1,
+    gap: float = GAP,
     closest: float = 0.0,
     batch: int = 512,
     max_boxes: int | None = None,
@@ -156,18 +159,14 @@ def _unit(scene: SceneMixture, place: Float[Tensor, "b 3"]) -> Float[Tensor, "b 
 class GOSMA(PairSolver):
     """Branch and bound on the distance between the mixtures of both point sets; no matching, no initial pose.
 
-    The camera centre is searched in a cube around the scene's centre, the rotation everywhere. `residual` of the pose
-    is its distance as a share of the image mixture's squared norm (0 for mixtures that coincide); `converged` is the
-    certificate that no pose of the domain is better by more than `gap`. It certifies the mixtures' alignment, which
-    need not be that of the points.
+    The camera centre is searched in a cube around the scene's centre of half side DOMAIN, no closer to it than CLOSEST
+    (weak-perspective distances), the rotation everywhere. `residual` of the pose is its distance as a share of the
+    image mixture's squared norm (0 for mixtures that coincide); `converged` is the certificate that no pose of the
+    domain is better by more than GAP. It certifies the mixtures' alignment, which need not be that of the points.
 
     Args:
         cluster2d: largest angle from an image cluster's mean, in root mean square angles of all rays to theirs.
         cluster3d: largest distance from a scene cluster's mean, in root mean square distances of all points to theirs.
-        domain: half side of the cube of camera centres, in weak-perspective distances.
-        closest: least distance of the camera centre from the scene's, in weak-perspective distances; 0 for cameras
-            among the points.
-        gap: share of the image mixture's squared norm by which the answer may miss the optimum.
         batch: boxes split together.
         max_boxes: most boxes; null for as many as the time allows.
         time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
@@ -180,17 +179,13 @@ class GOSMA(PairSolver):
         *,
         cluster2d: float = 0.8,
         cluster3d: float = 0.8,
-        domain: float = 1.5,
-        closest: float = 0.5,
-        gap: float = 0.1,
         batch: int = 512,
         max_boxes: int | None = None,
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
-        check_positive(cluster2d=cluster2d, cluster3d=cluster3d, domain=domain, gap=gap)
-        self.cluster2d, self.cluster3d, self.domain = cluster2d, cluster3d, domain
-        self.closest, self.gap, self.batch, self.max_boxes = closest, gap, batch, max_boxes
+        check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
+        self.cluster2d, self.cluster3d, self.batch, self.max_boxes = cluster2d, cluster3d, batch, max_boxes
 
     def solve(self, pair: SinglePair, deadline: float) -> Pose:
         rays = bearings(pair.points2d)
@@ -200,8 +195,8 @@ class GOSMA(PairSolver):
         away = weak_perspective_distance(pair.points2d, points)
         found = align_mixtures(
             scene_mixture(points, self.cluster3d), ray_mixture(rays, self.cluster2d * angle),
-            whole_domain(points, self.domain * away), gap=self.gap, closest=self.closest * away, batch=self.batch,
-            max_boxes=self.max_boxes, deadline=deadline,
+            whole_domain(points, DOMAIN * away), closest=CLOSEST * away, batch=self.batch, max_boxes=self.max_boxes,
+            deadline=deadline,
         )  # fmt: skip
         translation = -found.rotation @ (radius * found.place + centre)
         return one_pose(found.rotation, translation, found.boxes, found.value, found.certified)

@@ -17,7 +17,7 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
     distance_range,
     rotation_uncertainty,
     translation_uncertainty,
-)
+)  # fmt: skip
 from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture
 
 BISECTIONS = 16

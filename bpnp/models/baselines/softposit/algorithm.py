@@ -9,7 +9,11 @@ from torch import Tensor
 
 from bpnp.models.baselines.single_pairs import over
 
-CHI2_99 = 9.21  # 99 % quantile, two degrees of freedom
+FOCAL = 800.0  # pixels per unit of the normalised image, in which the other constants are
+NOISE = 2.0  # standard deviation of the image points, pixels
+ALPHA = 9.21 * NOISE**2 + 1  # squared pixels; 9.21 is the 99 % quantile of chi^2 with two degrees of freedom
+BETA_START, BETA_FINAL, BETA_RATE = 4e-4, 0.5, 1.05  # weight of squared distances, 1/pixel^2; factor of a step
+STEPS = 1 + int(math.log(BETA_FINAL / BETA_START) / math.log(BETA_RATE))
 ENOUGH_STEPS = 20
 WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
 
@@ -31,23 +35,17 @@ def softposit(
     rotation: Float[Tensor, "s 3 3"],
     translation: Float[Tensor, "s 3"],
     *,
-    noise_px: float = 2.0,
-    focal: float = 800.0,
-    beta_start: float = 4e-4,
-    beta_final: float = 0.5,
-    beta_rate: float = 1.05,
     max_steps: int | None = None,
     deadline: float = math.inf,
 ) -> Annealed:
     """Anneal every initial pose (R, t) of one pair.
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
-    and scene point k is d^2_jk = focal^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
-    exp(-beta (d^2 - alpha)) with slack, alpha = 9.21 noise^2 + 1, fits Q1 and Q2 to the assignment, makes their rows
-    orthonormal, and multiplies beta by `beta_rate`, from `beta_start` to `beta_final` (1 / pixel^2).
+    and scene point k is d^2_jk = FOCAL^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
+    exp(-beta (d^2 - ALPHA)) with slack, fits Q1 and Q2 to the assignment, makes their rows orthonormal, and multiplies
+    beta by BETA_RATE. points2d: normalised image coordinates. points3d: scene units.
 
-    points2d: normalised image coordinates; `focal` turns them into the pixels of the constants. points3d: scene units.
-    An initial pose is accepted if its residual is below sqrt(alpha)/2 after 20 steps or more. Where the matched points
+    An initial pose is accepted if its residual is below sqrt(ALPHA)/2 after 20 steps or more. Where the matched points
     span no volume it keeps its last pose and is not accepted.
     """
     image = points2d.double()
@@ -55,25 +53,23 @@ def softposit(
     scene = torch.nn.functional.pad(points3d.double() - centre, (0, 1), value=1.0)  # (n, 4)
     turned = rotation.double()
     shift = translation.double() + turned @ centre
-    alpha = CHI2_99 * noise_px**2 + 1
     moments2d = torch.stack([torch.ones_like(image[:, 0]), *image.unbind(-1), image.square().sum(-1)], -1).float()
-    steps = 1 + int(math.log(beta_final / beta_start) / math.log(beta_rate))
     broken = torch.zeros(len(turned), dtype=torch.bool, device=image.device)
     residual = image.new_full((len(turned),), math.inf)
-    beta, step = beta_start, 0
-    limit = steps if max_steps is None else min(steps, max_steps)
+    beta, step = BETA_START, 0
+    limit = STEPS if max_steps is None else min(STEPS, max_steps)
     while step < limit and not over(deadline):
         rows, depth = _scaled_rows(scene, turned, shift)
-        kernel = _kernel(image, rows, depth, beta, alpha, focal)
+        kernel = _kernel(image, rows, depth, beta)
         u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))
         matched = (v.unsqueeze(-1) * (kernel.mT @ (u.unsqueeze(-1) * moments2d))).double()  # (s, n, 4)
-        residual = torch.where(broken, torch.inf, _residual(matched, rows, depth, focal))
+        residual = torch.where(broken, torch.inf, _residual(matched, rows, depth))
         moved_r, moved_t, solved = _fit(matched, scene, depth)
         broken = broken | ~solved
         turned = torch.where(broken[:, None, None], turned, moved_r)
         shift = torch.where(broken[:, None], shift, moved_t)
-        beta, step = beta * beta_rate, step + 1
-    accepted = (residual < math.sqrt(alpha) / 2) & (step >= ENOUGH_STEPS) & ~broken
+        beta, step = beta * BETA_RATE, step + 1
+    accepted = (residual < math.sqrt(ALPHA) / 2) & (step >= ENOUGH_STEPS) & ~broken
     return Annealed(turned, shift - turned @ centre, residual, accepted, step, step == limit)
 
 
@@ -110,23 +106,23 @@ def _scaled_rows(scene: Tensor, rotation: Tensor, translation: Tensor) -> tuple[
     return rows[:, :2], rows[:, 2]
 
 
-def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float, alpha: float, focal: float) -> Tensor:
-    """gamma exp(-beta (d^2 - alpha)) (s, m, n) with gamma = 1/(max(m, n) + 1), in float32."""
-    x, y = (focal * image).float().unsqueeze(-1).unbind(1)
-    along_x, along_y = (focal * rows).float().unsqueeze(2).unbind(1)
+def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float) -> Tensor:
+    """gamma exp(-beta (d^2 - ALPHA)) (s, m, n) with gamma = 1/(max(m, n) + 1), in float32."""
+    x, y = (FOCAL * image).float().unsqueeze(-1).unbind(1)
+    along_x, along_y = (FOCAL * rows).float().unsqueeze(2).unbind(1)
     w = depth.float().unsqueeze(1)
     squared = torch.addcmul(along_x, x, w, value=-1).square_()
     squared += torch.addcmul(along_y, x.new_ones(()) * y, w, value=-1).square_()
     gamma = 1 / (max(image.shape[0], depth.shape[1]) + 1)
-    return squared.mul_(-beta).add_(beta * alpha + math.log(gamma)).exp_()
+    return squared.mul_(-beta).add_(beta * ALPHA + math.log(gamma)).exp_()
 
 
-def _residual(matched: Tensor, rows: Tensor, depth: Tensor, focal: float) -> Tensor:
+def _residual(matched: Tensor, rows: Tensor, depth: Tensor) -> Tensor:
     """sqrt(sum_jk m_jk d^2_jk / n) from the moments sum_j m_jk (1, x_j, y_j, x_j^2 + y_j^2)."""
     mass, x, y, squared = matched.unbind(-1)
     a, b = rows.unbind(1)
     total = (a.square() + b.square()) * mass - 2 * depth * (a * x + b * y) + depth.square() * squared
-    return focal * total.clamp_min(0).mean(-1).sqrt()
+    return FOCAL * total.clamp_min(0).mean(-1).sqrt()
 
 
 def _fit(matched: Tensor, scene: Tensor, depth: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,6 +13,7 @@ from bpnp.types import Pose
 
 Start = Literal["mean", "near_truth", "random"]
 CHUNK = 2**22  # pairs of points, times initial poses, that are annealed together
+THRESHOLD = 0.01  # distance of partners in the normalised image, to choose between starts
 
 
 class SoftPOSIT(PairSolver):
@@ -24,16 +25,8 @@ class SoftPOSIT(PairSolver):
     Args:
         start: mean, a fixed pose (the paper's start for ModelNet40: its mean pose); near_truth, the true pose disturbed
             (the paper's start for MegaDepth: not comparable with solvers that start blind); random, uniform rotations.
-        mean_euler_deg: Euler angles x, y, z of the fixed pose, degrees.
-        mean_translation: its translation, scene units.
-        perturbation_deg: largest turn of the true pose.
-        perturbation: its largest shift, scene units.
         starts: number of random starts.
-        noise_px: standard deviation of the image points, pixels.
-        focal: pixels per unit of the normalised image, for the constants of the annealing.
-        beta_start: first weight of squared distances, 1/pixel^2.
         max_steps: most annealing steps; null for all.
-        threshold: distance of partners in the normalised image, to choose between starts.
         seed: of the random starts and disturbances.
         time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
     """
@@ -44,26 +37,15 @@ class SoftPOSIT(PairSolver):
         self,
         *,
         start: Start = "mean",
-        mean_euler_deg: tuple[float, float, float] = (22.5, 22.5, 22.5),
-        mean_translation: tuple[float, float, float] = (0.0, 0.0, 4.5),
-        perturbation_deg: float = 10.0,
-        perturbation: float = 0.5,
         starts: int = 64,
-        noise_px: float = 2.0,
-        focal: float = 800.0,
-        beta_start: float = 4e-4,
         max_steps: int | None = None,
-        threshold: float = 0.01,
         seed: int = 0,
         time_limit: float | None = 30.0,
     ) -> None:
         super().__init__(time_limit)
         if start not in ("mean", "near_truth", "random"):
             raise ValueError(f"expected `start` mean, near_truth or random, got {start!r}")
-        self.start, self.starts, self.seed, self.threshold = start, starts, seed, threshold
-        self.mean = mean_euler_deg, mean_translation
-        self.perturbation = perturbation_deg, perturbation
-        self.annealing = {"noise_px": noise_px, "focal": focal, "beta_start": beta_start, "max_steps": max_steps}
+        self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
     def solve(self, pair: SinglePair, deadline: float) -> Pose:
         rotation, translation = self._initial_poses(pair)
@@ -73,24 +55,21 @@ class SoftPOSIT(PairSolver):
             if over(deadline):
                 finished = False
                 break
-            found = softposit(pair.points2d, pair.points3d, turned, shift, deadline=deadline, **self.annealing)  # type: ignore[arg-type]
+            points = pair.points2d, pair.points3d
+            found = softposit(*points, turned, shift, max_steps=self.max_steps, deadline=deadline)
             finished = finished and found.finished
-            counts = agreement(
-                pair.points2d, pair.points3d, found.rotation, found.translation, threshold=self.threshold
-            )
+            counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
             score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
             i = int(score.argmax())
             if int(score[i]) > most:
-                most, residual = int(score[i]), float(found.residual[i])
-                best = one_pose(
-                    found.rotation[i], found.translation[i], found.steps, residual, bool(found.accepted[i])
-                )  # fmt: skip
+                most, residual, accepted = int(score[i]), float(found.residual[i]), bool(found.accepted[i])
+                best = one_pose(found.rotation[i], found.translation[i], found.steps, residual, accepted)
         converged = best.stats.converged & finished
         return replace(best, stats=replace(best.stats, converged=converged))
 
     def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
         if self.start == "mean":
-            return mean_pose(pair, *self.mean)
+            return mean_pose(pair)
         if self.start == "near_truth":
-            return near_truth(pair, *self.perturbation, self.seed)
+            return near_truth(pair, self.seed)
         return random_poses(pair, self.starts, self.seed)
