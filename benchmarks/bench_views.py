@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, scene_pairs
 
 from bpnp import PosePrior, solve
-from bpnp.models import load_pretrained
+from bpnp.models import TrainedNet
 
 AUC_PX = (1.0, 5.0, 10.0)
 VIEW_DEGREES, VIEW_SHARE = 12.0, 0.12  # how far a photo is from a view that shares a third of its points
@@ -62,7 +62,7 @@ def learned(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 def bpnpnet(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
     del time_limit
-    found = solve(pair.points2d, pair.points3d, solver=load_pretrained("procedural-so3"), seed=seed)
+    found = solve(pair.points2d, pair.points3d, solver=TrainedNet.from_pretrained("procedural-so3"), seed=seed)
     return found.rotation, found.translation, found.verdict
 
 

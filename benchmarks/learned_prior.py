@@ -23,7 +23,7 @@ from rich.table import Table
 from bpnp import Batch, solve
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.metrics import rotation_error
-from bpnp.models import TrainedNet, load_network, load_pretrained
+from bpnp.models import TrainedNet
 from bpnp.models.weights import LEARNED
 
 RIGHT_DEG = 5.0
@@ -89,7 +89,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--points", type=int, default=256)
     parser.add_argument("--pairs", type=int, default=16)
     chosen = parser.parse_args(arguments)
-    net = load_network(chosen.prior) if Path(chosen.prior).is_file() else load_pretrained(chosen.prior)
+    load = TrainedNet.from_checkpoint if Path(chosen.prior).is_file() else TrainedNet.from_pretrained
+    net = load(chosen.prior)
     batch = test_batch(chosen)
     table = Table("prior", "rotation deg", "within 5 deg", "confident", "of them wrong", "CPU s")
     table.add_row("none", *measured(batch, None))

@@ -4,6 +4,6 @@ from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import Refinement
 from bpnp.models.matcher import Matcher
 from bpnp.models.search_solver import Search
-from bpnp.models.weights import TrainedNet, load_network, load_pretrained
+from bpnp.models.weights import TrainedNet
 
-__all__ = ["BPnPNet", "Matcher", "Refinement", "Search", "TrainedNet", "load_network", "load_pretrained"]
+__all__ = ["BPnPNet", "Matcher", "Refinement", "Search", "TrainedNet"]

@@ -66,15 +66,9 @@ class BPnPNet(TrainedNet):
         self.rounds = rounds
         self.widths = round_widths(rounds, self.ransac)
 
-    @property
-    def estimates(self) -> tuple[str, ...]:
-        """Names of the poses in evaluation."""
-        return ("ransac", "pnp", "refined") if self.refinement.enabled else ("ransac", "pnp")
-
     def forward(self, batch: Batch) -> Prediction:
         """The assignment and the poses "ransac" and "pnp"; in evaluation after its rounds, and with "refined"."""
-        features2d, features3d = self.features(batch)
-        cost = pairwise_distance(features2d, features3d)
+        cost = self.cost(batch)
         assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
         ransac = ransac_pose(self.ransac, assignment, batch)
         pnp = pnp_pose(self.pnp, assignment, batch, ransac)
@@ -100,10 +94,7 @@ class BPnPNet(TrainedNet):
 
 @full_precision
 def pairwise_distance(a: Float[Tensor, "b m c"], b: Float[Tensor, "b n c"]) -> Float[Tensor, "b m n"]:
-    """||a_i - b_j||_2 of unit vectors from one matrix product.
-
-    The gradient at distance zero is taken as zero.
-    """
+    """||a_i - b_j||_2 of unit vectors from one matrix product. The gradient at distance zero is taken as zero."""
     return _PairwiseDistance.apply(a, b)
 
 

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from bpnp.geometry import bearings, chords
 from bpnp.models.pose_head import pnp_pose
-from bpnp.models.search_solver import Refine
+from bpnp.models.search_solver import refine
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
@@ -124,37 +124,39 @@ class Refinement(nn.Module):
         if hypotheses < 0:
             raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
         self.hypotheses, self.enabled = hypotheses, enabled
-        self.anneal = Refine()
 
     def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
         if not self.enabled:
             return prediction
         own = list(prediction.poses.values())
-        starts = torch.stack([pose.rotation for pose in own], 1), torch.stack([pose.translation for pose in own], 1)
-        refined = self._annealed(batch, *self._with_hypotheses(prediction, batch, *starts))
+        rotation = torch.stack([pose.rotation for pose in own], 1)
+        translation = torch.stack([pose.translation for pose in own], 1)
+        refined = _annealed(batch, rotation, translation, *self._proposed(prediction, batch))
         doubtful = log_support(prediction, batch, refined) < 0
         if self.hypotheses and bool(doubtful.any()):
-            again = self._annealed(batch, *(torch.where(_like(doubtful, x), x, torch.nan) for x in starts))
-            better = doubtful & (log_support(prediction, batch, again) > 0)
-            refined = _chosen(better, again, refined)
+            alone = torch.where(doubtful[:, None, None], translation, torch.nan)
+            again = _annealed(batch, rotation, alone)
+            refined = _chosen(doubtful & (log_support(prediction, batch, again) > 0), again, refined)
         return replace(prediction, poses=prediction.poses | {REFINED: refined})
 
-    def _annealed(self, batch: Batch, rotation: Tensor, translation: Tensor) -> Pose:
-        rays = bearings(batch.points2d)
-        return Pose(*self.anneal(rays, batch.points3d, rotation, translation, batch.mask2d, batch.mask3d))
-
-    def _with_hypotheses(
-        self, prediction: Prediction, batch: Batch, rotation: Tensor, translation: Tensor
-    ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
+    def _proposed(self, prediction: Prediction, batch: Batch) -> tuple[Tensor, ...]:
+        """Rotations (b, s, 3, 3) and translations (b, s, 3) that the assignment proposes; nothing if none is wanted."""
         if not self.hypotheses:
-            return rotation, translation
+            return ()
         assert prediction.assignment is not None
-        proposed_r, proposed_t, _ = pose_hypotheses(
+        return pose_hypotheses(
             prediction.assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
             mask3d=batch.mask3d,
-        )  # fmt: skip
-        rotation = torch.cat([rotation, proposed_r.to(rotation)], 1)
-        return rotation, torch.cat([translation, proposed_t.to(translation)], 1)
+        )[:2]  # fmt: skip
+
+
+def _annealed(batch: Batch, rotation: Tensor, translation: Tensor, *proposed: Tensor) -> Pose:
+    """`refine` from the given poses (b, s, ...) and from those proposed."""
+    if proposed:
+        rotation = torch.cat([rotation, proposed[0].to(rotation)], 1)
+        translation = torch.cat([translation, proposed[1].to(translation)], 1)
+    masks = {"mask2d": batch.mask2d, "mask3d": batch.mask3d}
+    return Pose(*refine(bearings(batch.points2d), batch.points3d, rotation, translation, **masks))
 
 
 @contextmanager
@@ -175,16 +177,7 @@ def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
     """The first pose of the chosen samples, the second of the others."""
 
     def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(_like(chosen, a), a, b)
+        return torch.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
-    one, other = first.stats, second.stats
-    stats = SolveStats(
-        pick(one.iterations, other.iterations),
-        pick(one.residual, other.residual),
-        pick(one.converged, other.converged),
-    )
+    stats = SolveStats(*map(pick, vars(first.stats).values(), vars(second.stats).values()))
     return Pose(pick(first.rotation, second.rotation), pick(first.translation, second.translation), stats)
-
-
-def _like(chosen: Bool[Tensor, " b"], values: Tensor) -> Bool[Tensor, "b ..."]:
-    return chosen.reshape(-1, *[1] * (values.ndim - 1))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,13 +21,6 @@ from bpnp.models.weights import TrainedNet
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
-
-
-class RobustFrame(NamedTuple):
-    """Where a set lies: median of each coordinate, and median distance from it."""
-
-    centre: Float[Tensor, "b 1 d"]
-    radius: Float[Tensor, "b 1 1"]
 
 
 class Matcher(TrainedNet):
@@ -76,9 +68,8 @@ class Matcher(TrainedNet):
         self.backward_stats = BackwardStats()
         self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
         self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
-        around = {"neighbours": neighbours}
-        self.around2d = Neighbourhood(2, channels, **around) if neighbours else None
-        self.around3d = Neighbourhood(3, channels, **around) if neighbours else None
+        self.around2d = Neighbourhood(2, channels, neighbours=neighbours) if neighbours else None
+        self.around3d = Neighbourhood(3, channels, neighbours=neighbours) if neighbours else None
         self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(channels)
         self.project = nn.Linear(channels, channels)
@@ -88,11 +79,6 @@ class Matcher(TrainedNet):
         self.ransac = chosen(ransac, RansacPnP)
         self.pnp = chosen(pnp, WeightedPnP)
         self.refinement = Refinement() if refinement is None else refinement
-
-    @property
-    def estimates(self) -> tuple[str, ...]:
-        """Names of the poses in evaluation."""
-        return ("ransac", "pnp", "refined") if self.refinement.enabled else ("ransac", "pnp")
 
     def forward(self, batch: Batch) -> Prediction:
         """The assignment, its bins and the poses "ransac" and "pnp"; in evaluation "refined" too."""
@@ -129,10 +115,10 @@ class Matcher(TrainedNet):
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
         """Features of both sides after the last block, normalised by layer, not to unit length."""
-        frame2d, frame3d = robust_frame(batch.points2d, batch.mask2d), robust_frame(batch.points3d, batch.mask3d)
-        local2d = (batch.points2d - frame2d.centre) / frame2d.radius
-        local3d = (batch.points3d - frame3d.centre) / frame3d.radius
-        where = torch.cat([frame2d.centre, frame2d.radius.log()], -1).expand(-1, local2d.shape[1], -1)
+        centre2d, radius2d = robust_frame(batch.points2d, batch.mask2d)
+        centre3d, radius3d = robust_frame(batch.points3d, batch.mask3d)
+        local2d, local3d = (batch.points2d - centre2d) / radius2d, (batch.points3d - centre3d) / radius3d
+        where = torch.cat([centre2d, radius2d.log()], -1).expand(-1, local2d.shape[1], -1)
         x2d, x3d = self.enter2d(torch.cat([encode(local2d), where], -1)), self.enter3d(encode(local3d))
         if self.around2d is not None and self.around3d is not None:
             x2d, x3d = x2d + self.around2d(local2d, batch.mask2d), x3d + self.around3d(local3d, batch.mask3d)
@@ -145,7 +131,9 @@ class Matcher(TrainedNet):
         return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
 
 
-def robust_frame(points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> RobustFrame:
+def robust_frame(
+    points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]
+) -> tuple[Float[Tensor, "b 1 d"], Float[Tensor, "b 1 1"]]:
     """Median of each coordinate and median distance from it: half of the points may be clutter. Padding is not seen.
 
     A set whose points coincide has radius one.
@@ -153,7 +141,7 @@ def robust_frame(points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> R
     hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
     centre = hidden.nanmedian(1, keepdim=True).values
     radius = torch.linalg.vector_norm(hidden - centre, dim=-1).nanmedian(1).values[:, None, None]
-    return RobustFrame(centre, torch.where(radius > 0, radius, 1))
+    return centre, torch.where(radius > 0, radius, 1)
 
 
 def encode(points: Float[Tensor, "b k d"]) -> Float[Tensor, "b k e"]:

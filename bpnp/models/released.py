@@ -5,10 +5,9 @@ Geometric Optimization", ECCV 2020; the names and shapes of the 185 tensors are 
 """
 
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -26,53 +25,42 @@ _NUMPY_GLOBALS: list[Any] = [
     np.dtype,
     *(type(np.dtype(kind)) for kind in ("f2", "f4", "f8", "i4", "i8", "?")),
 ]
+# Our module names, as patterns, and theirs.
+_THEIRS = {
+    r"features(\d)d\.enter": r"FeatureExtractor\1d.conv_in.0",
+    r"features(\d)d\.blocks\.(\d+)\.linear_a": r"FeatureExtractor\1d.conv_\2.preconv.0",
+    r"features(\d)d\.blocks\.(\d+)\.linear_b": r"FeatureExtractor\1d.conv_\2.conv1.0",
+    r"features(\d)d\.blocks\.(\d+)\.linear_c": r"FeatureExtractor\1d.conv_\2.conv2.0",
+    **{f"features3d.align.norms.{i}": f"stn.bn{i + 1}" for i in range(5)},
+    **{f"features3d.align.linears.{i}": f"stn.conv{i + 1}" for i in range(3)},
+    "features3d.align.linears.3": "stn.fc1",
+    "features3d.align.linears.4": "stn.fc2",
+    "features3d.align.out": "stn.fc3",
+}
 
 
-@dataclass(frozen=True)
-class TensorMap:
-    """One tensor of the authors' file: its shape there, its name in BPnPNet, and its shape here."""
+class TensorMap(NamedTuple):
+    """One tensor of the authors' file: its shape there, and its name in BPnPNet."""
 
     shape: tuple[int, ...]
     ours: str
-    our_shape: tuple[int, ...]
 
 
 def tensor_maps() -> dict[str, TensorMap]:
     """The 185 tensors (1,992,841 parameters and the batch norms' buffers) by the authors' names.
 
-    Their 1x1 convolutions (out, in, 1) are our linear maps (out, in). In a block, `preconv`, `conv1` and `conv2` are
-    our linear_a, linear_b and linear_c. Both apply the input transform from the right, points @ T.
+    Their 1x1 convolutions (out, in, 1) are our linear maps (out, in). Both apply the input transform from the right,
+    points @ T.
     """
-    return dict(_feature_maps(2)) | dict(_feature_maps(3)) | dict(_transform_maps())
-
-
-def _linear(theirs: str, ours: str, out: int, into: int, *, conv: bool) -> Iterator[tuple[str, TensorMap]]:
-    shape = (out, into, 1) if conv else (out, into)
-    yield f"{theirs}.weight", TensorMap(shape, f"{ours}.weight", (out, into))
-    yield f"{theirs}.bias", TensorMap((out,), f"{ours}.bias", (out,))
-
-
-def _feature_maps(coordinates: int) -> Iterator[tuple[str, TensorMap]]:
-    theirs, ours = f"FeatureExtractor{coordinates}d", f"features{coordinates}d"
-    yield from _linear(f"{theirs}.conv_in.0", f"{ours}.enter", 128, coordinates, conv=True)
-    for block in range(12):
-        for layer, name in (("preconv", "linear_a"), ("conv1", "linear_b"), ("conv2", "linear_c")):
-            yield from _linear(
-                f"{theirs}.conv_{block}.{layer}.0", f"{ours}.blocks.{block}.{name}", 128, 128, conv=True
-            )  # fmt: skip
-
-
-def _transform_maps() -> Iterator[tuple[str, TensorMap]]:
-    widths = (3, 64, 128, 1024, 512, 256)
-    layers = ("conv1", "conv2", "conv3", "fc1", "fc2")
-    for i, layer in enumerate(layers):
-        ours, conv = f"features3d.align.linears.{i}", layer.startswith("conv")
-        yield from _linear(f"stn.{layer}", ours, widths[i + 1], widths[i], conv=conv)
-        for name in ("weight", "bias", "running_mean", "running_var"):
-            shape = (widths[i + 1],)
-            yield f"stn.bn{i + 1}.{name}", TensorMap(shape, f"features3d.align.norms.{i}.{name}", shape)
-        yield f"stn.bn{i + 1}.num_batches_tracked", TensorMap((), f"features3d.align.norms.{i}.num_batches_tracked", ())
-    yield from _linear("stn.fc3", "features3d.align.out", 9, 256, conv=False)
+    with torch.device("meta"):
+        own = BPnPNet().state_dict()
+    maps = {}
+    for ours, value in own.items():
+        module, _, kind = ours.rpartition(".")
+        theirs = next(re.sub(old, new, module) for old, new in _THEIRS.items() if re.fullmatch(old, module))
+        convolution = "conv" in theirs and kind == "weight"
+        maps[f"{theirs}.{kind}"] = TensorMap((*value.shape, 1) if convolution else tuple(value.shape), ours)
+    return maps
 
 
 def load_released(path: str | Path, *, backend: Backend = "auto", method: Method = "newton") -> BPnPNet:
@@ -102,7 +90,8 @@ def load_released(path: str | Path, *, backend: Backend = "auto", method: Method
             f"{'; '.join(sorted(problems)[:3])}{more}; try the authors' file as it was downloaded"
         )
     net = BPnPNet(ransac=RansacPnP(backend=backend), pnp=WeightedPnP(method=method))
-    net.load_state_dict({m.ours: state[key].reshape(m.our_shape) for key, m in maps.items()})
+    shapes = {name: value.shape for name, value in net.state_dict().items()}
+    net.load_state_dict({m.ours: state[key].reshape(shapes[m.ours]) for key, m in maps.items()})
     return net.eval()
 
 

@@ -1,6 +1,6 @@
-"""The search and the refinement over the samples of a batch, as functions of tensors and as modules."""
+"""The search and the refinement over the samples of a batch, and the search as a solver."""
 
-from collections.abc import Callable
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -18,7 +18,6 @@ from bpnp.search.starts import Prior
 from bpnp.search.verdict import SearchResult
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
-Array = NDArray[np.float64]
 Found = tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]
 
 
@@ -43,14 +42,14 @@ def search(
     """
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"expected a positive `time_limit` in seconds, got {time_limit}")
-
-    def one(_: int, f: Array, p: Array) -> SearchResult:
-        return search_poses(
+    results = (
+        search_poses(
             PointSets(f, p, prior=prior), clutter=clutter, seed=seed, deadline=Deadline.after(time_limit),
             settings=settings,
-        )  # fmt: skip
-
-    return _each(one, bearings, points3d, mask2d, mask3d)
+        )
+        for f, p in _samples(bearings, points3d, mask2d, mask3d)
+    )  # fmt: skip
+    return _best(results, points3d)
 
 
 def refine(
@@ -61,52 +60,42 @@ def refine(
     *,
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
-    outliers: float | None = None,
-    seed: int = 0,
-    settings: SearchSettings = DEFAULT,
 ) -> Found:
     """`refine_poses` from the s starts of each sample, NaN for one that is missing: as `search`.
 
     In the stats, iterations are the starts that were annealed.
     """
-
-    def one(i: int, f: Array, p: Array) -> SearchResult:
-        starts = _host(rotation[i]), _host(translation[i])
-        return refine_poses(PointSets(f, p), *starts, outliers=outliers, seed=seed, settings=settings)
-
-    return _each(one, bearings, points3d, mask2d, mask3d)
+    samples = zip(_samples(bearings, points3d, mask2d, mask3d), rotation, translation, strict=True)
+    return _best((refine_poses(PointSets(f, p), _host(r), _host(t)) for (f, p), r, t in samples), points3d)
 
 
-def _each(
-    solve: Callable[[int, Array, Array], SearchResult],
-    bearings: Tensor,
-    points3d: Tensor,
-    mask2d: Tensor | None,
-    mask3d: Tensor | None,
-) -> Found:
-    """The best pose of each sample's real points."""
-    found = []
-    for i in range(len(bearings)):
-        f = bearings[i] if mask2d is None else bearings[i][mask2d[i]]
-        p = points3d[i] if mask3d is None else points3d[i][mask3d[i]]
-        found.append(solve(i, _host(f), _host(p)))
-    device = points3d.device
-    rotation = np.stack([result.best[0] for result in found]) if found else np.empty((0, 3, 3))
-    translation = np.stack([result.best[1] for result in found]) if found else np.empty((0, 3))
+def _samples(
+    bearings: Tensor, points3d: Tensor, mask2d: Tensor | None, mask3d: Tensor | None
+) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """The real points of each sample."""
+    for i, (f, p) in enumerate(zip(bearings, points3d, strict=True)):
+        yield _host(f if mask2d is None else f[mask2d[i]]), _host(p if mask3d is None else p[mask3d[i]])
+
+
+def _best(results: Iterable[SearchResult], like: Tensor) -> Found:
+    """The best pose of each result, on the device of `like` and of its dtype."""
+    found = list(results)
+    rotation = torch.tensor(np.array([result.best[0] for result in found]).reshape(-1, 3, 3)).to(like)
+    translation = torch.tensor(np.array([result.best[1] for result in found]).reshape(-1, 3)).to(like)
     stats = SolveStats(
-        torch.tensor([result.batches for result in found], device=device, dtype=torch.int64),
-        torch.tensor([result.residual for result in found]).to(points3d),
-        torch.tensor([result.verdict == "confident" for result in found], device=device, dtype=torch.bool),
+        torch.tensor([result.batches for result in found], device=like.device, dtype=torch.int64),
+        torch.tensor([result.residual for result in found]).to(like),
+        torch.tensor([result.verdict == "confident" for result in found], device=like.device, dtype=torch.bool),
     )
-    return torch.as_tensor(rotation).to(points3d), torch.as_tensor(translation).to(points3d), stats
+    return rotation, translation, stats
 
 
-def _host(values: Tensor) -> Array:
+def _host(values: Tensor) -> NDArray[np.float64]:
     return values.detach().double().cpu().numpy()
 
 
 class Search(nn.Module):
-    """`search` as a solver: a `Batch` in, a `Prediction` with the pose "search" out. Nothing to train.
+    """`search` as a solver: a `Batch` in, a `Prediction` with the pose "search" and no assignment out.
 
     Args:
         seed: of the starts.
@@ -123,35 +112,8 @@ class Search(nn.Module):
         self.seed, self.time_limit, self.settings = seed, time_limit, settings
 
     def forward(self, batch: Batch) -> Prediction:
-        """Prediction with the estimate "search" and no assignment."""
-        pose = Pose(
-            *search(
-                bearings_of(batch.points2d), batch.points3d, mask2d=batch.mask2d, mask3d=batch.mask3d,
-                seed=self.seed, time_limit=self.time_limit, settings=self.settings,
-            )
+        rotation, translation, stats = search(
+            bearings_of(batch.points2d), batch.points3d, mask2d=batch.mask2d, mask3d=batch.mask3d, seed=self.seed,
+            time_limit=self.time_limit, settings=self.settings,
         )  # fmt: skip
-        return Prediction(poses={"search": pose})
-
-
-class Refine(nn.Module):
-    """`refine` with its options as a module; see `refine_poses`."""
-
-    def __init__(
-        self, *, outliers: float | None = None, seed: int = 0, settings: SearchSettings = DEFAULT
-    ) -> None:  # fmt: skip
-        super().__init__()
-        self.outliers, self.seed, self.settings = outliers, seed, settings
-
-    def forward(
-        self,
-        bearings: Float[Tensor, "b m 3"],
-        points3d: Float[Tensor, "b n 3"],
-        rotation: Float[Tensor, "b s 3 3"],
-        translation: Float[Tensor, "b s 3"],
-        mask2d: Bool[Tensor, "b m"] | None = None,
-        mask3d: Bool[Tensor, "b n"] | None = None,
-    ) -> Found:
-        return refine(
-            bearings, points3d, rotation, translation, mask2d=mask2d, mask3d=mask3d, outliers=self.outliers,
-            seed=self.seed, settings=self.settings,
-        )  # fmt: skip
+        return Prediction(poses={"search": Pose(rotation, translation, stats)})

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor, nn
 
-from bpnp.files import written_whole
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
@@ -21,7 +20,6 @@ from bpnp.models.older_checkpoints import brought_up_to_date
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
-PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
 
 
@@ -36,18 +34,30 @@ class TrainedNet(nn.Module):
     False
     """
 
+    refinement: Refinement
+
     @classmethod
     def from_checkpoint(cls: type[Net], path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> Net:
-        """The network of a checkpoint that `bpnp fit` wrote.
+        """The network of a checkpoint that `bpnp fit` wrote; by `TrainedNet` whichever it is.
 
         parts: classes outside this package that the network is made of; a checkpoint names them, and only those given
             here are used.
         Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
         """
-        net = load_network(path, parts=parts)
-        if not isinstance(net, cls):
-            raise ValueError(f"expected a checkpoint of {cls.__name__}, got {type(net).__name__} in {path}")
-        return net
+        content = read_checkpoint(path)
+        networks = {class_name(net): net for net in TrainedNet.__subclasses__()}
+        saved = content.get("solver")
+        found = saved.get("class") if isinstance(saved, Mapping) else None
+        if not issubclass(networks.get(str(found), object), cls):
+            wanted = class_name(cls) if cls in networks.values() else " or ".join(networks)
+            raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
+        try:
+            net = built(saved, (*networks.values(), *PARTS, *parts))
+            net.load_state_dict(solver_state(content["state_dict"]))
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
+        assert isinstance(net, cls)
+        return net.eval()
 
     @classmethod
     def from_pretrained(cls: type[Net], name: str) -> Net:
@@ -57,33 +67,14 @@ class TrainedNet(nn.Module):
         """
         return cls.from_checkpoint(pretrained_path(name))
 
-
-def load_network(path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> TrainedNet:
-    """The network of a checkpoint that `bpnp fit` wrote, whichever it is, in evaluation mode; see `from_checkpoint`."""
-    content = read_checkpoint(path)
-    networks = TrainedNet.__subclasses__()
-    saved = content.get("solver")
-    found = saved.get("class") if isinstance(saved, Mapping) else None
-    names = [class_name(cls) for cls in networks]
-    if found not in names:
-        wanted = " or ".join(names)
-        raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
-    try:
-        net = built(saved, (*networks, *PARTS, *parts))
-        net.load_state_dict(solver_state(content["state_dict"]))
-    except (ValueError, RuntimeError) as error:
-        raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
-    assert isinstance(net, TrainedNet)
-    return net.eval()
-
-
-def load_pretrained(name: str) -> TrainedNet:
-    """The network of weights that come with the package. Raises ValueError that lists the names for any other."""
-    return load_network(pretrained_path(name))
+    @property
+    def estimates(self) -> tuple[str, ...]:
+        """Names of the poses in evaluation."""
+        return ("ransac", "pnp", "refined") if self.refinement.enabled else ("ransac", "pnp")
 
 
 def pretrained_names() -> list[str]:
-    """Names that `TrainedNet.from_pretrained` knows."""
+    """Names that `from_pretrained` knows."""
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 
@@ -134,21 +125,3 @@ def check_solver(
     if shapes != own_shapes:
         told = ", ".join(differences(saved, own)) or "other weights"
         raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")
-
-
-def pack(checkpoint: str | Path, out: str | Path) -> None:
-    """A checkpoint of `bpnp fit` with nothing but the net and its settings, in half precision: what the package holds.
-
-    `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any other.
-
-    Weights beyond float16's range are a ValueError.
-    """
-    content = read_checkpoint(checkpoint)
-    state: dict[str, Any] = {}
-    for key, value in content["state_dict"].items():
-        if key.startswith(PREFIX):
-            state[key] = value.half() if value.is_floating_point() else value
-            if not state[key].isfinite().all():
-                raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
-    with written_whole(Path(out)) as temporary:
-        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, temporary)

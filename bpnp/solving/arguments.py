@@ -17,9 +17,9 @@ def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
     if solver == "search":
         return None
     if isinstance(solver, Path) or Path(str(solver)).suffix or Path(str(solver)).is_file():
-        from bpnp.models.weights import load_network  # the networks, where one is asked for
+        from bpnp.models.weights import TrainedNet  # the networks, where one is asked for
 
-        return load_network(solver)
+        return TrainedNet.from_checkpoint(solver)
     raise ValueError(f'expected `solver` "search", a module from Batch to Prediction, or a checkpoint, got {solver!r}')
 
 

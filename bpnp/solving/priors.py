@@ -42,10 +42,11 @@ def checked_prior(given: Any) -> Prior | None:
 
 
 def _checked_net(given: nn.Module | str | Path) -> nn.Module:
-    from bpnp.models.weights import LEARNED, TrainedNet, load_network, load_pretrained  # where a network is asked for
+    from bpnp.models.weights import LEARNED, TrainedNet  # where a network is asked for
 
     if isinstance(given, (str, Path)):
-        return load_pretrained(LEARNED) if str(given) == "learned" else load_network(given)
+        learned = str(given) == "learned"
+        return TrainedNet.from_pretrained(LEARNED) if learned else TrainedNet.from_checkpoint(given)
     if isinstance(given, TrainedNet):
         return given
     raise ValueError(f"{EXPECTED}, got {given!r:.60}")

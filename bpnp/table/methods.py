@@ -10,7 +10,7 @@ import yaml
 from torch import nn
 
 from bpnp.configs import packaged_config
-from bpnp.models import load_network
+from bpnp.models import TrainedNet
 from bpnp.table.pairs import build
 
 SHORT_NAMES = {
@@ -50,7 +50,7 @@ class Method:
     def build(self) -> nn.Module:
         """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
         if self.class_path in TRAINED and self.checkpoint is not None:
-            return load_network(self.checkpoint)
+            return TrainedNet.from_checkpoint(self.checkpoint)
         given = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
         solver: nn.Module = build(nn.Module, "solver", {"class_path": self.class_path, "init_args": given})
         if self.time_limit is not None and "time_limit" in vars(solver):

@@ -1,5 +1,6 @@
 """The packaged weights: found by name, offline, and good on shapes that they were not trained on."""
 
+import importlib
 import tomllib
 from dataclasses import replace
 from fnmatch import fnmatch
@@ -14,7 +15,7 @@ from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers
 from bpnp.metrics import rotation_error
 from bpnp.models.composition import described
-from bpnp.models.weights import LEARNED, pack, pretrained_names, pretrained_path
+from bpnp.models.weights import LEARNED, pretrained_names, pretrained_path
 
 ROOT = Path(__file__).parents[2]
 
@@ -128,7 +129,11 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
         assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
 
 
-def test_packing_keeps_the_net_in_half_the_space(tmp_path: Path, unseen: Batch) -> None:
+def test_packing_keeps_the_net_in_half_the_space(
+    tmp_path: Path, unseen: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    pack = importlib.import_module("pack_weights").pack
     net = small_net(normalise=True).eval()
     content = {
         "solver": described(net),

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from bpnp import Batch, BPnPNet, Matcher
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
-from bpnp.models import Refinement, load_network
+from bpnp.models import Refinement, TrainedNet
 from bpnp.models.composition import built, described, differences
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.older_checkpoints import brought_up_to_date
@@ -88,7 +88,7 @@ def test_settings_that_a_class_does_not_have_are_named(tmp_path: Path) -> None:
     solver["settings"]["transport"]["settings"]["nonsense"] = 3
     torch.save({"solver": solver, "state_dict": {}}, tmp_path / "net.ckpt")
     with pytest.raises(ValueError, match=r"net.ckpt: expected settings of Sinkhorn, got .*nonsense"):
-        load_network(tmp_path / "net.ckpt")
+        TrainedNet.from_checkpoint(tmp_path / "net.ckpt")
 
 
 def test_every_part_of_the_package_is_described_by_its_arguments() -> None:

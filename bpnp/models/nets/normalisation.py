@@ -62,6 +62,11 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     nothing; a batch with a single value per channel has no variance and uses the running statistics.
     """
 
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+    momentum: float
+
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
         if not self.training or (x.device.type == "cpu" and not dist.is_initialized()):
             return self._of_real_points(x, mask)
@@ -75,17 +80,12 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         real = None if mask is None or not self.training or bool(mask.all()) else mask
         points = x.flatten(0, -2) if real is None else x[real]
         enough = self.training and len(points) > 1
-        if enough and self.num_batches_tracked is not None:
+        if enough:
             self.num_batches_tracked += 1
         out = nn.functional.batch_norm(
-            points, self.running_mean, self.running_var, self.weight, self.bias, enough, self.momentum or 0.0, self.eps
+            points, self.running_mean, self.running_var, self.weight, self.bias, enough, self.momentum, self.eps
         )
         return out.view_as(x) if real is None else torch.zeros_like(x).masked_scatter(real.unsqueeze(-1), out)
-
-    def _running(self) -> tuple[Tensor, Tensor]:
-        assert self.running_mean is not None
-        assert self.running_var is not None
-        return self.running_mean, self.running_var
 
     def _statistics(self, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
         axes = tuple(range(x.ndim - 1))
@@ -96,13 +96,10 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         scatter = (((x - mean) * weight) ** 2).sum(axes)
         if dist.is_initialized():
             scatter = collectives.all_reduce(scatter)
-        running_mean, running_var = self._running()
         enough = count > 1
         with torch.no_grad():
-            assert self.momentum is not None
-            rate = self.momentum * enough.to(running_mean.dtype)
-            running_mean.lerp_(mean.detach().to(running_mean.dtype), rate)
-            running_var.lerp_((scatter / (count - 1).clamp_min(1)).detach().to(running_var.dtype), rate)
-            if self.num_batches_tracked is not None:
-                self.num_batches_tracked += 1
-        return torch.where(enough, mean, running_mean), torch.where(enough, scatter / count, running_var)
+            rate = self.momentum * enough.to(self.running_mean.dtype)
+            self.running_mean.lerp_(mean.to(self.running_mean.dtype), rate)
+            self.running_var.lerp_((scatter / (count - 1).clamp_min(1)).to(self.running_var.dtype), rate)
+            self.num_batches_tracked += 1
+        return torch.where(enough, mean, self.running_mean), torch.where(enough, scatter / count, self.running_var)

@@ -1,0 +1,42 @@
+"""How the weights of the package are made: `python benchmarks/pack_weights.py CHECKPOINT OUT`."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bpnp.files import written_whole
+from bpnp.models.weights import PREFIX, read_checkpoint
+
+PACKED = ("solver", "epoch", "global_step", "pytorch-lightning_version")  # the last three for `bpnp test --ckpt_path`
+
+
+def pack(checkpoint: str | Path, out: str | Path) -> None:
+    """A checkpoint of `bpnp fit` with nothing but the net and its settings, in half precision: what the package holds.
+
+    `TrainedNet.from_checkpoint` and ``bpnp test --ckpt_path`` read it like any other. Raises ValueError for weights
+    beyond float16's range.
+    """
+    content = read_checkpoint(checkpoint)
+    state: dict[str, Any] = {}
+    for key, value in content["state_dict"].items():
+        if key.startswith(PREFIX):
+            state[key] = value.half() if value.is_floating_point() else value
+            if not state[key].isfinite().all():
+                raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
+    with written_whole(Path(out)) as temporary:
+        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, temporary)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("checkpoint")
+    parser.add_argument("out")
+    chosen = parser.parse_args(arguments)
+    pack(chosen.checkpoint, chosen.out)
+
+
+if __name__ == "__main__":
+    main()
