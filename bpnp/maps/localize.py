@@ -12,11 +12,14 @@ from numpy.typing import NDArray
 from bpnp.cameras import camera_from
 from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
 
-MOST_KEYPOINTS = 2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 a tenth
+MOST_KEYPOINTS = (
+    2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
+)
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
@@ -56,11 +59,12 @@ def localize(
     used = keypoints if strongest is None else np.asarray(keypoints)[strongest]
     regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
     best: Solution | None = None
-    for region in regions:
+    for tried, region in enumerate(regions, 1):
         left = None if time_limit is None else time_limit - (time.monotonic() - start)
         if best is not None and left is not None and left <= 0:
             break
         found = _tried(scene, region, used, camera, prior, seed, None if left is None else max(left, 1e-3))
+        found = counted(found, tried)
         best = found if best is None else max(best, found, key=_rank)
         if best.verdict == "confident":
             break
@@ -86,6 +90,15 @@ def _tried(
     ids = scene.point_ids[region.points]
     matches = np.column_stack([found.matches[:, 0], ids[found.matches[:, 1]]])
     return replace(found, matches=matches, view=region.view.name, point_ids=ids)
+
+
+def counted(solution: Solution, tries: int) -> Solution:
+    """The solution with the false alarms of so many views: each is as many tests again."""
+    alarms, most = solution.log10_false_alarms + math.log10(tries), DEFAULT.evidence.false_alarms
+    if solution.verdict != "confident" or alarms <= most:
+        return replace(solution, log10_false_alarms=alarms)
+    reason = f"after {tries} views, 10^{alarms:.1f} poses are expected to fit unrelated points as well"
+    return replace(solution, log10_false_alarms=alarms, verdict="ambiguous", reason=reason)
 
 
 def _with_all_keypoints(solution: Solution, used: NDArray[np.int64], keypoints: Any, camera: Any) -> Solution:

@@ -1,11 +1,15 @@
 """A photo's pose in a map comes from its keypoints alone; matches are ids of the map's points."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted_model import Planted, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution
+from bpnp.maps.localize import counted
+from bpnp.search.settings import DEFAULT
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
@@ -78,6 +82,15 @@ def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap,
     for seed in range(3):
         noise = np.random.default_rng(seed).uniform((0, 0), (800, 600), (90, 2))
         assert scene.localize(noise, CAMERA, time_limit=3).verdict != "confident"
+
+
+def test_each_view_that_was_tried_is_as_many_tests_again(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    clear = scene.localize(photo_of(truth, 0)[0], CAMERA, views=["photo 0.jpg"])
+    close = replace(clear, log10_false_alarms=DEFAULT.evidence.false_alarms - 1)
+    assert counted(clear, 1000).verdict == counted(close, 9).verdict == "confident"
+    assert counted(close, 11).verdict == "ambiguous"
+    assert counted(close, 100).log10_false_alarms == pytest.approx(close.log10_false_alarms + 2)
 
 
 def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None:
