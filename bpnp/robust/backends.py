@@ -87,8 +87,8 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
 
 
 def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
-    points2d, points3d, real = (torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool)))
-    return int(residuals(torch.as_tensor(pose)[None, None], Pairs(points2d, points3d, real), threshold**2).inlier.sum())
+    pairs = Pairs(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
+    return int(residuals(torch.as_tensor(pose)[None, None], pairs, threshold**2).inlier.sum())
 
 
 BACKENDS: dict[str, Callable[[Pairs, float, int, int], Estimate]] = {

@@ -11,6 +11,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.robust.sampling import take
+
+NEWTON_STEPS = 2  # on the depths
+TOLERANCE = 1e-6  # of the squared sides, relative to the longest
+
 
 class P3P(NamedTuple):
     """Up to four poses a sample, camera = R p + t; slots without a solution hold NaN and `valid` False."""
@@ -20,13 +25,13 @@ class P3P(NamedTuple):
     valid: Bool[Tensor, "*b 4"]
 
 
-def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *, polish: int = 2) -> P3P:
+def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) -> P3P:
     """Solve d_i f_i = R p_i + t, d_i > 0, for three pairs (rows of the last two axes).
 
     With x = d_0/d_2 and y = d_1/d_2 the law of cosines in the triangles at the camera gives two conics in (x, y). One
     real root s of the cubic det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at
-    most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023). `polish` Newton steps
-    on |d_i f_i - d_j f_j| = |p_i - p_j| then make the depths exact.
+    most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023). Newton
+    steps on |d_i f_i - d_j f_j| = |p_i - p_j| then make the depths exact.
 
     bearings: rays in the camera frame, of any length. points3d: scene units, any scale and offset. Computed in float64,
     returned in the type of `points3d`. The four slots have no order, and where two solutions meet both are given.
@@ -53,11 +58,10 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"], *,
     last = ((1 - y).square() + y * chords2[1]).rsqrt()
     depths = torch.stack([x * last, y * last, last])
     chords2, lengths2 = chords2.unsqueeze(1), lengths2.unsqueeze(1)
-    for _ in range(polish):
+    for _ in range(NEWTON_STEPS):
         depths = _newton_step(depths, chords2, lengths2)
 
-    tolerance = 1e-6
-    valid = (depths > 0).all(0) & (_residuals(depths, chords2, lengths2).abs().amax(0) < tolerance)
+    valid = (depths > 0).all(0) & (_residuals(depths, chords2, lengths2).abs().amax(0) < TOLERANCE)
     camera = (depths * scale).unsqueeze(1) * rays.unsqueeze(2)  # 3 points, 3 coordinates, 4 slots
     camera_axes, world_axes = _frame(camera), _frame(points.unsqueeze(2))
     rotation = (camera_axes.unsqueeze(2) * world_axes.unsqueeze(1)).sum(0)
@@ -79,8 +83,7 @@ def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b 
     solution = p3p(rays, points3d)
     poses = torch.cat([solution.rotation, solution.translation.unsqueeze(-1)], -1).flatten(1, 2)
     filled = solution.valid.flatten(1).byte().argsort(dim=1, descending=True, stable=True)
-    index = filled[:, : 2 * points3d.shape[1] + 2, None, None]
-    return poses.gather(1, index.expand(-1, -1, 3, 4))
+    return take(poses, filled[:, : 2 * points3d.shape[1] + 2])
 
 
 def _sides2(points: Tensor) -> Tensor:
