@@ -122,10 +122,14 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         assert 40 <= 2 * np.degrees(np.arctan(half)) <= 75
         assert np.abs(pair.points2d).max() <= half * (1 + 1e-6)
         assert np.abs(pair.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
-    turns = Rotation.from_matrix([pair.rotation for pair in plenty])
-    upright = [pair.rotation[1, 2] for pair in pairs(30, num_points=20, rotate=False)]
-    assert np.quantile(upright, 0.75) < -0.8  # the third axis is upwards in the image
-    assert np.abs(turns.as_matrix().mean(0)).max() < 0.35
+    for rotate in (False, True):
+        data = SfmSceneDataModule(num_points=20, test_pairs=60, eval_batch_size=60, rotate=rotate)
+        data.setup("test")
+        (batch,) = data.test_dataloader()
+        if rotate:
+            assert batch.rotation.mean(0).abs().max() < 0.35
+        else:
+            assert batch.rotation[:, 1, 2].quantile(0.75) < -0.8  # the third axis is upwards in the image
     extents = [np.ptp(pair.points3d, axis=0).max() for pair in plenty]
     assert max(extents) / min(extents) > 20
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 from torch import Tensor
 
-from bpnp.datamodules.augment import Drawn, DrawnSide, bounds
+from bpnp.datamodules.augment import Augmentation, Drawn, DrawnSide, bounds
 from bpnp.datamodules.facades.views import SfmOptions, draw_sfm_pair
 from bpnp.datamodules.module import PairDataModule
 from bpnp.datamodules.pair import Counts, stacked
@@ -94,7 +94,6 @@ class SfmSceneDataModule(PairDataModule):
                 min_points=min_points,
                 clutter=clutter if split == "train" or eval_clutter is None else eval_clutter,
                 clutter_side=clutter_side,
-                rotate=rotate,
                 scale_range=scale_range,
                 field_of_view=field_of_view,
                 noise_px=noise_px,
@@ -102,7 +101,10 @@ class SfmSceneDataModule(PairDataModule):
             for split in ("train", "val", "test")
         }
         self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
-        self.fresh = fresh_views
+        self.fresh, self.rotate = fresh_views, rotate
+
+    def _augmentation(self, part: str) -> Augmentation:
+        return Augmentation(rotate=self.rotate, outliers=self.outliers[part])
 
     def _source(self, part: str, seed: tuple[int, int]) -> SfmSceneSource:
         split = "test" if part == "predict" else part

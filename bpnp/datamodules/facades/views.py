@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from bpnp.datamodules.augment import SIDES, Drawn, DrawnSide, Side, bounds
 from bpnp.datamodules.facades.scenes import Array, Scene, Walls, draw_scene
 from bpnp.datamodules.pair import Pair
-from bpnp.geometry import random_rotations
 
 LONG_SIDE = 1200.0  # of an image, pixels: a focal length of 800 to 1650 pixels at 75 to 40 degrees
 MIN_DEPTH = 0.5  # metres; nothing nearer to the camera is seen
@@ -27,7 +26,6 @@ class SfmOptions:
     min_points: int = 16
     clutter: Drawn = 0.0
     clutter_side: DrawnSide = "both"
-    rotate: bool = True
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: Drawn = (40.0, 75.0)
     noise_px: Drawn = (0.5, 1.5)
@@ -181,10 +179,8 @@ def _unseen(scene: Scene, seen: NDArray[np.int64], count: int, rng: np.random.Ge
 def _in_frame(
     points: Array, camera: Camera, options: SfmOptions, rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """Points and pose in the frame of an SfM model: any scale, any origin nearby, and turned if `rotate`."""
-    turn = random_rotations(1, rng)[0].numpy() if options.rotate else np.eye(3)
+    """Points and pose in an upright frame of any scale and an origin nearby."""
     low, high = options.scale_range
     scale = float(np.exp(rng.uniform(np.log(low), np.log(high))))
     origin = 20 * scale * rng.standard_normal(3)
-    rotation = camera.rotation @ turn.T
-    return scale * points @ turn.T + origin, rotation, scale * camera.translation - rotation @ origin
+    return scale * points + origin, camera.rotation, scale * camera.translation - camera.rotation @ origin
