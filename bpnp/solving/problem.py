@@ -1,6 +1,6 @@
 """One problem from a user's arrays: checked, undistorted, and with the plane in which its residuals are measured."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal
 
@@ -78,6 +78,19 @@ class Problem:
             camera = self.local3d @ rotation.T + translation
             seen[((self.normals3d @ rotation.T) * camera).sum(-1) >= 0] = np.nan
         return seen
+
+    def without(self, taken: npt.NDArray[np.int64]) -> "Problem":
+        """The same without some of the given 2D points."""
+        kept = ~np.isin(self.usable, taken)
+        labels = None if self.labels2d is None else self.labels2d[kept]
+        return replace(
+            self,
+            bearings=self.bearings[kept],
+            usable=self.usable[kept],
+            image=self.image[kept],
+            labels2d=labels,
+            degenerate=self.degenerate or _degenerate(self.bearings[kept], self.points3d, MIN_POINTS),
+        )
 
     def allowed(self, i: npt.NDArray[np.int64], j: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
         """Whether usable 2D points i and 3D points j can be partners by their labels."""

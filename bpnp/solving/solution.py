@@ -42,12 +42,14 @@ class Candidate:
 @dataclass(frozen=True)
 class SolutionStats:
     """How the search went: rounds (batches of starts), what it left as residual, whether it stopped by itself because
-    the evidence was safe, and how many 2D points could not be undistorted and were left out."""
+    the evidence was safe; how many 2D points could not be undistorted and were left out, and how many were left to
+    other pairs of the same image (`solve_many`)."""
 
     iterations: int = 0
     residual: float = math.nan
     converged: bool = False
     dropped2d: int = 0
+    taken2d: int = 0
 
 
 @dataclass(frozen=True, eq=False)

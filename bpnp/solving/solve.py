@@ -12,7 +12,8 @@ from bpnp.search.starts import GravityPrior
 from bpnp.solving.arguments import device_from, each_camera, each_of, each_set, source_from
 from bpnp.solving.finishing import finished, without_pose
 from bpnp.solving.priors import Prior, checked_prior
-from bpnp.solving.problem import problem_from
+from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.sharing import shared_lights
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, results_of
 
@@ -95,7 +96,10 @@ def solve_many(
     device: str | torch.device | None = None,
     progress: Progress | None = None,
 ) -> list[Solution]:
-    """`solve` for many pairs; a solution depends on nothing but its own pair.
+    """`solve` for many pairs; a solution depends on nothing but its own pair, unless few-point pairs share an image.
+
+    Where several devices are looked for in the same image points, no point is matched to two of them: the surest
+    device keeps its own, and another that claimed some of them is solved again without (`stats.taken2d`).
 
     points2d: a sequence of arrays (m_i, 2). points3d: one of (n_i, 3), or one array (n, 3) that all pairs share.
     normals3d, labels2d, labels3d: sequences with one array a pair, or one array that all pairs share.
@@ -137,6 +141,14 @@ def solve_many(
     }
     for i, result, seconds in results_of(module, solvable, priors, options):
         solutions[i] = finished(problems[i], result, seconds, threshold, dropped[i])
+
+    def solve_again(i: int, problem: Problem) -> Solution:
+        if problem.degenerate is not None:
+            return without_pose(problem, f"of the lights that no other pair has, {problem.degenerate}", threshold, 0)
+        ((_, result, seconds),) = results_of(module, {i: problem}, priors, options)
+        return finished(problem, result, seconds, threshold, dropped[i])
+
+    shared_lights(solvable, solutions, solve_again)
     return [solutions[i] for i in range(len(problems))]
 
 

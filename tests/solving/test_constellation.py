@@ -166,3 +166,18 @@ def test_annotations_of_many_pairs() -> None:
         np.testing.assert_array_equal(alone.rotation, solution.rotation)
     with pytest.raises(ValueError, match="expected 2 arrays as in `points2d` in `labels2d`, got 1"):
         solve_many(images, points, CAMERA, labels2d=[np.zeros(3, int)], labels3d=np.zeros(20, int))
+
+
+def test_two_devices_in_one_picture_share_no_light() -> None:
+    """Two controllers of one make: each pose is found once, and no light belongs to both."""
+    rng = np.random.default_rng(8)
+    points, normals = device(rng, 20)
+    pictures = [frame(rng, points, normals) for _ in range(2)]
+    image = np.concatenate([picture[0] + [100 * sign, 0] for picture, sign in zip(pictures, (-1, 1), strict=True)])
+    solutions = solve_many([image] * 2, points, CAMERA, normals3d=normals)
+    lights = [set(solution.matches[:, 0].tolist()) for solution in solutions]
+    assert min(len(own) for own in lights) >= 6
+    assert not lights[0] & lights[1]
+    assert sorted(solution.stats.taken2d > 0 for solution in solutions) == [False, True]
+    alone = solve(image, points, CAMERA, normals3d=normals)
+    assert alone.stats.taken2d == 0
