@@ -172,7 +172,7 @@ def draw(frames: Sequence[Seen], answers: Sequence[Answer], points: Array, path:
     import matplotlib.pyplot as plt
 
     seconds = np.array([seen.second for seen in frames])
-    moments = [s for s in (5, 15, 19.9, 21, 22.1, 30, 41, 55) if s <= seconds[-1]]
+    moments = [s for s in (2, 12, 19.9, 21, 23, 34, 41, 50) if s <= seconds[-1]]
     figure = plt.figure(figsize=(13, 7), layout="constrained")
     grid = figure.add_gridspec(3, max(len(moments), 1), height_ratios=[1.2, 1, 1])
     for column, moment in enumerate(moments):
