@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 SHORT_SUM = 2048  # terms of a sum that are added up in float32
+CACHED = 128  # rows whose squares are made at a time: they stay in the cache of a core
 LOST = 100.0  # a difference of so many units of rounding has no digits
 
 
@@ -52,7 +53,9 @@ class Plan:
         formed for the sum of the positive terms P (1 - P / rows).
         """
         weight = divide(torch.ones_like(rows), rows)
-        degree = cols - self.beta**2 * transpose_times(self.kernel.square(), self.alpha**2 * weight)
+        parts = zip(self.kernel.split(CACHED, -2), (self.alpha**2 * weight).split(CACHED, -1), strict=True)
+        squares = torch.stack([transpose_times(part.square(), scale) for part, scale in parts]).sum(0)
+        degree = cols - self.beta**2 * squares
         weak = (degree < LOST * torch.finfo(cols.dtype).eps * cols).any(-1)
         if bool(weak.any()):
             plan = self.formed()
