@@ -1,6 +1,7 @@
 """Loops on the CPU: how they are compiled, and how they are shared among threads."""
 
 import inspect
+import logging
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -9,15 +10,43 @@ from typing import Any
 
 import numba
 import torch
+from numba.core import event
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator: compile at the first call, keep the result on disk, and hold no lock while it runs.
 
-    A function is compiled without the wrappers that a type checker puts around it when it is imported.
+    It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
+    names another one); where neither can, each process compiles again. A function is compiled without the wrappers that
+    a type checker puts around it when it is imported.
     options: of `numba.njit`.
     """
-    return lambda function: numba.njit(inspect.unwrap(function), nogil=True, cache=True, **options)
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        function = inspect.unwrap(function)
+        try:
+            return numba.njit(function, nogil=True, cache=True, **options)
+        except RuntimeError:  # numba finds no folder for its cache
+            return numba.njit(function, nogil=True, **options)
+
+    return compiled
+
+
+class _Announcement(event.Listener):
+    """Logs one line when the first of this package's functions is compiled, for it takes seconds."""
+
+    made = False
+
+    def on_start(self, event: event.Event) -> None:
+        if not self.made and event.data["dispatcher"].py_func.__module__.startswith("bpnp."):
+            self.made = True
+            logging.getLogger(__name__).warning("compiling bpnp's loops, which takes some seconds once an installation")
+
+    def on_end(self, event: event.Event) -> None:
+        """Nothing to say."""
+
+
+event.register("numba:compile", _Announcement())
 
 
 def in_threads(work: Callable[[int, int], object], count: int) -> None:

@@ -1,14 +1,29 @@
-"""Shares of a loop over threads: every index once, errors passed on, and a fork that is not stuck."""
+"""Compiled loops: kept where they can be kept, announced, and shared among threads of which none is stuck."""
 
 import multiprocessing
+import os
+import shutil
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import bpnp.compilation
 from bpnp.compilation import in_threads
+
+LOOP = """
+from bpnp.compilation import compiler
+
+
+@compiler()
+def double(x):
+    return 2 * x
+"""
 
 
 @pytest.fixture(params=[1, 2, 5])
@@ -76,3 +91,40 @@ def test_a_fork_has_threads_of_its_own() -> None:
     child.start()
     assert results.get(timeout=60) == 285.0
     child.join()
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A folder with a package `bpnp` of a compiled loop beside which nothing can be written, whoever runs the test."""
+    folder = tmp_path / "installed" / "bpnp"
+    folder.mkdir(parents=True)
+    shutil.copy(bpnp.compilation.__file__, folder / "compilation.py")
+    (folder / "__init__.py").touch()
+    (folder / "loop.py").write_text(LOOP)
+    (folder / "__pycache__").touch()  # a file where the folder would be
+    return folder.parent
+
+
+def doubled(package: Path, cache: str) -> tuple[str, str]:
+    """What a process prints and logs that calls the loop."""
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
+    environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": cache, "HOME": cache}
+    ask = [sys.executable, "-c", "from bpnp.loop import double; print(double(4), double(5))"]
+    ended = subprocess.run(ask, env=environment, cwd=package, capture_output=True, text=True, check=True)
+    return ended.stdout, ended.stderr
+
+
+def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(package: Path, tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    first, second = doubled(package, str(cache)), doubled(package, str(cache))
+    assert first[0] == second[0] == "8 10\n"
+    assert first[1].count("compiling") == 1
+    assert second[1] == ""
+    assert list(cache.rglob("*.nbi"))
+
+
+def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> None:
+    for _ in range(2):
+        printed, logged = doubled(package, "/dev/null/nowhere")
+        assert printed == "8 10\n"
+        assert logged.count("compiling") == 1

@@ -14,7 +14,7 @@ from bpnp.search.candidates import Candidates, best_distinct, merged
 from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
-from bpnp.search.settings import ClusterStage, Recipe
+from bpnp.search.settings import Batch, ClusterStage, Recipe
 from bpnp.search.starts import Prior, draw_poses
 
 
@@ -34,30 +34,38 @@ class Deadline:
 
 
 def run_batch(
-    scene: Scene, recipe: Recipe, prior: Prior | None, best: Candidates, outliers: float, deadline: Deadline
+    scene: Scene,
+    size: Batch,
+    recipe: Recipe,
+    prior: Prior | None,
+    best: Candidates,
+    outliers: float,
+    deadline: Deadline,
 ) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    settings = scene.settings
-    rotation, translation = draw_poses(scene.spread, scene.bulk3d, settings.starts, recipe, prior, scene.rng)
+    rotation, translation = draw_poses(scene.spread, scene.bulk3d, size.starts, recipe, prior, scene.rng)
     starts = Candidates.unscored(rotation, translation, hits=1)
-    coarse = anneal_on_clusters(scene, starts, settings.coarse, recipe.first_scale, outliers, deadline)
-    return _anneal_further(scene, Candidates.concatenated([coarse, shaken(scene, best)]), outliers, deadline)
+    coarse = anneal_on_clusters(scene, starts, size.coarse, recipe.first_scale, outliers, deadline)
+    poses = Candidates.concatenated([coarse, shaken(scene, best)])
+    return _anneal_further(scene, poses, size.middle, outliers, deadline)
 
 
 def refine_batch(scene: Scene, starts: Candidates, outliers: float, deadline: Deadline) -> Candidates:
     """From a few poses, and from poses shaken around them, through the finer clusters to all points."""
     around = Candidates.concatenated([starts, shaken(scene, starts)])
-    clustered = _anneal_further(scene, around, outliers, deadline)
+    clustered = _anneal_further(scene, around, scene.settings.middle, outliers, deadline)
     # A start that is right already needs no clusters, which would only shake it.
     first_scale = scene.settings.middle.last_scale * scene.spread
     direct = anneal_on_points(scene, starts, first_scale, outliers, deadline, bearings=scene.settings.fine.bearings)
     return merged([clustered, direct], scene)
 
 
-def _anneal_further(scene: Scene, poses: Candidates, outliers: float, deadline: Deadline) -> Candidates:
+def _anneal_further(
+    scene: Scene, poses: Candidates, middle: ClusterStage, outliers: float, deadline: Deadline
+) -> Candidates:
     """From coarse poses through the finer clusters to all points."""
     settings = scene.settings
-    poses = anneal_on_clusters(scene, poses, settings.middle, settings.coarse.last_scale, outliers, deadline)
+    poses = anneal_on_clusters(scene, poses, middle, settings.coarse.last_scale, outliers, deadline)
     first_scale = settings.middle.last_scale * scene.spread
     return anneal_on_points(scene, poses, first_scale, outliers, deadline, bearings=settings.fine.bearings)
 
@@ -104,8 +112,9 @@ def anneal_on_points(
     done = in_time(anneal, len(starts), deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
     ends = replace(
-        starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2]
-    )
+        starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2],
+        log10_false_alarms=np.full(len(starts), math.nan),
+    )  # fmt: skip
     return best_distinct(ends[:done], scene, done)
 
 
@@ -122,13 +131,21 @@ def shaken(scene: Scene, poses: Candidates) -> Candidates:
 
 
 def finish(
-    scene: Scene, poses: Candidates, outliers: float, deadline: Deadline, others: tuple[float, ...] | None = None
+    scene: Scene,
+    poses: Candidates,
+    outliers: float,
+    deadline: Deadline,
+    others: tuple[float, ...] | None = None,
+    annealed: int | None = None,
 ) -> Candidates:
     """One or more poses, annealed once more on every bearing, the best two with several shares of outliers.
 
-    others: these shares beside `outliers`; None for `settings.end_outliers`.
+    others: these shares beside `outliers`; None for `settings.end_outliers`. annealed: of the poses, from the best one;
+    the rest stay as they are. None for all.
     """
     shares = scene.settings.end_outliers if others is None else others
+    rest = poses[len(poses) if annealed is None else annealed :]
+    poses = poses[: len(poses) - len(rest)]
     runs = [(i, outliers) for i in range(len(poses))]
     runs += [(i, share) for i in range(min(2, len(poses))) for share in shares]
     ends: list[Candidates] = []
@@ -139,7 +156,7 @@ def finish(
         pose = poses[i : i + 1]
         first_scale = scene.settings.end_scale * float(pose.scale[0])
         ends.append(anneal_on_points(scene, pose, first_scale, share, deadline, bearings=None))
-    return best_distinct(Candidates.concatenated(ends), scene, scene.settings.kept)
+    return best_distinct(Candidates.concatenated([*ends, rest]), scene, scene.settings.kept)
 
 
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:

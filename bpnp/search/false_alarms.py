@@ -64,34 +64,20 @@ def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array) -> 
     >>> log10_false_alarms(sets, np.eye(3), np.array([0.3, 0, 5])) > 0  # another one
     True
     """
-    bearings, points3d = sets.bearings, sets.points3d
-    m, n = len(bearings), len(points3d)
-    tests = max(_log10_tests(sets) + sets.log10_share(rotation, translation), 0.0)
-    seen = _directions(points3d, rotation, translation, sets.normals3d)
-    if m <= FIXING or int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
-        return tests
-    view = _View(bearings)
-    floor = max(sets.floor or 0.0, FLOOR * view.spread)
-    coarsest = max(COARSEST * math.sqrt(view.solid_angle / m), 2 * floor)
-    steps = max(3, 1 + math.ceil(math.log(coarsest / floor) / math.log(SCALE_STEP)))
-    scales = np.geomspace(floor, coarsest, steps)
-    chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
-    crowd = cKDTree(bearings).query(bearings[chosen], min(m, MOST_NEIGHBOURS))[0].reshape(len(chosen), -1)
-    together = (crowd[:, None] <= TOGETHER * scales[:, None]).sum(-1)
-    logs = np.zeros((len(chosen), len(scales), len(SHARES)))
-    for rows, columns in _label_groups(chosen, sets.labels2d, sets.labels3d, n):
-        used = seen[columns][np.isfinite(seen[columns, 0])]
-        near2 = np.full((len(rows), 1), np.inf)
-        if len(used):
-            near2 = cKDTree(used).query(bearings[chosen[rows]], min(len(used), MOST_NEIGHBOURS))[0] ** 2
-        near2 = near2.reshape(len(rows), -1)
-        part = np.empty((len(rows), *logs.shape[1:]))
-        _log_ratios(near2, view.density(bearings[chosen[rows]], used), scales, SHARES, part)
-        logs[rows] = part
-    fixing = np.partition(logs, len(chosen) - FIXING, 0)[-FIXING:]
-    evidence = (logs / together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
-    mean = float(np.logaddexp.reduce(evidence.ravel())) - math.log(evidence.size)
-    return tests - mean / math.log(10)
+    return float(log10_false_alarms_of(sets, rotation[None], translation[None])[0])
+
+
+def log10_false_alarms_of(sets: PointSets, rotations: Array, translations: Array) -> Array:
+    """`log10_false_alarms` (c,) of poses (c, 3, 3), (c, 3); what depends on the image alone is computed once."""
+    tests = _log10_tests(sets)
+    result = np.array([max(tests + sets.log10_share(r, t), 0.0) for r, t in zip(rotations, translations, strict=True)])
+    if len(sets.bearings) > FIXING and len(result):
+        image = _Image(sets)
+        for k in range(len(result)):
+            seen = _directions(sets.points3d, rotations[k], translations[k], sets.normals3d)
+            if int(np.isfinite(seen[:, 0]).sum()) > FIXING:
+                result[k] -= image.log_evidence(seen) / math.log(10)
+    return result
 
 
 def _log10_tests(sets: PointSets) -> float:
@@ -114,16 +100,42 @@ def _directions(points3d: Array, rotation: Array, translation: Array, normals3d:
     return seen
 
 
-class _View:
-    """The rectangle on the tangent plane whose principal standard deviations are those of the bearings."""
+class _Image:
+    """What the evidence of every pose has in common: the view, the scales s, and how many points lie together.
 
-    def __init__(self, bearings: Array) -> None:
+    The view is the rectangle on the tangent plane whose principal standard deviations are those of the bearings.
+    """
+
+    def __init__(self, sets: PointSets) -> None:
+        bearings, m = sets.bearings, len(sets.bearings)
+        self.sets = sets
         self.centre = bearings.mean(0)
         centred = bearings - self.centre
         self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
         variance, axes = np.linalg.eigh(centred.T @ centred / max(len(bearings) - 1, 1))
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
         self.solid_angle = solid_angle(bearings)
+        floor = max(sets.floor or 0.0, FLOOR * self.spread)
+        coarsest = max(COARSEST * math.sqrt(self.solid_angle / m), 2 * floor)
+        steps = max(3, 1 + math.ceil(math.log(coarsest / floor) / math.log(SCALE_STEP)))
+        self.scales = np.geomspace(floor, coarsest, steps)
+        self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
+        crowd = _nearest(bearings, bearings[self.chosen], TOGETHER * coarsest)
+        self.together = (crowd[:, None] <= TOGETHER * self.scales[:, None]).sum(-1)
+        self.groups = _label_groups(self.chosen, sets.labels2d, sets.labels3d, len(sets.points3d))
+
+    def log_evidence(self, seen: Array) -> float:
+        """log mean_{s, w} prod_i x_i^(1 / c_i), the largest x_i left out, of points seen in directions (n, 3)."""
+        logs = np.zeros((len(self.chosen), len(self.scales), len(SHARES)))
+        for rows, columns in self.groups:
+            used, bearings = seen[columns][np.isfinite(seen[columns, 0])], self.sets.bearings[self.chosen[rows]]
+            near2 = _nearest(used, bearings, math.sqrt(FARTHEST) * float(self.scales[-1])) ** 2
+            part = np.empty((len(rows), *logs.shape[1:]))
+            _log_ratios(near2, self.density(bearings, used), self.scales, SHARES, part)
+            logs[rows] = part
+        fixing = np.partition(logs, len(self.chosen) - FIXING, 0)[-FIXING:]
+        evidence = (logs / self.together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
+        return float(np.logaddexp.reduce(evidence.ravel())) - math.log(evidence.size)
 
     def density(self, bearings: Array, directions: Array) -> Array:
         """Directions per steradian around each bearing, smoothed by OUTLINE spreads; at least their mean density."""
@@ -136,6 +148,16 @@ class _View:
         squared = np.maximum(2 - 2 * bearings @ some.T, 0)
         smooth = np.exp(squared / (-2 * width2)).sum(1) / (2 * math.pi * width2) * (len(directions) / len(some))
         return np.maximum(smooth, mean)
+
+
+def _nearest(directions: Array, bearings: Array, radius: float) -> Array:
+    """Chords (k, l) from each bearing to its nearest directions, ascending; infinite beyond `radius`."""
+    if not len(directions):
+        return np.full((len(bearings), 1), np.inf)
+    count = min(len(directions), MOST_NEIGHBOURS)
+    # The bound excludes what lies at it.
+    chords = cKDTree(directions).query(bearings, count, distance_upper_bound=radius * (1 + 1e-9))[0]
+    return np.asarray(chords).reshape(len(bearings), -1)
 
 
 def _label_groups(

@@ -5,15 +5,26 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+
 from bpnp.search.annealing import Deadline, finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.few.search import is_few, judged_few, search_few
 from bpnp.search.nearby import cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT, Batch, SearchSettings
 from bpnp.search.starts import PosePrior, Prior
-from bpnp.search.verdict import SearchResult, is_certain, is_exhausted, judged, no_pose, weighed
+from bpnp.search.verdict import (
+    SearchResult,
+    is_certain,
+    is_exhausted,
+    is_unique,
+    judged,
+    no_pose,
+    weighed,
+    with_false_alarms,
+)
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 LEADERS = 3  # candidates that are weighed after a batch; all of them are in the end
@@ -69,32 +80,50 @@ def search_poses(
     if len(few):
         rotation, translation = scene.enter(few.rotation, few.translation)
         candidates = replace(few, rotation=rotation, translation=translation)
-    batches, stalled, best = 0, 0, -math.inf
-    over = False
-    while batches < settings.max_batches and not (over or end.passed()):
-        found = _batch(scene, batches, known, candidates, share, end)
+    rule, batches, best = settings.evidence, 0, -math.inf
+    searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
+    certain = exhausted = False
+    while searched < settings.max_batches and not (certain or exhausted or end.passed()):
+        found, size = _batch(scene, batches, known, candidates, share, end)
         candidates = merged([candidates, found], scene)
         batches += 1
+        searched += size
         if len(candidates):
-            stalled = stalled + 1 if candidates.score[0] < best + settings.evidence.better else 0
+            stalled = candidates.score[0] < best + rule.better
+            bettered = bettered if stalled else searched
             best = float(candidates.score[0])
-            leaders = weighed(in_user_frame(candidates[:LEADERS], scene), sets, settings.evidence)
-            over = is_certain(leaders, sets, settings.evidence) or is_exhausted(candidates, scene, stalled)
+            candidates, leaders = _weighed_leaders(candidates, scene, sets)
+            # A pose that was just found may be an optimum beside a better one, which starts around it will find.
+            settled = stalled or is_unique(leaders, sets, rule)
+            certain = settled and is_certain(leaders, sets, rule)
+            exhausted = is_exhausted(candidates, scene, searched - bettered)
         if progress is not None:
             progress(batches, time.monotonic() - start)
     if len(candidates):
-        candidates = finish(scene, candidates, share, end, None if clutter is None else ())
-    return judged(in_user_frame(candidates, scene), sets, batches=batches, rule=settings.evidence)
+        annealed = LEADERS if certain else None
+        candidates = finish(scene, candidates, share, end, None if clutter is None else (), annealed)
+    return judged(in_user_frame(candidates, scene), sets, batches=batches, rule=rule)
 
 
 def _batch(
     scene: Scene, number: int, prior: Prior | None, best: Candidates, outliers: float, deadline: Deadline
-) -> Candidates:
-    """One batch of starts; of a rough pose every other one is looked up in a raster, which finds other poses."""
-    recipes = scene.settings.recipes
-    if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
-        return run_batch(scene, recipes[number % len(recipes)], prior, best, outliers, deadline)
-    if number % 2 == 0:
-        return nearby_batch(scene, prior, outliers, deadline)
-    recipe = cooled(recipes[number // 2 % len(recipes)], prior, scene)
-    return run_batch(scene, recipe, prior, best, outliers, deadline)
+) -> tuple[Candidates, float]:
+    """One batch of starts, and its share of a full one.
+
+    Of a rough pose all batches are full, and every other one is looked up in a raster, which finds other poses.
+    """
+    settings = scene.settings
+    size, recipe = settings.batch(number), settings.recipes[number % len(settings.recipes)]
+    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
+        if number % 2 == 0:
+            return nearby_batch(scene, prior, outliers, deadline), 1.0
+        size = Batch(settings.starts, settings.coarse, settings.middle)
+        recipe = cooled(settings.recipes[number // 2 % len(settings.recipes)], prior, scene)
+    return run_batch(scene, size, recipe, prior, best, outliers, deadline), size.starts / settings.starts
+
+
+def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:
+    """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
+    leaders = with_false_alarms(in_user_frame(candidates[:LEADERS], scene), sets)
+    alarms = np.concatenate([leaders.log10_false_alarms, candidates.log10_false_alarms[LEADERS:]])
+    return replace(candidates, log10_false_alarms=alarms), weighed(leaders, sets, scene.settings.evidence)

@@ -1,6 +1,8 @@
 """Every constant that tunes the search, in one argument: what it is, its unit, and why it has this value."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 
 @dataclass(frozen=True)
@@ -115,11 +117,12 @@ class Evidence:
     translations by this share of their length, are different.
     loose_deg: standard deviation of the rotation about its least certain axis; few points that fix it less well than
         this leave the verdict ambiguous.
-    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed; or
+    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
+    first four have 720 starts, of which 5 are within 30 degrees of any rotation. Or
     matched, over_chance: this share of the points is matched, and so many times the share expected by chance.
-    stalled: batches in a row that do not better the best log-likelihood by `better` nats a bearing end the search,
-    as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the bearings, and
-    its matched share above plausible_matched; wrong poses of sparse points had up to a quarter.
+    stalled: so many full batches of starts that do not better the best log-likelihood by `better` nats a bearing end
+    the search, as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the
+    bearings, and its matched share above plausible_matched; wrong poses of sparse points had up to a quarter.
     """
 
     false_alarms: float = -2.0
@@ -130,9 +133,9 @@ class Evidence:
     hits: int = 4
     matched: float = 0.2
     over_chance: float = 6.0
-    stalled: int = 4
+    stalled: float = 4.0
     better: float = 0.002
-    enough_hits: int = 8
+    enough_hits: int = 12
     plausible_scale: float = 2.0
     plausible_matched: float = 0.25
 
@@ -141,7 +144,9 @@ class Evidence:
 class SearchSettings:
     """All of it; the stages are described in docs/search.md.
 
-    max_batches: of starts. starts: a batch; 1200 rotations leave no gap over 25 degrees.
+    max_batches: full batches of starts. starts: of a full one; 1200 rotations leave no gap over 25 degrees.
+    first_starts: of the first batch; each next one has twice as many until it is full. Easy pairs need no more. A small
+        batch hands on the square root of its share of a full one from stage to stage, and least_kept at least.
     recipes: of the batches, in turn.
     least_annealed: points of the smaller side; fewer are only enumerated (`bpnp.search.few`), since the soft assignment
         of so few has no smooth optimum.
@@ -158,6 +163,8 @@ class SearchSettings:
 
     max_batches: int = 32
     starts: int = 1200
+    first_starts: int = 48
+    least_kept: int = 3
     recipes: tuple[Recipe, ...] = (Recipe(0.30, 0.0, 0.5), Recipe(0.30, 1.0, 0.8), Recipe(0.35, 0.5, 1.2))
     coarse: ClusterStage = ClusterStage(64, last_scale=0.1, iterations=10, kept=48, apart_deg=3.0)
     middle: ClusterStage = ClusterStage(256, last_scale=0.04, iterations=16, kept=10, apart_deg=1.0)
@@ -180,13 +187,30 @@ class SearchSettings:
     starts_a_check: int = 32
 
     def __post_init__(self) -> None:
-        if self.max_batches < 1 or self.starts < 1 or not self.recipes:
+        if min(self.max_batches, self.starts, self.first_starts) < 1 or not self.recipes:
             raise ValueError(
-                f"expected one or more `max_batches`, `starts` and `recipes`, got {self.max_batches}, {self.starts} "
-                f"and {len(self.recipes)}; try SearchSettings()"
+                "expected one or more `max_batches`, `starts`, `first_starts` and `recipes`, got "
+                f"{self.max_batches}, {self.starts}, {self.first_starts} and {len(self.recipes)}; try SearchSettings()"
             )
         if not (0 < self.outliers < 1 and all(0 < share < 1 for share in self.end_outliers)):
             raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
+
+    def batch(self, number: int) -> "Batch":
+        """The size of a batch, counted from 0."""
+        starts = min(self.starts, self.first_starts * 2 ** min(number, 60))
+        share = math.sqrt(starts / self.starts)
+        coarse, middle = (
+            min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept))) for stage in (self.coarse, self.middle)
+        )
+        return Batch(starts, replace(self.coarse, kept=coarse), replace(self.middle, kept=middle))
+
+
+class Batch(NamedTuple):
+    """starts: that are drawn. coarse, middle: the stages that they go through, with as many poses kept as they need."""
+
+    starts: int
+    coarse: ClusterStage
+    middle: ClusterStage
 
 
 DEFAULT = SearchSettings()

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose
 from bpnp.search.candidates import Candidates
-from bpnp.search.false_alarms import log10_false_alarms
+from bpnp.search.false_alarms import log10_false_alarms_of
 from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
@@ -54,6 +54,14 @@ class SearchResult:
         return float(self.candidates.log10_false_alarms[0]) if len(self.candidates) else math.inf
 
 
+def with_false_alarms(candidates: Candidates, sets: PointSets) -> Candidates:
+    """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
+    alarms = candidates.log10_false_alarms.copy()
+    new = np.isnan(alarms)
+    alarms[new] = log10_false_alarms_of(sets, candidates.rotation[new], candidates.translation[new])
+    return replace(candidates, log10_false_alarms=alarms)
+
+
 def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Candidates:
     """The candidates, in the user's coordinates, with their false alarms; the best first, the others as they were.
 
@@ -62,12 +70,11 @@ def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.ev
     """
     if not len(candidates):
         return candidates
-    alarms = np.array(
-        [log10_false_alarms(sets, r, t) for r, t in zip(candidates.rotation, candidates.translation, strict=True)]
-    )
+    candidates = with_false_alarms(candidates, sets)
+    alarms = candidates.log10_false_alarms
     first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
-    return replace(candidates, log10_false_alarms=alarms)[order]
+    return candidates[order]
 
 
 def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> tuple[float, int]:
@@ -109,11 +116,11 @@ def is_unique(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.
     return bool(candidates.matched[0] > max(rule.matched, rule.over_chance * by_chance))
 
 
-def is_exhausted(candidates: Candidates, scene: Scene, stalled: int) -> bool:
+def is_exhausted(candidates: Candidates, scene: Scene, stalled: float) -> bool:
     """Whether a search should end though no pose is certain: batches keep ending at the best one, or stall.
 
-    stalled: batches in a row that did not better it. It has to be plausible: its residuals about the spacing of the
-    bearings or less, and enough points matched; otherwise the right pose has not been met yet.
+    stalled: starts since it was bettered, in full batches. It has to be plausible: its residuals about the spacing of
+    the bearings or less, and enough points matched; otherwise the right pose has not been met yet.
     """
     rule = scene.settings.evidence
     if not len(candidates) or (int(candidates.hits[0]) < rule.enough_hits and stalled < rule.stalled):

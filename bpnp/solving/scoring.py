@@ -1,5 +1,6 @@
 """Results that did not come out of one search: of the poses of a module, and of two searches together."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +42,8 @@ def joined(problem: Problem, around: SearchResult, anywhere: SearchResult) -> Se
     scene = Scene(sets, 0, DEFAULT)
     parts = []
     for result in (around, anywhere):
+        unknown = np.full(len(result.candidates), math.nan)  # what a prior adds to them holds no longer
         rotation, translation = scene.enter(result.candidates.rotation, result.candidates.translation)
-        parts.append(replace(result.candidates, rotation=rotation, translation=translation))
+        parts.append(replace(result.candidates, rotation=rotation, translation=translation, log10_false_alarms=unknown))
     poses = in_user_frame(merged(parts, scene), scene)
     return judged(poses, sets, batches=around.batches + anywhere.batches)

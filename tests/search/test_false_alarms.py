@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.false_alarms import log10_false_alarms
+from bpnp.search.false_alarms import log10_false_alarms, log10_false_alarms_of
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -62,6 +62,17 @@ def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
         products.append(log10_tests - log10_false_alarms(sets, turn, np.zeros(3)))
     for bound in (0.5, 1, 2):
         assert np.mean(np.array(products) > bound) <= 10**-bound
+
+
+def test_poses_together_have_the_evidence_of_each_alone() -> None:
+    rng = np.random.default_rng(2)
+    rays, points, rotation = planted(rng, 80)
+    sets = PointSets(rays, points)
+    turns, shifts = np.stack([rotation, np.eye(3), rotation]), np.stack([SHIFT, SHIFT, -SHIFT])
+    alone = [log10_false_alarms(sets, r, t) for r, t in zip(turns, shifts, strict=True)]
+    assert log10_false_alarms_of(sets, turns, shifts).tolist() == alone
+    assert alone[0] < -10 < 0 < alone[1]
+    assert log10_false_alarms_of(sets, turns[:0], shifts[:0]).shape == (0,)
 
 
 def test_it_does_not_depend_on_the_frame_or_unit_of_the_scene() -> None:

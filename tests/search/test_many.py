@@ -15,7 +15,7 @@ from bpnp.models import Search
 from bpnp.models.search_solver import refine, search
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior, super_fibonacci
 from bpnp.types import Batch
 
@@ -45,6 +45,29 @@ def test_search_finds_poses_among_clutter(outliers):
     problem = plant(2, 200, seed=5, noise=1e-4, outliers2d=outliers, outliers3d=outliers)
     rotation, translation, _ = search(problem.bearings, problem.points3d)
     found(rotation, translation, problem, 0.5)
+
+
+def test_batches_grow_until_they_are_full():
+    sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
+    assert [size.starts for size in sizes] == [48, 96, 192, 384, 768, 1200, 1200, 1200]
+    for stage in ("coarse", "middle"):
+        kept = [getattr(size, stage).kept for size in sizes]
+        assert kept == sorted(kept)
+        assert kept[0] >= DEFAULT.least_kept
+        assert kept[-1] == getattr(DEFAULT, stage).kept
+
+
+def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
+    settings = SearchSettings(max_batches=2, starts=96, first_starts=24)
+    rng, seen = np.random.default_rng(0), []
+    noise = rng.normal(size=(80, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
+    unrelated = PointSets(noise / np.linalg.norm(noise, axis=1, keepdims=True), rng.normal(size=(80, 3)))
+    search_poses(unrelated, settings=settings, progress=lambda batches, _: seen.append(batches))
+    assert seen == [1, 2, 3, 4]  # 24 + 48 + 96 starts are less than 2 x 96, and one more batch is not
+    related = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
+    easy = search_poses(related)
+    assert easy.verdict == "confident"
+    assert easy.batches <= 4  # 720 starts
 
 
 def test_units_and_origin_of_the_scene_do_not_matter(problem):
@@ -166,7 +189,9 @@ def test_wrong_budgets_are_refused(problem, wrong):
         search(problem.bearings, problem.points3d, **wrong)
 
 
-@pytest.mark.parametrize("wrong", [{"max_batches": 0}, {"starts": 0}, {"recipes": ()}, {"outliers": 1.0}])
+@pytest.mark.parametrize(
+    "wrong", [{"max_batches": 0}, {"starts": 0}, {"first_starts": 0}, {"recipes": ()}, {"outliers": 1.0}]
+)
 def test_settings_without_a_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="expected"):
         SearchSettings(**wrong)

@@ -142,6 +142,15 @@ def assign_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scale: Any
 
 
 @compiled
+def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
+    """Element by element: numba compiles an assignment of arrays for 3 s, most of it the message of a wrong shape."""
+    for r in range(3):
+        for c in range(3):
+            to_rotation[r, c] = rotation[r, c]
+        to_translation[r] = translation[r]
+
+
+@compiled
 def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int,
                    result: Any) -> None:  # fmt: skip
     """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best.
@@ -168,10 +177,8 @@ def descend_sparse(grid: Any, p: Any, rotation: Any, translation: Any, scales: A
             since += 1
             if likelihood > result[k, 0]:
                 result[k, 0], result[k, 1], result[k, 2] = likelihood, matched, scale
-                best_rotation[:] = rotation[k]
-                best_translation[:] = translation[k]
+                copy_pose(rotation[k], translation[k], best_rotation, best_translation)
                 since = 0
             if since > patience or not move(q, p, rotation[k], translation[k], F(1), hessian, gradient, step):
                 break
-        rotation[k] = best_rotation
-        translation[k] = best_translation
+        copy_pose(best_rotation, best_translation, rotation[k], translation[k])
