@@ -14,12 +14,18 @@ from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
+from bpnp.solving.finishing import finished, without_pose
+from bpnp.solving.priors import checked_prior
+from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution
-from bpnp.solving.solve import solve
+from bpnp.solving.sources import Options, results_of
 
 MOST_KEYPOINTS = (
     2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
 )
+BRIEF = replace(DEFAULT, max_batches=2)  # one batch that is looked up, one that is annealed on clusters
+LONGER = replace(DEFAULT, max_batches=10)
+PROMISING = 3  # views that are tried longer if none is confident
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
@@ -43,9 +49,10 @@ def localize(
     prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
     time_limit: seconds for all views together, after which no search begins; None for no limit.
 
-    Each view's points are tried until a pose is confident; else the likeliest of all is returned. `solution.view` is
-    the view whose points gave the pose. `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's
-    COLMAP model; `solution.points3d` with the ids `solution.point_ids` are the points that were tried.
+    Each view's points are tried briefly until a pose is confident, then the most promising ones longer; else the pose
+    with the fewest false alarms is returned. `solution.view` is the view whose points gave the pose.
+    `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d` with
+    the ids `solution.point_ids` are the points that were tried.
     Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
     """
     start = time.monotonic()
@@ -58,35 +65,40 @@ def localize(
     strongest = None if scores is None else np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
     used = keypoints if strongest is None else np.asarray(keypoints)[strongest]
     regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
-    best: Solution | None = None
-    for tried, region in enumerate(regions, 1):
-        left = None if time_limit is None else time_limit - (time.monotonic() - start)
-        if best is not None and left is not None and left <= 0:
-            break
-        found = _tried(scene, region, used, camera, prior, seed, None if left is None else max(left, 1e-3))
-        found = counted(found, tried)
-        best = found if best is None else max(best, found, key=_rank)
-        if best.verdict == "confident":
-            break
-    if best is None:
+    found: list[tuple[Region, Solution]] = []
+    chosen, tries, over = regions, 0, False
+    for settings in (BRIEF, LONGER):
+        for region in chosen:
+            left = None if time_limit is None else time_limit - (time.monotonic() - start)
+            over = over or (bool(found) and left is not None and left <= 0)
+            if over:
+                break
+            tries += 1
+            options = Options(None, seed, None if left is None else max(left, 1e-3), None, None, settings)
+            found.append((region, counted(_tried(scene, region, used, camera, prior, options), tries)))
+            over = found[-1][1].verdict == "confident"
+        found.sort(key=lambda item: _rank(item[1]), reverse=True)
+        chosen = [region for region, _ in found[:PROMISING]]
+    if not found:
         raise ValueError("expected a map with views that see 4 or more points, got none")
+    best = found[0][1]
     if strongest is not None:
         best = _with_all_keypoints(best, strongest, keypoints, camera)
     return replace(best, seconds=time.monotonic() - start)
 
 
 def _tried(
-    scene: ViewedPoints,
-    region: Region,
-    keypoints: Any,
-    camera: Any,
-    prior: PosePrior | None,
-    seed: int,
-    left: float | None,
+    scene: ViewedPoints, region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options
 ) -> Solution:
     """The best pose of the photo among the points of one region."""
-    known = region.prior(scene) if prior is None else prior
-    found = solve(keypoints, scene.points3d[region.points], camera, prior=known, seed=seed, time_limit=left)
+    known = checked_prior(region.prior(scene) if prior is None else prior)
+    problem = problem_from(keypoints, scene.points3d[region.points], camera_from(camera))
+    dropped = len(problem.points2d) - len(problem.usable)
+    if problem.degenerate is not None:
+        found = without_pose(problem, problem.degenerate, None, dropped)
+    else:
+        ((_, result, seconds),) = results_of(None, {0: problem}, {0: known}, options)
+        found = finished(problem, result, seconds, None, dropped)
     ids = scene.point_ids[region.points]
     matches = np.column_stack([found.matches[:, 0], ids[found.matches[:, 1]]])
     return replace(found, matches=matches, view=region.view.name, point_ids=ids)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
-from bpnp.search.settings import DEFAULT
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.priors import Prior
@@ -30,13 +30,14 @@ Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, 
 
 
 class Options(NamedTuple):
-    """What applies to all pairs; see `bpnp.solve`. device: None for that of each module."""
+    """What applies to all pairs; see `bpnp.solve`. device: None for that of each module. settings: of the search."""
 
     clutter: float | None
     seed: int
     time_limit: float | None
     device: torch.device | None
     progress: Progress | None
+    settings: SearchSettings = DEFAULT
 
 
 def results_of(
@@ -104,6 +105,7 @@ def _search(number: int, options: Options, deadline: Deadline) -> Callable[..., 
         clutter=options.clutter,
         seed=options.seed,
         deadline=deadline,
+        settings=options.settings,
         progress=None if options.progress is None else partial(options.progress, number),
     )
 
