@@ -51,8 +51,8 @@ def localize(
 
     Each view's points are tried briefly until a pose is confident, then the most promising ones longer; else the pose
     with the fewest false alarms is returned. `solution.view` is the view whose points gave the pose.
-    `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d` with
-    the ids `solution.point_ids` are the points that were tried.
+    `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
+    with the ids `solution.point_ids` are the points that were tried.
     Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
     """
     start = time.monotonic()
