@@ -5,13 +5,17 @@ from pathlib import Path
 from rich.console import Console
 
 from bpnp.commands.output import console, say
-from bpnp.localization.point_files import read_camera, read_points
+from bpnp.localization.point_files import read_camera, read_image, read_scene
 from bpnp.localization.priors import read_prior
 from bpnp.localization.slow_progress import SlowProgress
 from bpnp.localization.solved import solution_table, write_text
 from bpnp.report.figures import SUFFIXES, save_figure
 from bpnp.report.pictures import solution_picture
+from bpnp.search.starts import GravityPrior
+from bpnp.solving.priors import Prior
 from bpnp.solving.solve import solve as find_pose
+
+Vector = tuple[float, float, float]
 
 
 def solve(
@@ -26,6 +30,9 @@ def solve(
     prior: Path | None = None,
     prior_degrees: float = 10.0,
     prior_distance: float | None = None,
+    up_camera: tuple[float, float, float] | None = None,
+    up_scene: tuple[float, float, float] | None = None,
+    up_degrees: float = 2.0,
     clutter: float | None = None,
     solver: str = "search",
     inlier_threshold: float | None = None,
@@ -39,8 +46,8 @@ def solve(
     Files: docs/solve.md.
 
     Args:
-        points2d: .npy, .csv or .txt; pixels with --camera, else x/z y/z.
-        points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb).
+        points2d: .npy, .csv or .txt; pixels with --camera, else x/z y/z; a column named label.
+        points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label.
         camera: file with a 3x3 matrix, or COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
@@ -49,6 +56,9 @@ def solve(
         prior: rough pose, the JSON of a solution; or a checkpoint.
         prior_degrees: standard deviation of its rotation.
         prior_distance: standard deviation of its translation, scene units; unknown by default.
+        up_camera: direction up in the camera (x right, y down, z forward), if gravity is known.
+        up_scene: the same direction in the scene.
+        up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
         solver: search, or the checkpoint of a BPnPNet.
         inlier_threshold: largest error of a match, pixels with a camera.
@@ -56,16 +66,20 @@ def solve(
         seed: of the search.
         device: such as cuda; cpu by default.
     """
-    image_points = read_points(points2d)
-    scene_points = read_points(points3d, 3, surface=surface, seed=seed)
+    image_points, labels2d = read_image(points2d)
+    scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
+    known = _known(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
     _prepare(output, picture)
     with SlowProgress("searching the pose") as progress:
         solution = find_pose(
             image_points,
             scene_points,
             None if camera is None else read_camera(camera),
+            normals3d=normals3d,
+            labels2d=labels2d,
+            labels3d=labels3d,
             solver=solver,
-            prior=None if prior is None else read_prior(prior, prior_degrees, prior_distance),
+            prior=known,
             inlier_threshold=inlier_threshold,
             clutter=clutter,
             seed=seed,
@@ -82,6 +96,20 @@ def solve(
         say(write_text(output, solution.to_json() + "\n"), to=said)
     if picture is not None:
         say(save_figure(solution_picture(solution, title=points2d.stem), picture), to=said)
+
+
+def _known(
+    prior: Path | None, degrees: float, distance: float | None, up_camera: Vector | None, up_scene: Vector | None,
+    up_degrees: float,
+) -> Prior | str | Path | None:  # fmt: skip
+    """The prior that the options describe."""
+    if (up_camera is None) != (up_scene is None):
+        raise ValueError("expected --up_camera and --up_scene together, got one of them")
+    if up_camera is None or up_scene is None:
+        return None if prior is None else read_prior(prior, degrees, distance)
+    if prior is not None:
+        raise ValueError("expected --prior or --up_camera with --up_scene, got both")
+    return GravityPrior(up_camera, up_scene, up_degrees)
 
 
 def _prepare(output: Path | None, picture: Path | None) -> None:

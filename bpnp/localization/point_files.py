@@ -10,6 +10,7 @@ from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices,
 
 Array = npt.NDArray[np.float64]
 TEXTS = (".csv", ".txt", ".xyz")
+NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 
 
 def read_points(path: Path, width: int | None = None, *, surface: int | None = None, seed: int = 0) -> Array:
@@ -32,7 +33,7 @@ def read_points(path: Path, width: int | None = None, *, surface: int | None = N
     if suffix == ".npy":
         points = _npy(path)
     elif suffix in TEXTS:
-        points = _columns(path)
+        points, _ = _columns(path)
     else:
         known = (".npy", *TEXTS, *(SUFFIXES if width == 3 else ()))
         raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
@@ -44,6 +45,55 @@ def read_points(path: Path, width: int | None = None, *, surface: int | None = N
     return points
 
 
+def read_scene(
+    path: Path, *, surface: int | None = None, seed: int = 0
+) -> tuple[Array, Array | None, npt.NDArray[np.int64] | None]:
+    """Points (n, 3) of a file, and their outward normals (n, 3) and labels (n,) where it has them.
+
+    As `read_points`; a text may have columns nx, ny, nz and label beside x, y, z: by the names in its first line, or
+    without names after the coordinates, in this order (4, 6 or 7 columns).
+    """
+    if path.suffix.lower() not in TEXTS or surface is not None or not path.is_file():
+        return read_points(path, 3, surface=surface, seed=seed), None, None
+    return _annotated(path, ("x", "y", "z"))
+
+
+def read_image(path: Path) -> tuple[Array, npt.NDArray[np.int64] | None]:
+    """Image points (m, 2) or unit bearings (m, 3), and labels (m,) where a column of a text is named label."""
+    if path.suffix.lower() not in TEXTS or not path.is_file() or LABEL not in (_columns(path)[1] or ()):
+        return read_points(path), None
+    points, _, labels = _annotated(path, ("x", "y"))
+    return points, labels
+
+
+def _annotated(
+    path: Path, coordinates: tuple[str, ...]
+) -> tuple[Array, Array | None, npt.NDArray[np.int64] | None]:  # fmt: skip
+    values, names = _columns(path)
+    if names is None:
+        shapes = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
+        if values.shape[1] not in shapes:
+            known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
+            raise ValueError(
+                f"expected {known} in {path}, got shape {values.shape}"
+                f"{' (are the two files swapped?)' if values.shape[1] == 2 else ''}"
+            )
+        names = [*coordinates, *shapes[values.shape[1]]]
+    place = {name: column for column, name in enumerate(names)}
+    if not set(coordinates) <= set(place):
+        hint = " (are the two files swapped?)" if len(names) == 2 else ""
+        raise ValueError(f"expected columns {', '.join(coordinates)} in {path}, got {', '.join(names)}{hint}")
+    points = values[:, [place[name] for name in coordinates]]
+    normals = values[:, [place[name] for name in NORMAL]] if set(NORMAL) <= set(place) else None
+    if LABEL not in place:
+        return points, normals, None
+    labels = values[:, place[LABEL]]
+    fractions = labels[labels != np.round(labels)]
+    if len(fractions):
+        raise ValueError(f"expected integers in the column label of {path}, got {fractions[0]:g}")
+    return points, normals, labels.astype(np.int64)
+
+
 def read_camera(text: str) -> Any:
     """The camera that `--camera` names: a file with a 3x3 matrix, or a COLMAP model with its parameters.
 
@@ -52,7 +102,7 @@ def read_camera(text: str) -> Any:
     """
     path = Path(text)
     if path.is_file():
-        return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)
+        return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)[0]
     words = text.replace(",", " ").split()
     try:
         numbers = [float(word) for word in words[1:]]
@@ -86,12 +136,14 @@ def _npy(path: Path) -> Array:
         raise ValueError(f"expected an array of numbers in {path}, got {error}") from error
 
 
-def _columns(path: Path) -> Array:
+def _columns(path: Path) -> tuple[Array, list[str] | None]:
+    """The numbers of a text, and the names of its columns if the first line has one for each."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
         raise ValueError(f"expected text with numbers in {path}, got {error}") from error
     rows: list[list[float]] = []
+    names: list[str] | None = None
     for number, line in enumerate(text.splitlines(), 1):
         content = line.partition("#")[0].strip()
         if not content:
@@ -102,14 +154,15 @@ def _columns(path: Path) -> Array:
             row = [float(word) for word in words]
         except ValueError:
             if not rows and not any(_is_number(word) for word in words):
-                continue  # names of the columns
+                names = [word.strip().lower() for word in words]
+                continue
             raise ValueError(f"expected numbers in line {number} of {path}, got {line[:60]!r}") from None
         if rows and len(row) != len(rows[0]):
             raise ValueError(f"expected {len(rows[0])} numbers in line {number} of {path}, got {len(row)}")
         rows.append(row)
     if not rows:
         raise ValueError(f"expected lines of numbers in {path}, got none")
-    return np.array(rows)
+    return np.array(rows), names if names is not None and len(names) == len(rows[0]) else None
 
 
 def _is_number(word: str) -> bool:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bpnp.localization.point_files import read_camera, read_points
+from bpnp.localization.point_files import read_camera, read_image, read_points, read_scene
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
@@ -119,3 +119,31 @@ def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
 def test_what_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected --camera as a file"):
         read_camera(text)
+
+
+def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> None:
+    named, plain, image = (tmp_path / name for name in ("named.csv", "plain.txt", "image.csv"))
+    named.write_text("label,x,y,z,nx,ny,nz\n7,1,2,3,0,0,1\n-1,4,5,6,1,0,0\n")
+    plain.write_text("1 2 3 0 0 1 7\n4 5 6 1 0 0 -1\n")
+    for path in (named, plain):
+        points, normals, labels = read_scene(path)
+        np.testing.assert_array_equal(points, [[1, 2, 3], [4, 5, 6]])
+        np.testing.assert_array_equal(normals, [[0, 0, 1], [1, 0, 0]])
+        np.testing.assert_array_equal(labels, [7, -1])
+    image.write_text("x;y;label\n10;20;7\n30;40;8\n")
+    points, labels = read_image(image)
+    np.testing.assert_array_equal(points, [[10, 20], [30, 40]])
+    np.testing.assert_array_equal(labels, [7, 8])
+
+
+def test_columns_that_mean_nothing_are_named(tmp_path: Path) -> None:
+    path = tmp_path / "points.csv"
+    for text, message in (
+        ("1 2 3 4 5\n", r"expected 3 to 4 or 6 to 7 columns .* got shape \(1, 5\)"),
+        ("1 2\n", "are the two files swapped"),
+        ("a,b,label\n1,2,3\n", "expected columns x, y, z in .*points.csv, got a, b, label"),
+        ("x,y,z,label\n1,2,3,0.5\n", "expected integers in the column label"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ValueError, match=message):
+            read_scene(path)
