@@ -92,7 +92,8 @@ def test_a_rough_pose_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     (tmp_path / "rough.json").write_text(json.dumps({"rotation": rotation, "translation": translation}))
     rough = ["--prior", str(tmp_path / "rough.json"), "--prior-degrees", "5", "--prior-distance", "0.2"]
     main(["solve", *write(tmp_path), "--json", *rough])
-    np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-8)
+    # The rough pose is an observation too: it pulls by the square of the ratio of its width to that of the residuals.
+    np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
