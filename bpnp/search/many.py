@@ -82,27 +82,35 @@ def search_poses(
         candidates = replace(few, rotation=rotation, translation=translation)
     rule, batches, best = settings.evidence, 0, -math.inf
     searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
-    certain = exhausted = False
-    while searched < settings.max_batches and not (certain or exhausted or end.passed()):
+
+    def finished(annealed: int | None = None) -> SearchResult:
+        poses = candidates
+        if len(poses):
+            poses = finish(scene, poses, share, end, None if clutter is None else (), annealed)
+        return judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
+
+    exhausted = False
+    while searched < settings.max_batches and not (exhausted or end.passed()):
         found, size = _batch(scene, batches, known, candidates, share, end)
         candidates = merged([candidates, found], scene)
         batches += 1
         searched += size
-        if len(candidates):
-            stalled = candidates.score[0] < best + rule.better
-            bettered = bettered if stalled else searched
-            best = float(candidates.score[0])
-            candidates, leaders = _weighed_leaders(candidates, scene, sets)
-            # A pose that was just found may be an optimum beside a better one, which starts around it will find.
-            settled = stalled or is_unique(leaders, sets, rule)
-            certain = settled and is_certain(leaders, sets, rule)
-            exhausted = is_exhausted(candidates, scene, searched - bettered)
         if progress is not None:
             progress(batches, time.monotonic() - start)
-    if len(candidates):
-        annealed = LEADERS if certain else None
-        candidates = finish(scene, candidates, share, end, None if clutter is None else (), annealed)
-    return judged(in_user_frame(candidates, scene), sets, batches=batches, rule=rule)
+        if not len(candidates):
+            continue
+        stalled = candidates.score[0] < best + rule.better
+        bettered = bettered if stalled else searched
+        best = float(candidates.score[0])
+        candidates, leaders = _weighed_leaders(candidates, scene, sets)
+        # A pose that was just found may be an optimum beside a better one, which starts around it will find.
+        settled = stalled or is_unique(leaders, sets, rule)
+        if settled and is_certain(leaders, sets, rule, batches=batches):
+            certain = finished(LEADERS)
+            if certain.verdict == "confident":  # on all bearings too
+                return certain
+        exhausted = is_exhausted(candidates, scene, searched - bettered)
+    return finished()
 
 
 def _batch(

@@ -118,7 +118,8 @@ class Evidence:
     loose_deg: standard deviation of the rotation about its least certain axis; few points that fix it less well than
         this leave the verdict ambiguous.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
-    first four have 720 starts, of which 5 are within 30 degrees of any rotation. Or
+    first four have 720 starts, of which 5 are within 30 degrees of any rotation. Of so many batches well_matched_hits
+    are enough where the share well_matched is matched: it leaves a better pose little to explain. Or
     matched, over_chance: this share of the points is matched, and so many times the share expected by chance.
     stalled: so many full batches of starts that do not better the best log-likelihood by `better` nats a bearing end
     the search, as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the
@@ -131,6 +132,8 @@ class Evidence:
     other_shift: float = 0.1
     loose_deg: float = 0.8
     hits: int = 4
+    well_matched: float = 0.5
+    well_matched_hits: int = 2
     matched: float = 0.2
     over_chance: float = 6.0
     stalled: float = 4.0

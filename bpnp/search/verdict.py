@@ -93,7 +93,12 @@ def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evide
 
 
 def is_certain(
-    candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence, *, exhaustive: bool = False
+    candidates: Candidates,
+    sets: PointSets,
+    rule: Evidence = DEFAULT.evidence,
+    *,
+    exhaustive: bool = False,
+    batches: int = 0,
 ) -> bool:
     """Whether weighed candidates leave no doubt about the first: the verdict "confident".
 
@@ -102,7 +107,9 @@ def is_certain(
     """
     if not len(candidates):
         return False
-    found = exhaustive or int(candidates.hits[0]) >= rule.hits or is_unique(candidates, sets, rule)
+    well_matched = batches >= rule.hits and candidates.matched[0] >= rule.well_matched
+    repeated = int(candidates.hits[0]) >= (rule.well_matched_hits if well_matched else rule.hits)
+    found = exhaustive or repeated or is_unique(candidates, sets, rule)
     chance = float(candidates.log10_false_alarms[0]) <= rule.false_alarms
     return chance and found and lead(candidates, sets, rule)[0] >= rule.lead
 
@@ -139,7 +146,7 @@ def judged(
     candidates = weighed(candidates, sets, rule)
     alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
     chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
-    if is_certain(candidates, sets, rule, exhaustive=exhaustive):
+    if is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches):
         return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
