@@ -132,7 +132,7 @@ class Evidence:
     other_shift: float = 0.1
     loose_deg: float = 0.8
     hits: int = 4
-    well_matched: float = 0.5
+    well_matched: float = 0.6
     well_matched_hits: int = 2
     matched: float = 0.2
     over_chance: float = 6.0
