@@ -8,7 +8,8 @@ from small_data import small_net
 from torch import Tensor, nn
 
 from bpnp import Batch, Matcher, Pose, SolveStats
-from bpnp.models import Refinement
+from bpnp.geometry import is_finite
+from bpnp.models import Refinement, evaluation
 from bpnp.models.evaluation import ALONE, TRUST, WIDTH, log_support, refinement_enabled
 from bpnp.types import Prediction
 
@@ -73,17 +74,17 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
     refinement, batch = Refinement(), planted.batch()
     wrong, calls = planted.near(2.5), []
 
-    def annealed(rays: Tensor, points3d: Tensor, rotation: Tensor, *rest: Tensor) -> object:
+    def annealed(_: Tensor, __: Tensor, rotation: Tensor, translation: Tensor, **masks: Tensor) -> object:
         calls.append(rotation.shape[1])
         crowd = rotation.shape[1] > 2
         ends = (torch.stack([planted.rotation[0], wrong[0][1]]), torch.stack([planted.translation[0], wrong[1][1]]))
         turned, shifted = ends if crowd else planted.pose
-        missing = ~rotation.isfinite().all((-2, -1)).any(1)
+        missing = ~is_finite(rotation, translation).any(1)
         turned = turned.masked_fill(missing[:, None, None], torch.nan)
         shifted = shifted.masked_fill(missing[:, None], torch.nan)
         return turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing)
 
-    monkeypatch.setattr(refinement.anneal, "forward", annealed)
+    monkeypatch.setattr(evaluation, "refine", annealed)
     stats = SolveStats(torch.zeros(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
     own = Pose(*planted.near(0.02), stats)
     refined = refinement(Prediction(planted.permutation(), poses={"ransac": own, "pnp": own}), batch).poses["refined"]
