@@ -138,6 +138,8 @@ def test_files_are_short_and_folders_small() -> None:
 def test_the_tests_mirror_the_package() -> None:
     rooms = {folder.relative_to(PACKAGE).parts[0] for folder in FOLDERS if folder != PACKAGE}
     assert {folder.name for folder in TESTS.iterdir() if any(folder.glob("test_*.py"))} <= {*rooms, "commands"}
+    names = [file.name for file in TESTS.rglob("test_*.py")]
+    assert len(names) == len(set(names))  # pytest collects only one file of a name
 
 
 def test_only_the_command_line_prints_and_no_assertion_decides_anything() -> None:

@@ -16,9 +16,9 @@ from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
+from bpnp.solving.given_poses import joined, scored
 from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
-from bpnp.solving.scoring import joined, scored
 from bpnp.types import Batch
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first

@@ -6,8 +6,8 @@ from planted import plant
 
 from bpnp.search.annealing import Deadline
 from bpnp.search.verdict import SearchResult
+from bpnp.solving.given_poses import joined, scored
 from bpnp.solving.problem import Problem, problem_from
-from bpnp.solving.scoring import joined, scored
 
 
 def ended(problem: Problem, pose: tuple[torch.Tensor, torch.Tensor]) -> SearchResult:
