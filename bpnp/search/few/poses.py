@@ -18,6 +18,7 @@ from bpnp.search.few.knowledge import knowledge_of, predicted_pose
 from bpnp.search.few.state import Enumeration, Stage
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import PosePrior, Prior
+from bpnp.search.symmetries import near_symmetries
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -109,12 +110,19 @@ def enumerate_poses(
     scene = scene_arrays(sets.points3d, sets.normals3d, sets.labels3d, settings.witnesses)
     lookup = _lookup(prior, scene, radius, settings)
     image = ImageArrays(sets.bearings, radius, sets.labels2d, lookup)
+    symmetries = near_symmetries(sets.points3d)
     run = Enumeration(scene, image, knowledge_of(prior, scene, image), settings.kept, lookup)
+
+    def vary() -> None:
+        run.vary_best()
+        for turn, shift in symmetries:
+            rotation, translation = run.best_pose()
+            run.refine(run.enter(rotation @ turn, rotation @ shift + translation), run.widest)
 
     def enough(safe: float = settings.safe) -> FewPoses | None:
         if run.best < run.tests:
             return None
-        run.vary_best()
+        vary()
         found = _found(run, exhausted=False)
         needed = safe * (1 - run.solved / settings.patience)
         doubtful = margin(found, settings) < needed or not (is_safe is None or is_safe(found))
@@ -134,12 +142,12 @@ def enumerate_poses(
             if (found := enough()) is not None:
                 return found
             if time.monotonic() > deadline or run.solved > settings.most:
-                run.vary_best()
+                vary()
                 return _found(run, exhausted=False)
         complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
         if complete and stage.pairs == 3 and stage.reach == settings.stages[-1].reach:
             break
-    run.vary_best()
+    vary()
     return _found(run, exhausted=complete)
 
 

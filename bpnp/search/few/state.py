@@ -118,6 +118,11 @@ class Enumeration:
             self.known.directions, self.found, self.work,
         )  # fmt: skip
 
+    def best_pose(self) -> tuple[Array, Array]:
+        """Rotation (3, 3) and translation (3,) of the best pose, of the given points."""
+        rotation, translation = self.leave(self.found[0][[int(self.found[1].argmax())]])
+        return rotation[0], translation[0]
+
     def enter(self, rotation: Array, translation: Array) -> Array:
         """A pose of the given points as (12,) in these frames."""
         turned = self.image.turn @ rotation
