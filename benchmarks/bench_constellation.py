@@ -9,6 +9,7 @@ the constellation baseline, SoftPOSIT and blind RANSAC are run on frames of some
 """
 
 import argparse
+import contextlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -151,13 +152,18 @@ def devices(setting: Setting, frames: int, seed: int, solver: Any = "search") ->
 
 def pictures(setting: Setting, frames: int, seed: int, rng: np.random.Generator) -> list[Frame]:
     """Frames of a setting; every fifth has a new device."""
-    return [
-        frame(
-            device(setting.kind, 1000 * seed + i // 5), rng, camera=setting.camera, noise=setting.noise,
-            background=setting.background, missing=setting.missing, least=setting.least, most=setting.most,
-        )
-        for i in range(frames)
-    ]  # fmt: skip
+    return [_picture(setting, 1000 * seed + i // 5, rng) for i in range(frames)]
+
+
+def _picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
+    """A frame of the device with this seed, or of the next one whose LEDs can be seen."""
+    for number in range(100):
+        with contextlib.suppress(ValueError):
+            return frame(
+                device(setting.kind, seed + 10**6 * number), rng, camera=setting.camera, noise=setting.noise,
+                background=setting.background, missing=setting.missing, least=setting.least, most=setting.most,
+            )  # fmt: skip
+    raise ValueError(f"expected a device of {setting.name} whose LEDs can be seen, got none of 100")
 
 
 def _outcome(picture: Frame, setting: Setting, rng: np.random.Generator, solver: Any) -> Outcome:

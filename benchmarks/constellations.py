@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 Kind = Literal["ring", "headset", "drone", "marker"]
+MOST_POSES = 2000  # that are drawn for one picture
 FACING_DEG = 78.0  # largest angle between a normal and the line of sight to a LED that is seen
 SIZES = {"ring": 17, "headset": 34, "drone": 8, "marker": 5}
 
@@ -128,9 +129,10 @@ def frame(
 
     noise: pixels, standard deviation. background: lights that are not the device's, uniform in the picture or, half of
     them, around the device. missing: share of the LEDs that face the camera and are not detected. distance: metres.
-    off_axis: of the device from the optical axis, share of half the picture.
+    off_axis: of the device from the optical axis, share of half the picture. Raises ValueError for a device of which
+    so many are never seen.
     """
-    while True:
+    for _ in range(MOST_POSES):
         rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
         middle = camera.bearings(camera.size / 2 * (1 + off_axis * rng.uniform(-1, 1, (1, 2))))[0]
         translation = rng.uniform(*distance) * middle
@@ -150,6 +152,7 @@ def frame(
         return Frame(
             every, camera, device, rotation, translation, np.concatenate([led, np.full(background, -1)])[order]
         )
+    raise ValueError(f"expected a device of which {least} LEDs can be seen at once, got none of {MOST_POSES} poses")
 
 
 def seen(
