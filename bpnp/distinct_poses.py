@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 Array = NDArray[np.floating[Any]]
 
 
+def turned_by(one: Array, other: Array) -> float:
+    """Angle between two rotations (3, 3), radians, in [0, pi]."""
+    cosine = (float((one * other).sum()) - 1) / 2
+    return math.acos(min(max(cosine, -1.0), 1.0))
+
+
 def same_pose(rotation: Array, translation: Array, i: int, degrees: float, shift: float) -> NDArray[np.bool_]:
     """Which poses (c, 3, 3), (c, 3) are within `degrees` and `shift` of pose i, itself among them; NaN is not."""
     flat = rotation.reshape(-1, 9)

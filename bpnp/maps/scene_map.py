@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, camera_models, colmap_camera
+from bpnp.cameras import Camera, camera_models
 from bpnp.datamodules.colmap.model_files import ColmapError, ModelRecords, read_records
+from bpnp.datamodules.colmap.reconstruction import camera_of
 from bpnp.maps.localize import localize
 from bpnp.maps.views import View, ViewedPoints
 from bpnp.search.starts import PosePrior
@@ -71,7 +72,9 @@ def _scene_map(folder: Path, records: ModelRecords) -> SceneMap:
             broken += 1
             continue
         if record.camera_id not in cameras:
-            cameras[record.camera_id] = _camera(folder, records, record.camera_id)
+            cameras[record.camera_id] = camera_of(
+                records.cameras.get(record.camera_id), f"camera {record.camera_id} of an image in {folder}"
+            )
         observed = np.unique(record.point_ids[record.point_ids >= 0])
         place = np.minimum(np.searchsorted(ids, observed), max(len(ids) - 1, 0))
         views.append(
@@ -93,13 +96,3 @@ def _scene_map(folder: Path, records: ModelRecords) -> SceneMap:
             "try a model with registered images"
         )
     return SceneMap(points3d, ids, np.zeros(len(ids), np.int32), tuple(views)).seen_by(1)
-
-
-def _camera(folder: Path, records: ModelRecords, number: int) -> Camera:
-    record = records.cameras.get(number)
-    if record is None:
-        raise ColmapError(f"expected camera {number} of an image in {folder}, got no such camera; try another model")
-    try:
-        return colmap_camera(record.model, record.params)
-    except ValueError as error:
-        raise ColmapError(f"camera {number} in {folder}: {error}; try another model") from error

@@ -1,23 +1,23 @@
 """How likely a pose fits by chance: the a-contrario number of false alarms, for 4 points or 10,000.
 
 The question: were the image points unrelated to the scene, how many of all the poses that could have been tried would
-fit as well as this one? Unrelated means: at scales finer than h, image point i falls with the density l_i of the
-projected points around it, wherever those happen to lie. A pose that explains it predicts the mixture
+fit as well as this one? Unrelated means: at scales finer than h, half the spread of the bearings, image point i falls
+with the density l_i of the projected points around it, wherever those happen to lie. A pose that explains it predicts
+the mixture
 
-    x_i = 1 - w + w g_i / l_i,    g_i = sum_j N(f_i - u_j; s^2),    l_i = max(sum_j N(f_i - u_j; h_i^2), n / A)
+    x_i = 1 - w + w g_i / l_i,    g_i = sum_j N(f_i - u_j; s^2),    l_i = max(sum_j N(f_i - u_j; h^2), n / A)
 
 u_j the direction in which the pose sees scene point j, N the normal density on the tangent plane, s the scale of the
-residuals, w the share of the image points that have a partner, h_i = max(3 s, half the distance to the 8th neighbour),
-and A the solid angle of the view. For unrelated points x_i has the mean 1, so that the product of the x_i exceeds a
-bound b with a probability of at most 1 / b (Markov). From this follow
+residuals, w the share of the image points that have a partner, n the projected points in the view and A its solid
+angle. For unrelated points x_i has the mean 1, so that the product of the x_i exceeds a bound b with a probability of
+at most 1 / b (Markov). From this follow
 
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
 
 T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2). The three largest
 x_i are left out, whatever their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number
 of image points within 2 s of point i: keypoints that lie together are one observation. The mean over a fixed set of
-(s, w) counts what was looked at. A prior reduces T to the share of the
-poses that it allows.
+(s, w) counts what was looked at. A prior reduces T to the share of the poses that it allows.
 
 Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; L. Moisan, B. Stival, A probabilistic
 criterion to detect rigid point matches, IJCV 2004. That the likelihood ratio takes the place of a binomial tail keeps

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.distinct_poses import turned_by
 from bpnp.search.starts import GravityPrior, Prior
 
 Array = NDArray[np.float64]
@@ -45,8 +46,7 @@ class PointSets:
             off = _angle(up, np.asarray(self.prior.up_camera))
             return math.log10(_cap(max(off, math.radians(SIGMAS * self.prior.sigma_deg))))
         known = np.asarray(self.prior.rotation, np.float64)
-        cosine = (float((rotation * known).sum()) - 1) / 2
-        off = max(math.acos(min(max(cosine, -1.0), 1.0)), math.radians(SIGMAS * self.prior.rotation_sigma_deg))
+        off = max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg))
         share = _ball(off)
         if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
             middle = np.median(self.points3d, 0)
@@ -58,10 +58,13 @@ class PointSets:
         return math.log10(share)
 
 
-def solid_angle(bearings: Array) -> float:
-    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most."""
+def solid_angle(bearings: Array, *, ddof: int = 1) -> float:
+    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most.
+
+    ddof: 1 for the variances of what few bearings are a sample of, 0 for those of the bearings themselves.
+    """
     centred = bearings - bearings.mean(0)
-    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - 1, 1))[1:]
+    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - ddof, 1))[1:]
     return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
 
 

@@ -8,9 +8,9 @@ from scipy.cluster.vq import vq
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.point_sets import PointSets
+from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.settings import SearchSettings
-from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread, solid_angle
+from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
@@ -41,7 +41,8 @@ class Scene:
         order = self.rng.permutation(len(points3d))
         self.points3d = ((points3d - self.centre) / self.size)[order].astype(np.float32)
         self.bulk3d = self.points3d[in_bulk[order]]
-        self.spread, self.solid_angle = angular_spread(self.offsets), solid_angle(self.offsets)
+        self.spread = angular_spread(self.offsets)
+        self.solid_angle = solid_angle(self.offsets.astype(np.float64), ddof=0)
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread)

@@ -100,9 +100,3 @@ def draw_poses(
 def angular_spread(offsets: Array) -> float:
     """Root mean square distance of the bearings from their mean, radians for a narrow view."""
     return max(float(np.sqrt(offsets.var(0, dtype=np.float64).sum())), 1e-12)
-
-
-def solid_angle(offsets: Array) -> float:
-    """Steradians that the bearings fill: of the rectangle with their principal standard deviations, 4 pi at most."""
-    variances = np.linalg.eigvalsh(np.cov(offsets.T.astype(np.float64), bias=True))[1:]
-    return float(np.clip(12 * math.sqrt(max(float(variances.prod()), 0.0)), 1e-20, 4 * math.pi))

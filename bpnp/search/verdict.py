@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import same_pose
+from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.false_alarms import log10_false_alarms_of
 from bpnp.search.point_sets import PointSets, solid_angle
@@ -151,8 +151,7 @@ def judged(
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
     if ahead < rule.lead:
-        turned = candidates.rotation[0].T @ candidates.rotation[other]
-        degrees = math.degrees(math.acos(min(max((float(np.trace(turned)) - 1) / 2, -1.0), 1.0)))
+        degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[other]))
         reason = f"{chance}, but a pose {degrees:.0f} deg away fits about as well ({_number(ahead)} times the number)"
     elif alarms > rule.false_alarms:
         reason = f"{chance}: too many to be sure"

@@ -80,7 +80,8 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
             lost["images with a broken pose"] += 1
             continue
         if record.camera_id not in cameras:
-            cameras[record.camera_id] = _camera(path, record, records.cameras.get(record.camera_id))
+            where = f"camera {record.camera_id} of image {record.name!r} in {path}"
+            cameras[record.camera_id] = camera_of(records.cameras.get(record.camera_id), where)
         images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost))
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
@@ -99,7 +100,10 @@ def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], 
     """
     records = read_records(folder, camera_models=camera_models())
     cameras = {image.camera_id: image for image in records.images}
-    lenses = {key: _camera(folder, image, records.cameras.get(key)) for key, image in cameras.items()}
+    lenses = {
+        key: camera_of(records.cameras.get(key), f"camera {key} of image {image.name!r} in {folder}")
+        for key, image in cameras.items()
+    }
     sizes = {key: np.array(records.cameras[key].size, np.float64) for key in lenses}
     if not all((size > 0).all() for size in sizes.values()):
         raise ColmapError(f"expected cameras with a width and a height in {folder}, got 0; try another model")
@@ -110,8 +114,8 @@ def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], 
     return {image.name: partial(place, key=image.camera_id) for image in records.images}
 
 
-def _camera(folder: Path, image: ImageRecord, record: CameraRecord | None) -> Camera:
-    where = f"camera {image.camera_id} of image {image.name!r} in {folder}"
+def camera_of(record: CameraRecord | None, where: str) -> Camera:
+    """The camera of a record; `where` names it in the error for one that is missing or not usable."""
     if record is None:
         raise ColmapError(f"expected {where}, got no such camera; try another model")
     try:
