@@ -14,11 +14,10 @@ from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
-from bpnp.solving.finishing import finished, without_pose
 from bpnp.solving.priors import checked_prior
 from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution
-from bpnp.solving.sources import Options, results_of
+from bpnp.solving.sources import Options, solutions_of
 
 MOST_KEYPOINTS = (
     2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
@@ -74,7 +73,8 @@ def localize(
             if over:
                 break
             tries += 1
-            options = Options(None, seed, None if left is None else max(left, 1e-3), None, None, settings)
+            limit = None if left is None else max(left, 1e-3)
+            options = Options(seed=seed, time_limit=limit, settings=settings)
             found.append((region, counted(_tried(scene, region, used, camera, prior, options), tries)))
             over = found[-1][1].verdict == "confident"
         found.sort(key=lambda item: _rank(item[1]), reverse=True)
@@ -92,13 +92,8 @@ def _tried(
 ) -> Solution:
     """The best pose of the photo among the points of one region."""
     known = checked_prior(region.prior(scene) if prior is None else prior)
-    problem = problem_from(keypoints, scene.points3d[region.points], camera_from(camera))
-    dropped = len(problem.points2d) - len(problem.usable)
-    if problem.degenerate is not None:
-        found = without_pose(problem, problem.degenerate, None, dropped)
-    else:
-        ((_, result, seconds),) = results_of(None, {0: problem}, {0: known}, options)
-        found = finished(problem, result, seconds, None, dropped)
+    problem = problem_from(keypoints, scene.points3d[region.points], camera_from(camera), prior=known)
+    found = solutions_of({0: problem}, options)[0]
     ids = scene.point_ids[region.points]
     matches = np.column_stack([found.matches[:, 0], ids[found.matches[:, 1]]])
     return replace(found, matches=matches, view=region.view.name, point_ids=ids)

@@ -36,19 +36,22 @@ def device_from(wanted: str | torch.device | None) -> torch.device | None:
 
 
 def each_set(name: str, values: Any, size: int | None, axes: int = 2) -> list[Any]:
-    """The arrays of the pairs, of `axes` axes each; one array is shared by all where their number is known."""
-    if isinstance(values, (np.ndarray, torch.Tensor)):
-        if values.ndim == axes and size is not None:
-            return [values] * size
-        if values.ndim != axes + 1:
-            raise ValueError(f"expected `{name}` as a sequence of arrays, one a pair, got shape {tuple(values.shape)}")
+    """The arrays of the pairs, of `axes` axes each; one array is shared by all where their number is known.
+
+    None, for what is not known of any pair, is shared too.
+    """
+    if size is not None and (values is None or getattr(values, "ndim", 0) == axes):
+        return [values] * size
+    wanted = f"expected `{name}` as a sequence of arrays, one a pair"
+    if getattr(values, "ndim", axes + 1) != axes + 1:
+        raise ValueError(f"{wanted}, got shape {tuple(values.shape)}")
     try:
         found = list(values)
     except TypeError as error:
-        raise ValueError(f"expected `{name}` as a sequence of arrays, one a pair, got {values!r:.60}") from error
+        raise ValueError(f"{wanted}, got {values!r:.60}") from error
     if not found or (size is not None and len(found) != size):
-        wanted = "one array a pair" if size is None else f"{size} arrays as in `points2d`"
-        raise ValueError(f"expected {wanted} in `{name}`, got {len(found)}")
+        count = "one array a pair" if size is None else f"{size} arrays as in `points2d`"
+        raise ValueError(f"expected {count} in `{name}`, got {len(found)}")
     return found
 
 
@@ -63,14 +66,9 @@ def each_of(name: str, given: Any, size: int) -> list[Any]:
 
 def each_camera(given: Any, size: int) -> list[Camera | None]:
     """One camera for all, or a list or stack of them. A 3x3 matrix as a list of lists is one camera."""
-    return [None if one is None else camera_from(one) for one in _each_given_camera(given, size)]
-
-
-def _each_given_camera(given: Any, size: int) -> list[Any]:
-    if isinstance(given, (np.ndarray, torch.Tensor)) and given.ndim == 3:
+    if getattr(given, "ndim", 2) == 3:
         given = list(given)
-    if isinstance(given, list) and given and np.ndim(given[0]) == 1 and not isinstance(given[0], (tuple, str)):
-        return [given] * size
-    if isinstance(given, list) and given and isinstance(given[0], str):
-        return [tuple(given)] * size
-    return each_of("camera", given, size)
+    elif isinstance(given, list) and given and not isinstance(given[0], tuple):
+        rows = isinstance(given[0], str) or np.ndim(given[0]) == 1  # (model, parameters), or the rows of one matrix
+        given = tuple(given) if rows else given
+    return [None if one is None else camera_from(one) for one in each_of("camera", given, size)]

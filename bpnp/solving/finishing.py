@@ -11,38 +11,35 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.matches import count_one_to_one, fit_pose, mutual_nearest, one_to_one
 from bpnp.solving.problem import Array, Problem
-from bpnp.solving.solution import Candidate, Solution, SolutionStats, no_pose
+from bpnp.solving.solution import Candidate, Solution, SolutionStats
 
 SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
 FIT_ROUNDS = 5
 SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
-def finished(
-    problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None, dropped: int
-) -> Solution:
+def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
     """Matches, a last fit to them, and the inliers of every candidate."""
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        return without_pose(problem, result.reason, inlier_threshold, dropped)
+        return without_pose(problem, result.reason, inlier_threshold)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
-    rotation, translation = result.best
+    poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
-        rotation, translation = _fitted(problem, rotation, translation, threshold)
-    projected = problem.view(rotation, translation)
+        poses[0] = _fitted(problem, *poses[0], threshold)
+    projected, *others = (problem.view(*pose) for pose in poses)
     matches = one_to_one(problem.image, projected, threshold, problem.allowed)
-    counts = [len(matches)] + [
-        count_one_to_one(problem.image, problem.view(r, t), threshold, problem.allowed)
-        for r, t in zip(found.rotation[1:], found.translation[1:], strict=True)
-    ]
-    rotations = [rotation, *found.rotation[1:]]
-    translations = [
-        t - r @ problem.origin for r, t in zip(rotations, [translation, *found.translation[1:]], strict=True)
-    ]
-    error, error_deg = _errors(problem, rotation, translation, projected, matches)
+    counts = [count_one_to_one(problem.image, seen, threshold, problem.allowed) for seen in others]
+    error, error_deg = _errors(problem, *poses[0], projected, matches)
+    candidates = tuple(
+        Candidate(rotation, translation - rotation @ problem.origin, score, count, alarms)
+        for (rotation, translation), score, count, alarms in zip(
+            poses, found.score.tolist(), [len(matches), *counts], found.log10_false_alarms.tolist(), strict=True
+        )
+    )
     return Solution(
-        rotation=rotation,
-        translation=translations[0],
+        rotation=candidates[0].rotation,
+        translation=candidates[0].translation,
         matches=np.stack([problem.usable[matches[:, 0]], matches[:, 1]], -1),
         inlier_count=len(matches),
         inlier_ratio=len(matches) / min(len(problem.points2d), len(problem.points3d)),
@@ -50,17 +47,25 @@ def finished(
         reprojection_error=error,
         reprojection_error_deg=error_deg,
         unit=problem.unit,
-        candidates=tuple(
-            Candidate(*values)
-            for values in zip(
-                rotations, translations, found.score.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
-            )
-        ),
+        candidates=candidates,
         verdict=result.verdict,
         reason=result.reason,
         log10_false_alarms=result.log10_false_alarms,
-        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", dropped),
+        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", *problem.left_out),
         seconds=seconds + time.perf_counter() - start,
+        points2d=problem.points2d,
+        points3d=problem.points3d,
+    )
+
+
+def without_pose(problem: Problem, reason: str, inlier_threshold: float | None) -> Solution:
+    dropped, taken = problem.left_out
+    return Solution(
+        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
+        unit=problem.unit,
+        verdict="failed",
+        reason=reason,
+        stats=SolutionStats(dropped2d=dropped, taken2d=taken),
         points2d=problem.points2d,
         points3d=problem.points3d,
     )
@@ -99,26 +104,3 @@ def _errors(
     sine = np.linalg.norm(np.cross(problem.bearings[i], camera), axis=-1)
     angle = np.degrees(np.arctan2(sine, (problem.bearings[i] * camera).sum(-1)))
     return float(distance.mean()), float(angle.mean())
-
-
-def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, dropped: int) -> Solution:
-    rotation, translation = no_pose()
-    return Solution(
-        rotation=rotation,
-        translation=translation,
-        matches=np.empty((0, 2), np.int64),
-        inlier_count=0,
-        inlier_ratio=0.0,
-        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
-        reprojection_error=math.nan,
-        reprojection_error_deg=math.nan,
-        unit=problem.unit,
-        candidates=(),
-        verdict="failed",
-        reason=reason,
-        log10_false_alarms=math.inf,
-        stats=SolutionStats(dropped2d=dropped),
-        seconds=0.0,
-        points2d=problem.points2d,
-        points3d=problem.points3d,
-    )

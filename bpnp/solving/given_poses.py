@@ -22,7 +22,7 @@ def scored(problem: Problem, rotation: Array, translation: Array, deadline: Dead
     found = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
     if not found.any():
         return no_pose("the module found no pose")
-    scene = Scene(problem.sets(), 0, DEFAULT)
+    scene = Scene(problem.sets, 0, DEFAULT)
     starts = Candidates.unscored(*scene.enter(rotation[found], translation[found]))
     # Each starts at the scale of its own residuals: the median distance of a point to the nearest bearing.
     tree = cKDTree(problem.bearings)
@@ -33,17 +33,16 @@ def scored(problem: Problem, rotation: Array, translation: Array, deadline: Dead
         distance[i] = np.median(tree.query(camera / length)[0])
     starts = replace(starts, scale=np.maximum(distance, scene.smallest_scale))
     poses = finish(scene, starts, DEFAULT.outliers, deadline)
-    return judged(in_user_frame(poses, scene), problem.sets(), batches=len(starts))
+    return judged(in_user_frame(poses, scene), problem.sets, batches=len(starts))
 
 
 def joined(problem: Problem, around: SearchResult, anywhere: SearchResult) -> SearchResult:
     """The distinct poses of two searches, best first; a pose has the hits of both."""
-    sets = problem.sets()
-    scene = Scene(sets, 0, DEFAULT)
+    scene = Scene(problem.sets, 0, DEFAULT)
     parts = []
     for result in (around, anywhere):
         unknown = np.full(len(result.candidates), math.nan)  # what a prior adds to them holds no longer
         rotation, translation = scene.enter(result.candidates.rotation, result.candidates.translation)
         parts.append(replace(result.candidates, rotation=rotation, translation=translation, log10_false_alarms=unknown))
     poses = in_user_frame(merged(parts, scene), scene)
-    return judged(poses, sets, batches=around.batches + anywhere.batches)
+    return judged(poses, problem.sets, batches=around.batches + anywhere.batches)

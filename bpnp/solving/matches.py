@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
-from scipy.optimize import least_squares, linear_sum_assignment
+from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
@@ -29,56 +29,37 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
     allowed: which pairs, given as places i and j, may be matched. A minimum-weight matching, in which leaving an image
     point out costs more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
     """
-    if len(image) * len(projected) <= DENSE:
-        within = _within(image, projected, radius, allowed)
-        cost = np.where(np.isfinite(within), (within / radius) ** 2, min(within.shape) + 2.0)
-        i, j = linear_sum_assignment(cost)
-        real = np.isfinite(within[i, j])
-        return np.stack([i[real], j[real]], -1).astype(np.int64)
-    pairs, distance = _edges(image, projected, radius, allowed)
+    pairs, distance = _near(image, projected, radius, allowed)
     if not len(pairs):
-        return np.empty((0, 2), np.int64)
-    # Only points of an edge take part. Column `count + i` stands for leaving row i out.
+        return pairs
+    # Only points of a near pair take part. Column `count + i` stands for leaving row i out.
     rows, row = np.unique(pairs[:, 0], return_inverse=True)
     columns, column = np.unique(pairs[:, 1], return_inverse=True)
-    count = len(columns)
+    count, every = len(columns), np.arange(len(rows))
     cost = (distance / radius) ** 2 + 1e-9  # zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
-    index = (np.r_[row, np.arange(len(rows))], np.r_[column, count + np.arange(len(rows))])
-    graph = csr_array((np.r_[cost, out], index), shape=(len(rows), count + len(rows)))
+    graph = csr_array((np.r_[cost, out], (np.r_[row, every], np.r_[column, count + every])))
     i, j = min_weight_full_bipartite_matching(graph)
     real = j < count
-    return np.stack([rows[i[real]], columns[j[real]]], -1).astype(np.int64)
+    return np.stack([rows[i[real]], columns[j[real]]], -1)
 
 
 def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:
     """How many pairs `one_to_one` has: a maximum matching, faster than one of least cost."""
-    if len(image) * len(projected) <= DENSE:
-        return len(one_to_one(image, projected, radius, allowed))
-    pairs, _ = _edges(image, projected, radius, allowed)
-    if not len(pairs):
-        return 0
-    graph = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(len(image), len(projected)))
+    pairs, _ = _near(image, projected, radius, allowed)
+    graph = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
 def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Matches:
     """Pairs within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
-    if len(image) * len(projected) <= DENSE:
-        within = _within(image, projected, radius, allowed)
-        i = np.flatnonzero(np.isfinite(within).any(1))
-        j = within[i].argmin(1)
-        mutual = within[:, j].argmin(0) == i
-        return np.stack([i[mutual], j[mutual]], -1)
-    seen = np.flatnonzero(np.isfinite(projected).all(-1))
-    if not len(seen):
-        return np.empty((0, 2), np.int64)
-    distance, forward = cKDTree(projected[seen]).query(image, distance_upper_bound=radius)
-    _, backward = cKDTree(image).query(projected[seen])
-    i = np.flatnonzero(np.isfinite(distance))
-    i = i[backward[forward[i]] == i]
-    j = seen[forward[i]]
-    return np.stack([i, j], -1)[allowed(i, j)]
+    pairs, distance = _near(image, projected, radius, allowed)
+    nearest = np.ones(len(pairs), np.bool_)
+    for side, size in enumerate((len(image), len(projected))):
+        least = np.full(size, np.inf)
+        np.minimum.at(least, pairs[:, side], distance)
+        nearest &= distance == least[pairs[:, side]]
+    return pairs[nearest]
 
 
 def fit_pose(
@@ -101,30 +82,26 @@ def fit_pose(
     return pose(found.x)
 
 
-def _within(image: Array, projected: Array, radius: float, allowed: Allowed) -> Array:
-    """All distances (m, n), infinite beyond `radius` and for pairs that are not allowed."""
-    distance = np.sqrt(((image[:, None] - projected[None]) ** 2).sum(-1))
-    i, j = np.indices(distance.shape).reshape(2, -1)
-    possible = (distance <= radius) & allowed(i, j).reshape(distance.shape)
-    return np.where(possible, distance, np.inf)
-
-
-def _edges(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Matches, Array]:
-    """Pairs within `radius` (e, 2) without repetition, among the nearest of either side, and their distances."""
+def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Matches, Array]:
+    """Allowed pairs (e, 2) within `radius`, ordered, and their distances; of many points, among the nearest of each."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
-    if not len(seen):
-        return np.empty((0, 2), np.int64), np.empty(0)
-    pairs, distances = [], []
-    for points, others, flip in ((image, projected[seen], False), (projected[seen], image, True)):
-        k = min(NEIGHBOURS, len(others))
-        distance, index = (
-            np.reshape(x, (len(points), k)) for x in cKDTree(others).query(points, k, distance_upper_bound=radius)
+    if len(image) * len(seen) <= DENSE:
+        distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
+        pairs = np.argwhere(distance <= radius)
+    else:
+        forward, backward = (
+            _neighbours(points, others, radius)
+            for points, others in ((image, projected[seen]), (projected[seen], image))
         )
-        own, nth = np.nonzero(np.isfinite(distance))
-        edge = np.stack([own, index[own, nth]], -1)
-        pairs.append(edge[:, ::-1] if flip else edge)
-        distances.append(distance[own, nth])
-    joined, first = np.unique(np.concatenate(pairs), axis=0, return_index=True)
-    joined[:, 1] = seen[joined[:, 1]]
-    possible = allowed(*joined.T)
-    return joined[possible].astype(np.int64), np.concatenate(distances)[first][possible]
+        pairs = np.unique(np.concatenate([forward, backward[:, ::-1]]), axis=0)
+    pairs[:, 1] = seen[pairs[:, 1]]
+    pairs = pairs[allowed(*pairs.T)]
+    return pairs, np.linalg.norm(image[pairs[:, 0]] - projected[pairs[:, 1]], axis=-1)
+
+
+def _neighbours(points: Array, others: Array, radius: float) -> Matches:
+    """Pairs of each point with the nearest others within `radius`."""
+    count = min(NEIGHBOURS, len(others))
+    distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
+    own, nth = np.nonzero(np.isfinite(distance))
+    return np.stack([own, index[own, nth]], -1)

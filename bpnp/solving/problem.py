@@ -12,27 +12,28 @@ from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.solving.annotations import checked_labels, checked_normals
+from bpnp.solving.annotations import UNIT_NORM, checked_labels, checked_normals
+from bpnp.solving.priors import Prior
 
 Array = npt.NDArray[np.float64]
 Unit = Literal["px", "normalised", "rad"]
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
 FLOOR_PIXELS = 0.1  # no detector of points is better
-UNIT_NORM = 1e-3
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """k usable of m given 2D points, and n 3D points.
+    """k usable of m given 2D points, and n 3D points, with all that is known of them and of the pose.
 
     bearings: (k, 3) unit. usable: (k,) their places among the given. image: (k, d) the usable points where residuals
     are measured, in `unit`: pixels with a camera, else the normalised image plane, or the unit sphere for bearings.
     points2d: (m, 2) normalised, NaN for a point that has no such coordinates. points3d: (n, 3) as given. origin: where
     solvers put the scene's origin, for scenes so far from it that float32 would lose digits. degenerate: why no pose
     can follow from these points, if so. normals3d: (n, 3) unit; labels2d: (k,) and labels3d: (n,), -1 for any.
+    prior: in the user's coordinates. taken2d: of the given 2D points, how many were left to another pair.
     """
 
     bearings: Array
@@ -47,6 +48,13 @@ class Problem:
     normals3d: Array | None = None
     labels2d: npt.NDArray[np.int64] | None = None
     labels3d: npt.NDArray[np.int64] | None = None
+    prior: Prior | None = None
+    taken2d: int = 0
+
+    @property
+    def left_out(self) -> tuple[int, int]:
+        """How many of the given 2D points could not be undistorted, and how many were left to another pair."""
+        return len(self.points2d) - len(self.usable) - self.taken2d, self.taken2d
 
     @cached_property
     def local3d(self) -> Array:
@@ -61,8 +69,10 @@ class Problem:
         stretch = (1 + (self.points2d[self.usable] ** 2).sum(-1)) ** 0.75
         return float(np.median(stretch) * (1.0 if self.camera is None else self.camera.focal))
 
-    def sets(self, prior: PosePrior | GravityPrior | None = None) -> PointSets:
+    @cached_property
+    def sets(self) -> PointSets:
         """What a search is given: the points around `origin`, the prior there, and the noise floor of the detector."""
+        prior = self.prior if isinstance(self.prior, (PosePrior, GravityPrior)) else None
         if isinstance(prior, PosePrior) and prior.translation is not None:
             moved = np.asarray(prior.translation) + np.asarray(prior.rotation) @ self.origin
             prior = prior._replace(translation=moved)
@@ -82,14 +92,15 @@ class Problem:
     def without(self, taken: npt.NDArray[np.int64]) -> "Problem":
         """The same without some of the given 2D points."""
         kept = ~np.isin(self.usable, taken)
-        labels = None if self.labels2d is None else self.labels2d[kept]
+        reason = _degenerate(self.bearings[kept], self.points3d, MIN_POINTS)
         return replace(
             self,
             bearings=self.bearings[kept],
             usable=self.usable[kept],
             image=self.image[kept],
-            labels2d=labels,
-            degenerate=self.degenerate or _degenerate(self.bearings[kept], self.points3d, MIN_POINTS),
+            labels2d=None if self.labels2d is None else self.labels2d[kept],
+            degenerate=None if reason is None else f"of the lights that no other pair has, {reason}",
+            taken2d=int((~kept).sum()),
         )
 
     def allowed(self, i: npt.NDArray[np.int64], j: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
@@ -118,23 +129,21 @@ def problem_from(
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
-    fewest: int = MIN_POINTS,
+    prior: Prior | None = None,
     where: str = "",
 ) -> Problem:
     """Check the arrays of one pair.
 
     points2d: (m, 2) pixels with a camera, normalised coordinates or (m, 3) unit bearings without; points3d (n, 3).
-    fewest: points of each side that fix a pose, 3 where gravity is known. where: added to the errors, to name the pair.
-    Pixels that cannot be undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape,
-    swapped, fewer than `fewest` points, NaN, pixels without a camera or the reverse, normals or labels that do not go
-    with the points.
+    where: added to the errors, to name the pair. Pixels that cannot be undistorted are left out of `usable`.
+    Raises ValueError that names the argument: wrong shape, swapped, fewer points than fix a pose (3 where gravity is
+    known, else 4), NaN, pixels without a camera or the reverse, normals or labels that do not go with the points.
     """
+    fewest = MIN_POINTS - isinstance(prior, GravityPrior)
     given2d, given3d = _numbers("points2d", points2d, where), _numbers("points3d", points3d, where)
     if given2d.ndim == 2 and given2d.shape[1] == 3 and (camera is not None or given3d.shape[-1:] == (2,)):
-        what = (
-            "pixels `points2d` of shape (m, 2) with a `camera`" if camera is not None else "`points3d` of shape (n, 3)"
-        )
         wrong = given2d if camera is not None else given3d
+        what = "`points3d` of shape (n, 3)" if camera is None else "pixels `points2d` of shape (m, 2) with a `camera`"
         raise ValueError(f"expected {what}{where}, got {wrong.shape} (are points2d and points3d swapped?)")
     _check_points("points2d", given2d, (2, 3) if camera is None else (2,), fewest, where)
     _check_points("points3d", given3d, (3,), fewest, where)
@@ -165,6 +174,7 @@ def problem_from(
         normals3d=checked_normals(normals3d, len(given3d), where),
         labels2d=None if labels is None else labels[0][usable],
         labels3d=None if labels is None else labels[1],
+        prior=prior,
     )
 
 

@@ -1,7 +1,6 @@
 """Several devices in one image: no light is matched to two of them."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 
 import numpy as np
 
@@ -20,15 +19,14 @@ def shared_lights(
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
-        if is_few(problem.sets()):
+        if problem.degenerate is None and is_few(problem.sets):
             groups.setdefault(problem.image.tobytes() + repr(problem.camera).encode(), []).append(i)
     for members in groups.values():
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):
             claimed = set(solutions[i].matches[:, 0].tolist())
             if claimed & taken:
-                again = solve_again(i, problems[i].without(np.array(sorted(taken))))
-                solutions[i] = replace(again, stats=replace(again.stats, taken2d=len(taken)))
+                solutions[i] = solve_again(i, problems[i].without(np.array(sorted(taken))))
                 claimed = set(solutions[i].matches[:, 0].tolist())
             if solutions[i].verdict != "failed":
                 taken |= claimed

@@ -2,7 +2,9 @@
 
 import json
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -52,7 +54,7 @@ class SolutionStats:
     taken2d: int = 0
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
     """The pose of one pair of point sets, camera = R p + t; without a pose NaN, no matches and the verdict "failed".
 
@@ -72,21 +74,21 @@ class Solution:
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
     """
 
-    rotation: Array
-    translation: Array
-    matches: npt.NDArray[np.int64]
-    inlier_count: int
-    inlier_ratio: float
-    inlier_threshold: float
-    reprojection_error: float
-    reprojection_error_deg: float
+    rotation: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
+    translation: Array = field(default_factory=lambda: np.full(3, math.nan))
+    matches: npt.NDArray[np.int64] = field(default_factory=lambda: np.empty((0, 2), np.int64))
+    inlier_count: int = 0
+    inlier_ratio: float = 0.0
+    inlier_threshold: float = math.nan
+    reprojection_error: float = math.nan
+    reprojection_error_deg: float = math.nan
     unit: Unit
-    candidates: tuple[Candidate, ...]
+    candidates: tuple[Candidate, ...] = ()
     verdict: Verdict
     reason: str
-    log10_false_alarms: float
+    log10_false_alarms: float = math.inf
     stats: SolutionStats
-    seconds: float
+    seconds: float = 0.0
     points2d: Array = field(repr=False)
     points3d: Array = field(repr=False)
     view: str | None = None
@@ -133,12 +135,9 @@ class Solution:
 
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""
-        content: dict[str, Any] = {"format": FORMAT}
-        content |= {f.name: getattr(self, f.name) for f in fields(self)} | {"centre": self.centre}
-        content["candidates"] = [vars(candidate) for candidate in self.candidates]
-        content["stats"] = vars(self.stats)
-        if not self.found:
-            content |= dict.fromkeys(POSE)
+        pose = {name: getattr(self, name) if self.found else None for name in ("rotation", "translation", "centre")}
+        content = {"format": FORMAT} | vars(self) | pose
+        content |= {"candidates": [vars(candidate) for candidate in self.candidates], "stats": vars(self.stats)}
         return json.dumps(_plain(content), allow_nan=False)
 
     @classmethod
@@ -149,39 +148,11 @@ class Solution:
             content = json.loads(text.read_bytes() if isinstance(text, Path) else text)
             if content["format"] != FORMAT:
                 raise ValueError(f"format {content['format']}, try the bpnp that wrote it")
-            known = {f.name: content[f.name] for f in fields(cls) if f.name not in OF_A_MAP}
-            known |= {name: content.get(name) for name in OF_A_MAP}
-            if known["point_ids"] is not None:
-                known["point_ids"] = np.array(known["point_ids"], np.int64)
-            candidates = tuple(
-                Candidate(
-                    _array(c["rotation"], 3, 3),
-                    _array(c["translation"], 3),
-                    c["score"],
-                    c["inlier_count"],
-                    _infinite(c["log10_false_alarms"]),
-                )  # fmt: skip
-                for c in known["candidates"]
-            )
-            if known["verdict"] not in get_args(Verdict):
-                raise ValueError(f"verdict {known['verdict']!r}")
-            return cls(
-                **known
-                | {"candidates": candidates, "stats": SolutionStats(**_numbers(known["stats"]))}
-                | {key: _array(known[key], *shape) for key, shape in SHAPES.items()}
-                | {"log10_false_alarms": _infinite(known["log10_false_alarms"])}
-                | {"matches": np.array(known["matches"], np.int64).reshape(-1, 2)}
-                | _numbers(
-                    {key: known[key] for key in ("inlier_threshold", "reprojection_error", "reprojection_error_deg")}
-                )
-            )
+            if content["verdict"] not in get_args(Verdict):
+                raise ValueError(f"verdict {content['verdict']!r}")
+            return _read(cls, content)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
-
-
-OF_A_MAP = ("view", "point_ids")  # not in the files of versions that had no maps
-POSE = ("rotation", "translation", "centre")
-SHAPES = {"rotation": (3, 3), "translation": (3,), "points2d": (-1, 2), "points3d": (-1, 3)}
 
 
 def _plain(value: Any) -> Any:
@@ -196,18 +167,30 @@ def _plain(value: Any) -> Any:
     return value
 
 
-def _infinite(value: float | None) -> float:
-    return math.inf if value is None else value
+def _read(kind: type, content: dict[str, Any]) -> Any:
+    """A dataclass of this file from its JSON. Files of versions that had no maps lack `view` and `point_ids`."""
+    optional = [f.name for f in fields(kind) if f.default is None and f.name not in content]
+    values = {f.name: content[f.name] for f in fields(kind) if f.name not in optional}
+    return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
 
 
-def _array(values: Any, *shape: int) -> Array:
+def _array(values: Any, *, shape: tuple[int, ...]) -> Array:
     return np.full(shape, math.nan) if values is None else np.array(values, np.float64).reshape(shape)
 
 
-def _numbers(values: dict[str, Any]) -> dict[str, Any]:
-    return {key: math.nan if value is None else value for key, value in values.items()}
+def _float(value: float | None, *, missing: float = math.nan) -> float:
+    return missing if value is None else value
 
 
-def no_pose() -> tuple[Array, Array]:
-    """The pose of a pair without one."""
-    return np.full((3, 3), math.nan), np.full(3, math.nan)
+READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in another form
+    "rotation": partial(_array, shape=(3, 3)),
+    "translation": partial(_array, shape=(3,)),
+    "points2d": partial(_array, shape=(-1, 2)),
+    "points3d": partial(_array, shape=(-1, 3)),
+    "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
+    "point_ids": lambda values: None if values is None else np.array(values, np.int64),
+    "log10_false_alarms": partial(_float, missing=math.inf),
+    **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual"), _float),
+    "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
+    "stats": lambda value: _read(SolutionStats, value),
+}

@@ -7,15 +7,12 @@ from typing import Any
 import torch
 from torch import nn
 
-from bpnp.geometry import MIN_POINTS
-from bpnp.search.starts import GravityPrior
 from bpnp.solving.arguments import device_from, each_camera, each_of, each_set, source_from
-from bpnp.solving.finishing import finished, without_pose
 from bpnp.solving.priors import Prior, checked_prior
-from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.problem import problem_from
 from bpnp.solving.sharing import shared_lights
 from bpnp.solving.solution import Solution
-from bpnp.solving.sources import Options, Progress, results_of
+from bpnp.solving.sources import Options, Progress, solutions_of
 
 
 def solve(
@@ -72,10 +69,9 @@ def solve(
     True
     """
     return solve_many(
-        [points2d], [points3d], camera, normals3d=None if normals3d is None else [normals3d],
-        labels2d=None if labels2d is None else [labels2d], labels3d=None if labels3d is None else [labels3d],
-        solver=solver, prior=prior, inlier_threshold=inlier_threshold, clutter=clutter, seed=seed,
-        time_limit=time_limit, device=device, progress=progress,
+        [points2d], [points3d], camera, normals3d=[normals3d], labels2d=[labels2d], labels3d=[labels3d], solver=solver,
+        prior=prior, inlier_threshold=inlier_threshold, clutter=clutter, seed=seed, time_limit=time_limit,
+        device=device, progress=progress,
     )[0]  # fmt: skip
 
 
@@ -114,42 +110,32 @@ def solve_many(
     for name, value in (("inlier_threshold", inlier_threshold), ("time_limit", time_limit)):
         if value is not None and not 0 < value < math.inf:
             raise ValueError(f"expected a positive `{name}`, got {value}")
+    options = Options(
+        source_from(solver), _float(inlier_threshold), _float(clutter), seed, _float(time_limit), device_from(device),
+        progress,
+    )  # fmt: skip
     sets2d = each_set("points2d", points2d, None)
-    sets3d = each_set("points3d", points3d, len(sets2d))
-    cameras = each_camera(camera, len(sets2d))
-    priors = {i: checked_prior(given) for i, given in enumerate(each_of("prior", prior, len(sets2d)))}
-    module, threshold = source_from(solver), _float(inlier_threshold)
-    options = Options(_float(clutter), seed, _float(time_limit), device_from(device), progress)
-    known = [
-        [None] * len(sets2d) if values is None else each_set(name, values, len(sets2d), axes)
-        for name, values, axes in (("normals3d", normals3d, 2), ("labels2d", labels2d, 1), ("labels3d", labels3d, 1))
-    ]
-    problems = [
-        problem_from(
-            x, p, lens, normals3d=normals, labels2d=labels, labels3d=others,
-            fewest=MIN_POINTS - isinstance(priors[i], GravityPrior),
-            where=f" in pair {i}" if len(sets2d) > 1 else "",
+    count = len(sets2d)
+    arguments = zip(
+        sets2d,
+        each_set("points3d", points3d, count),
+        each_camera(camera, count),
+        each_set("normals3d", normals3d, count),
+        each_set("labels2d", labels2d, count, axes=1),
+        each_set("labels3d", labels3d, count, axes=1),
+        map(checked_prior, each_of("prior", prior, count)),
+        strict=True,
+    )
+    problems = {
+        i: problem_from(
+            x, p, lens, normals3d=normals, labels2d=labels, labels3d=others, prior=known,
+            where=f" in pair {i}" if count > 1 else "",
         )
-        for i, (x, p, lens, normals, labels, others) in enumerate(zip(sets2d, sets3d, cameras, *known, strict=True))
-    ]  # fmt: skip
-    dropped = [len(problem.points2d) - len(problem.usable) for problem in problems]
-    solvable = {i: problem for i, problem in enumerate(problems) if problem.degenerate is None}
-    solutions = {
-        i: without_pose(problem, problem.degenerate, threshold, dropped[i])
-        for i, problem in enumerate(problems)
-        if problem.degenerate is not None
-    }
-    for i, result, seconds in results_of(module, solvable, priors, options):
-        solutions[i] = finished(problems[i], result, seconds, threshold, dropped[i])
-
-    def solve_again(i: int, problem: Problem) -> Solution:
-        if problem.degenerate is not None:
-            return without_pose(problem, f"of the lights that no other pair has, {problem.degenerate}", threshold, 0)
-        ((_, result, seconds),) = results_of(module, {i: problem}, priors, options)
-        return finished(problem, result, seconds, threshold, dropped[i])
-
-    shared_lights(solvable, solutions, solve_again)
-    return [solutions[i] for i in range(len(problems))]
+        for i, (x, p, lens, normals, labels, others, known) in enumerate(arguments)
+    }  # fmt: skip
+    solutions = solutions_of(problems, options)
+    shared_lights(problems, solutions, lambda i, problem: solutions_of({i: problem}, options)[i])
+    return [solutions[i] for i in range(count)]
 
 
 def _float(value: float | int | None) -> float | None:

@@ -16,9 +16,10 @@ from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
+from bpnp.solving.finishing import finished, without_pose
 from bpnp.solving.given_poses import joined, scored
-from bpnp.solving.priors import Prior
 from bpnp.solving.problem import Array, Problem
+from bpnp.solving.solution import Solution
 from bpnp.types import Batch
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
@@ -30,41 +31,63 @@ Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, 
 
 
 class Options(NamedTuple):
-    """What applies to all pairs; see `bpnp.solve`. device: None for that of each module. settings: of the search."""
+    """What applies to all pairs; see `bpnp.solve`.
 
-    clutter: float | None
-    seed: int
-    time_limit: float | None
-    device: torch.device | None
-    progress: Progress | None
+    solver: None for the search. device: None for that of each module. settings: of the search.
+    """
+
+    solver: nn.Module | None = None
+    inlier_threshold: float | None = None
+    clutter: float | None = None
+    seed: int = 0
+    time_limit: float | None = None
+    device: torch.device | None = None
+    progress: Progress | None = None
     settings: SearchSettings = DEFAULT
 
 
-def results_of(
-    module: nn.Module | None, problems: Mapping[int, Problem], priors: Mapping[int, Prior | None], options: Options
-) -> Iterator[tuple[int, SearchResult, float]]:
-    """The number of each problem, its result around the problem's origin, and the seconds it took.
+def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
+    """The solution of each problem, which has its number."""
+    solutions = {
+        i: without_pose(problem, problem.degenerate, options.inlier_threshold)
+        for i, problem in problems.items()
+        if problem.degenerate is not None
+    }
+    rest = {i: problem for i, problem in problems.items() if i not in solutions}
+    for i, result, seconds in (_searched if options.solver is None else _predicted)(rest, options):
+        solutions[i] = finished(problems[i], result, seconds, options.inlier_threshold)
+    return solutions
 
-    Of a module, which on a GPU gets pairs of similar size together, or, with None, of the search.
-    """
-    if module is not None:
-        net = evaluation_copy(module, options.device)
-        together = device_of(net).type != "cpu"
-        for group in _groups(problems) if together else [[number] for number in problems]:
-            start = time.perf_counter()
-            found = _asked(net, [problems[i] for i in group], Deadline.after(options.time_limit))
-            seconds = (time.perf_counter() - start) / len(group)
-            yield from ((i, result, seconds) for i, result in zip(group, found, strict=True))
-        return
-    nets = {id(net): evaluation_copy(net, options.device) for net in priors.values() if isinstance(net, nn.Module)}
-    for number, problem in problems.items():
-        start, prior = time.perf_counter(), priors[number]
-        if isinstance(prior, nn.Module):
-            result = _searched_around(nets[id(prior)], problem, number, options)
+
+def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
+    """Number, result and seconds of each problem, of the search: anywhere, or around a net's pose first."""
+    priors = [problem.prior for problem in problems.values()]
+    nets = {id(net): evaluation_copy(net, options.device) for net in priors if isinstance(net, nn.Module)}
+    for i, problem in problems.items():
+        start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
+        search = partial(
+            search_poses, problem.sets, clutter=options.clutter, seed=options.seed, deadline=deadline,
+            settings=options.settings, progress=None if options.progress is None else partial(options.progress, i),
+        )  # fmt: skip
+        net = nets.get(id(problem.prior))
+        known = None if net is None else _net_prior(net, problem, deadline)
+        around = None if known is None else search(around=known, settings=AROUND_NET)
+        if around is None:
+            result = search()
         else:
-            search = _search(number, options, Deadline.after(options.time_limit))
-            result = search(problem.sets(prior))
-        yield number, result, time.perf_counter() - start
+            result = around if _certain(problem, around, deadline) else joined(problem, around, search())
+        yield i, result, time.perf_counter() - start
+
+
+def _predicted(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
+    """Number, result and seconds of each problem, of a module, which on a GPU gets pairs of similar size together."""
+    assert options.solver is not None
+    net = evaluation_copy(options.solver, options.device)
+    for group in [[i] for i in problems] if device_of(net).type == "cpu" else _groups(problems):
+        start = time.perf_counter()
+        found = _asked(net, [problems[i] for i in group], Deadline.after(options.time_limit))
+        seconds = (time.perf_counter() - start) / len(group)
+        yield from ((i, result, seconds) for i, result in zip(group, found, strict=True))
 
 
 def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
@@ -96,29 +119,6 @@ def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
         group.append(i)
     if group:
         yield group
-
-
-def _search(number: int, options: Options, deadline: Deadline) -> Callable[..., SearchResult]:
-    """The search, but for the point sets."""
-    return partial(
-        search_poses,
-        clutter=options.clutter,
-        seed=options.seed,
-        deadline=deadline,
-        settings=options.settings,
-        progress=None if options.progress is None else partial(options.progress, number),
-    )
-
-
-def _searched_around(net: nn.Module, problem: Problem, number: int, options: Options) -> SearchResult:
-    """The search around the net's pose and, unless what that finds is certain, everywhere too."""
-    deadline = Deadline.after(options.time_limit)
-    search, sets = _search(number, options, deadline), problem.sets()
-    known = _net_prior(net, problem, deadline)
-    if known is None:
-        return search(sets)
-    around = search(sets, around=known, settings=AROUND_NET)
-    return around if _certain(problem, around, deadline) else joined(problem, around, search(sets))
 
 
 def _certain(problem: Problem, around: SearchResult, deadline: Deadline) -> bool:
