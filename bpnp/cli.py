@@ -3,7 +3,6 @@
 import difflib
 import logging
 import os
-import signal
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -22,7 +21,7 @@ from bpnp.commands import COMMANDS
 from bpnp.commands.parser import OneLineParser, first_line, run_command
 from bpnp.configs import config_names, packaged_config
 from bpnp.files import claimed
-from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO
+from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
@@ -92,15 +91,8 @@ class BpnpCLI(LightningCLI):
         """In a run folder that no other training holds."""
         self._check_checkpoint(subcommand)
         training = subcommand == "fit" and self.trainer.global_rank == 0
-        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext():
-            try:
-                super()._run_subcommand(subcommand)
-            except SystemExit:
-                # Lightning ends the process with status 1 after an interruption.
-                if self.trainer.interrupted:
-                    signal.signal(signal.SIGINT, signal.default_int_handler)
-                    raise KeyboardInterrupt from None
-                raise
+        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext(), interruptible(self.trainer):
+            super()._run_subcommand(subcommand)
 
     def _check_checkpoint(self, subcommand: str) -> None:
         """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""

@@ -5,7 +5,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Literal
 
-from rich.progress import track
+from rich.progress import Progress
 
 from bpnp.commands.output import console, say
 from bpnp.commands.parser import at_least
@@ -13,9 +13,10 @@ from bpnp.configs import packaged_config
 from bpnp.files import claimed
 from bpnp.report.figures import save_figure
 from bpnp.report.published import Paper
+from bpnp.report.seeds import mean_and_spread
 from bpnp.table.layout import Line, as_csv, as_latex, as_markdown, terminal
 from bpnp.table.methods import Method, parse_methods
-from bpnp.table.pairs import TestPairs, read_data, with_outlier_ratio
+from bpnp.table.pairs import TestPairs, read_data, with_outlier_ratio, with_setting
 from bpnp.table.run import Block, run
 from bpnp.table.sweep import sweep_figure
 
@@ -28,6 +29,7 @@ def table(
     methods: list[str],
     limit: int | None = None,
     rho: list[float] | None = None,
+    seeds: list[int] | None = None,
     time_limit: float | None = None,
     processes: int = 1,
     output: Path = Path("runs/table"),
@@ -46,6 +48,7 @@ def table(
             be more than untrained.
         limit: pairs, a fixed random choice; all by default.
         rho: outliers a true pair on both sides; a table and a plot over these.
+        seeds: of the data; the table of each, and their mean with its standard deviation.
         time_limit: seconds a pair, for methods that have a limit.
         processes: worker processes of one thread each.
         output: folder of the results.
@@ -55,19 +58,23 @@ def table(
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
     described = read_data(Path(packaged_config(data)), overrides or [])
-    indices = tuple(TestPairs(described).order[:limit])
-    shares: list[float | None] = [None] if rho is None else [*rho]
-    blocks = [(share, block) for share in shares for block in _blocks(output, chosen, described, indices, share)]
+    every: list[int | None] = [None] if seeds is None else [*dict.fromkeys(seeds)]
+    lists: list[tuple[float | None, list[Block]]] = [
+        (share, [block for seed in every for block in _blocks(output, chosen, described, limit, share, seed)])
+        for share in ([None] if rho is None else dict.fromkeys(rho))
+    ]
+    blocks = [block for _, own in lists for block in own]
     out = console()
     with ExitStack() as held:
-        for _, block in blocks:
+        for block in blocks:
             held.enter_context(claimed(block.folder))
             block.claim()
-        missing = sum(len(block.missing()) for _, block in blocks)
-        solved = run([block for _, block in blocks], processes=processes)
-        for _ in track(solved, "pairs", total=missing, console=out, disable=missing == 0, transient=True):
-            pass
-        lines = [line for ratio, block in blocks for line in _lines(block, ratio)]
+        missing = sum(len(block.missing()) for block in blocks)
+        with Progress(console=out, disable=missing == 0, transient=True) as progress:
+            bar = progress.add_task("pairs", total=missing)
+            for tested in run(blocks, processes=processes):
+                progress.advance(bar, tested)
+        lines = [line for ratio, own in lists for line in _lines(own, ratio, len(every))]
     published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else _paper(paper)
     out.print(terminal(lines, published))
     for path in _write(output, lines, published):
@@ -75,20 +82,41 @@ def table(
 
 
 def _blocks(
-    output: Path, methods: Sequence[Method], data: dict[str, Any], indices: tuple[int, ...], rho: float | None
+    output: Path,
+    methods: Sequence[Method],
+    data: dict[str, Any],
+    limit: int | None,
+    rho: float | None,
+    seed: int | None,
 ) -> list[Block]:
-    harder = data if rho is None else with_outlier_ratio(data, rho)
-    folder = output if rho is None else output / f"rho-{rho:g}"
-    return [Block(method, harder, folder / _folder_name(method.label), indices) for method in methods]
+    """The tests of all methods on the data with an outlier share and a seed, each in a folder of its own."""
+    folder = output
+    if rho is not None:
+        data, folder = with_outlier_ratio(data, rho), folder / f"rho-{rho:g}"
+    if seed is not None:
+        data, folder = with_setting(data, "seed", seed), folder / f"seed-{seed}"
+    indices = tuple(TestPairs(data).order[:limit])
+    return [Block(method, data, folder / _folder_name(method.label), indices) for method in methods]
 
 
-def _lines(block: Block, rho: float | None) -> list[Line]:
-    results = block.summarise()
-    several = len(results.estimates) > 1
-    return [
-        Line(f"{block.method.label} {estimate}" if several else block.method.label, len(block.indices), values, rho)
-        for estimate, values in results.estimates.items()
-    ]
+def _lines(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Line]:
+    """The rows of a share: each estimate of each method, its mean and standard deviation where there are several seeds.
+
+    blocks: those of all methods for the first seed, then for the next.
+    """
+    results = [(block, block.summarise()) for block in blocks]
+    lines = []
+    for k in range(len(blocks) // seeds):
+        own = results[k :: len(blocks) // seeds]
+        block, first = own[0]
+        for estimate in first.estimates:
+            label = f"{block.method.label} {estimate}" if len(first.estimates) > 1 else block.method.label
+            pairs = sum(len(block.indices) for block, _ in own)
+            mean, spread = mean_and_spread([each.estimates[estimate] for _, each in own])
+            lines.append(Line(label, pairs, mean, rho))
+            if seeds > 1:
+                lines.append(Line(label, pairs, spread, rho, spread_of=seeds))
+    return lines
 
 
 def _write(folder: Path, lines: Sequence[Line], paper: Paper | None) -> list[Path]:

@@ -5,6 +5,7 @@ A test under way appends its finished rows to `unfinished.csv`, from which it ca
 """
 
 import csv
+import fcntl
 import io
 import json
 import math
@@ -67,8 +68,8 @@ def write_results(
     folder.mkdir(parents=True, exist_ok=True)
     # Old aggregates must not stand beside new rows, should the process end between the two files.
     (folder / "summary.json").unlink(missing_ok=True)
-    _write(folder / "pairs.csv", _csv([COLUMNS, *map(astuple, ordered)]))
-    _write(folder / "summary.json", json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
+    _write(folder / "pairs.csv", _encoded([COLUMNS, *map(astuple, ordered)]))
+    _write(folder / "summary.json", json.dumps(plain(summary), indent=2, allow_nan=False).encode() + b"\n")
     (folder / UNFINISHED).unlink(missing_ok=True)
     return results
 
@@ -105,13 +106,17 @@ def read_results(folder: Path | str) -> Results:
 
 
 def append_rows(folder: Path, rows: Iterable[PairRow]) -> None:
-    """Add the rows of finished pairs to `unfinished.csv` and wait until they are on the disk."""
+    """Add the rows of finished pairs to `unfinished.csv` and wait until they are on the disk.
+
+    Several processes may add to one folder. A last line that was cut short is removed first.
+    """
     path = folder / UNFINISHED
     folder.mkdir(parents=True, exist_ok=True)
-    if path.is_file() and not path.read_bytes().endswith(b"\n"):
-        _write(path, _csv([COLUMNS, *map(astuple, _rows(path, cut=True))]))
-    with path.open("a", encoding="utf-8", errors="surrogateescape", newline="") as file:
-        file.write(_csv([*([COLUMNS] if file.tell() == 0 else []), *map(astuple, rows)]))
+    with path.open("ab") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        if file.tell() and not path.read_bytes().endswith(b"\n"):
+            file.truncate(len(_encoded([COLUMNS, *map(astuple, _rows(path, cut=True))])))
+        file.write(_encoded([*([] if path.stat().st_size else [COLUMNS]), *map(astuple, rows)]))
         file.flush()
         os.fsync(file.fileno())
 
@@ -229,16 +234,16 @@ def _version() -> str:
         return "unknown"
 
 
-def _csv(rows: Iterable[Iterable[Any]]) -> str:
+def _encoded(rows: Iterable[Iterable[Any]]) -> bytes:
+    """Rows as CSV. File names that are not UTF-8 reach us, and leave, as surrogates."""
     text = io.StringIO(newline="")
     csv.writer(text).writerows(rows)
-    return text.getvalue()
+    return text.getvalue().encode(errors="surrogateescape")
 
 
-def _write(path: Path, text: str) -> None:
+def _write(path: Path, content: bytes) -> None:
     with written_whole(path) as temporary:
-        # File names that are not UTF-8 reach us, and leave, as surrogates.
-        temporary.write_text(text, encoding="utf-8", errors="surrogateescape", newline="")
+        temporary.write_bytes(content)
 
 
 def _read(path: Path) -> str:

@@ -17,6 +17,7 @@ from bpnp.metrics import RecallThresholds, pose_recalls
 from bpnp.report.folder import named_runs, read_results, read_runs, trained_only
 from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
+from bpnp.report.seeds import seed_groups, with_spread
 from bpnp.report.training_log import TrainingLog, read_training_log
 
 WIDTH = 80
@@ -106,20 +107,21 @@ RECALL_COLUMNS = (
 def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> FittedTable:
     """Quartiles, joint recalls, share of pairs with a pose and seconds per pair, a row per run and estimate.
 
-    The best number of each column is bold. `paper` adds the published rows of that data set, for orientation only: they
+    Runs that differ by their seeds only have rows of their mean and standard deviation beneath. The best number of each
+    column is bold. `paper` adds the published rows of that data set, for orientation only: they
     are of other data and take no part in the comparison.
     """
     caption = (
         "rot, repr: errors in degrees; trans: in scene units; 15deg 0.5, 10deg 1.0: % of pairs with both rotation and "
         "translation error within; sec: seconds per pair. A pair without a pose counts as 180 deg and inf."
     )
-    return _table(_title("Pose errors", runs), RESULT_COLUMNS, _rows(runs), published_rows(paper), caption)
+    return _table(_title("Pose errors", runs), RESULT_COLUMNS, runs, published_rows(paper), caption)
 
 
 def recall_table(runs: Mapping[str, Results]) -> FittedTable:
     """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
     caption = "% of pairs with an error up to the number in the head: rot, repr in degrees; trans in scene units."
-    return _table(_title("Recall", runs), RECALL_COLUMNS, _rows(runs), {}, caption)
+    return _table(_title("Recall", runs), RECALL_COLUMNS, runs, {}, caption)
 
 
 def learning_table(before: Results, after: Results) -> Table:
@@ -196,14 +198,9 @@ def number(value: float | None) -> str:
     return f"{mantissa}e{int(exponent)}"
 
 
-def _rows(runs: Mapping[str, Results]) -> dict[str, Values]:
-    rows: dict[str, Values] = {}
-    for name, results in runs.items():
-        for estimate, values in results.estimates.items():
-            standard = pose_recalls(results.errors(estimate), STANDARD_POINTS)
-            label = estimate if len(runs) == 1 else f"{name}: {estimate}"
-            rows[label] = values | {key: float(value) for key, value in standard.items()}
-    return rows
+def _values(results: Results, estimate: str) -> Values:
+    standard = pose_recalls(results.errors(estimate), STANDARD_POINTS)
+    return results.estimates[estimate] | {key: float(value) for key, value in standard.items()}
 
 
 def _title(what: str, runs: Mapping[str, Results]) -> str:
@@ -214,21 +211,30 @@ def _title(what: str, runs: Mapping[str, Results]) -> str:
 def _table(
     title: str,
     columns: Sequence[Column],
-    rows: Mapping[str, Values],
+    runs: Mapping[str, Results],
     published: Mapping[str, Mapping[str, str]],
     caption: str,
 ) -> FittedTable:
+    """A row per run and estimate, then mean and spread of the runs that differ by their seeds, then what is printed."""
+    rows = {(run, name): _values(results, name) for run, results in runs.items() for name in results.estimates}
     best = best_texts(columns, list(rows.values()))
-    shown = {label: {column.key: cell(column, values) for column in columns} for label, values in rows.items()}
+    shown = {key: {column.key: cell(column, values) for column in columns} for key, values in rows.items()}
     here = [
-        (Text(label), [Text(text, "bold" if text == best[key] else "") for key, text in cells.items()])
-        for label, cells in shown.items()
+        (
+            Text(estimate if len(runs) == 1 else f"{run}: {estimate}"),
+            [Text(text, "bold" if text == best[key] else "") for key, text in cells.items()],
+        )
+        for (run, estimate), cells in shown.items()
+    ]
+    seeds = [
+        (Text(label), [Text(cell(column, values)) for column in columns])
+        for label, values in with_spread(rows, seed_groups(runs))
     ]
     paper = [
         (Text(label, "dim"), [Text(printed.get(column.key, "-"), "dim") for column in columns])
         for label, printed in published.items()
     ]
-    return FittedTable(title, [column.header for column in columns], [here, paper], caption)
+    return FittedTable(title, [column.header for column in columns], [here, seeds, paper], caption)
 
 
 def cell(column: Column, values: Values) -> str:

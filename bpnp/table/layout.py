@@ -20,16 +20,25 @@ LATEX_SPECIAL = {"&": r"\&", "%": r"\%", "_": r"\_", "#": r"\#", "$": r"\$", "{"
 
 @dataclass(frozen=True)
 class Line:
-    """One row: a method's estimate, the share of outliers it was given (None: as the data are), and its figures."""
+    """One row: a method's estimate, the share of outliers it was given (None: as the data are), and its figures.
+
+    spread_of: of how many seeds the figures are the standard deviation; 0 for the figures themselves.
+    """
 
     label: str
     pairs: int
     values: Mapping[str, float]
     rho: float | None = None
+    spread_of: int = 0
+
+    @property
+    def row(self) -> str:
+        """The label, and whether it is a spread."""
+        return f"{self.label}, standard deviation of {self.spread_of} seeds" if self.spread_of else self.label
 
     @property
     def name(self) -> str:
-        return self.label if self.rho is None else f"{self.label}, rho {self.rho:g}"
+        return self.row if self.rho is None else f"{self.row}, rho {self.rho:g}"
 
     @property
     def cells(self) -> list[str]:
@@ -70,7 +79,7 @@ def as_csv(lines: Sequence[Line], paper: Paper | None) -> str:
     writer.writerow(["method", "source", "rho", "pairs", *keys])
     for line in lines:
         rho = "" if line.rho is None else line.rho
-        writer.writerow([line.label, "here", rho, line.pairs, *(line.values.get(key, "") for key in keys)])
+        writer.writerow([line.row, "here", rho, line.pairs, *(line.values.get(key, "") for key in keys)])
     if paper is not None:
         for label, printed in PUBLISHED[paper].items():
             shown = (_full(column, printed.get(column.key)) for column in RESULT_COLUMNS)

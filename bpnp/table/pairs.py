@@ -1,16 +1,14 @@
-"""The test pairs of a recipe, one at a time and in any order; objects from class paths and settings."""
+"""The test pairs of a recipe in the order of a limited table; objects from class paths and settings."""
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import yaml
 from jsonargparse import ArgumentParser
 from lightning import LightningDataModule
-
-from bpnp.types import Batch
 
 ORDER_SEED = 0  # of the order in which `--limit` takes pairs: the same for every method, and longer tables only add
 
@@ -29,12 +27,13 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
 
 
 def with_outlier_ratio(data: dict[str, Any], ratio: float) -> dict[str, Any]:
-    """The same data with `ratio` uniform outliers a true pair on both sides, at test time.
+    """The same data with `ratio` uniform outliers a true pair on both sides, at test time. Raises as `with_setting`."""
+    return with_setting(data, "test_outliers", {"ratio": ratio})
 
-    Raises ValueError for data that have no such option.
-    """
-    harder = data | {"init_args": data["init_args"] | {"test_outliers": {"ratio": ratio}}}
-    return checked(LightningDataModule, "data", harder)
+
+def with_setting(data: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
+    """The same data with another value of a setting. Raises ValueError for data that have no such setting."""
+    return checked(LightningDataModule, "data", data | {"init_args": data["init_args"] | {name: value}})
 
 
 class TestPairs:
@@ -45,12 +44,8 @@ class TestPairs:
     def __init__(self, data: dict[str, Any]) -> None:
         module = build(LightningDataModule, "data", data)
         module.setup("test")
-        self._dataset = module.test_dataloader().dataset
-        self.order = [int(i) for i in np.random.default_rng(ORDER_SEED).permutation(len(self._dataset))]
-
-    def __getitem__(self, index: int) -> Batch:
-        """A batch of the one pair at this position of the data set."""
-        return cast(Batch, self._dataset[[(0, index)]])
+        self.dataset = module.test_dataloader().dataset
+        self.order = [int(i) for i in np.random.default_rng(ORDER_SEED).permutation(len(self.dataset))]
 
 
 def checked(base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:

@@ -1,27 +1,39 @@
-"""Testing methods pair by pair, in one process or several of one thread each; what is finished stays."""
+"""A table is a loop over `test`: methods in turns, some pairs at a time, in one process or several of one thread.
+
+What is finished is in the results folders, pair by pair, whatever ends the process.
+"""
 
 import json
+import logging
 import multiprocessing
 import os
-import time
+import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import nn
+from lightning import LightningModule, Trainer
+from lightning.pytorch import Callback
+from torch.utils.data import DataLoader
 
 from bpnp.files import written_whole
 from bpnp.report.folder import append_rows, finished_rows, write_results
-from bpnp.report.results import PairRow, Results, rows_from, summarise
+from bpnp.report.results import Results, rows_from, summarise
+from bpnp.report.samples import PairView, read_views, select_views, thin, views_from, write_views
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs
+from bpnp.training.plugins import interruptible
+from bpnp.training.task import BlindPnPTask
 
 IDENTITY = "method.json"
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+ROUNDS = 50  # turns in which a method is given its pairs, so that a table cut short has about as many of each
+LEAST = 4  # pairs of a turn, unless fewer are left
 
 
 @dataclass(frozen=True)
@@ -56,89 +68,126 @@ class Block:
         known = {(row.index, row.estimate) for row in rows}
         return [i for i in self.indices if not estimates or any((i, name) not in known for name in estimates)]
 
+    def keep(self, views: Sequence[PairView]) -> None:
+        """Add views to those of the folder; the worst pairs and some others have many points, as after a test."""
+        every = [*views, *read_views(self.folder)]
+        write_views(self.folder, [*select_views(every), *map(thin, every)])
+
     def summarise(self) -> Results:
         """Write the results of all finished pairs into the folder and return those of the wanted ones."""
         rows = finished_rows(self.folder)
-        write_results(self.folder, rows, settings={"method": self.method.label, "data": self.data})
-        wanted = set(self.indices)
-        return subset([row for row in rows if row.index in wanted])
+        settings: dict[str, Any] = {
+            "solver": {"class_path": self.method.class_path, "init_args": self.method.init_args}
+        }
+        settings |= {"data": self.data, "checkpoint": self.method.checkpoint, "method": self.method.label}
+        write_results(self.folder, rows, settings=settings)
+        wanted = tuple(row for row in rows if row.index in set(self.indices))
+        return Results(wanted, summarise(wanted), None, settings, "", "")
 
 
-def subset(rows: Sequence[PairRow]) -> Results:
-    """Results of some rows, not kept on disk."""
-    return Results(tuple(rows), summarise(rows), None, {}, "", "")
+Job = tuple[Block, list[int]]
 
 
-def run(blocks: Sequence[Block], *, processes: int) -> Iterator[str]:
-    """Solve all missing pairs; yields the label of the method of each as it is finished.
+def run(blocks: Sequence[Block], *, processes: int) -> Iterator[int]:
+    """Test all missing pairs; yields how many were tested, again and again.
 
-    Pair by pair through all methods, so that a table cut short has about as many pairs of each. An error of a solver
-    ends the run; what is finished stays.
+    The methods take turns. An error of a solver ends the run; what is finished stays.
     """
-    missing = {id(block): set(block.missing()) for block in blocks}
-    longest = max((len(block.indices) for block in blocks), default=0)
-    tasks = [
-        (block, block.indices[i])
-        for i in range(longest)
-        for block in blocks
-        if i < len(block.indices) and block.indices[i] in missing[id(block)]
-    ]
-    alone = processes == 1 or len(tasks) < 2
-    for block, rows in _inline(tasks) if alone else _parallel(tasks, processes):
-        append_rows(block.folder, rows)
-        yield block.method.label
+    turns: list[list[Job]] = [[] for _ in range(ROUNDS)]
+    for block in blocks:
+        missing = block.missing()
+        size = max(LEAST, -(-len(missing) // ROUNDS))
+        for k in range(0, len(missing), size):
+            turns[k // size].append((block, missing[k : k + size]))
+    jobs = [job for turn in turns for job in turn]
+    alone = processes == 1 or len(jobs) < 2
+    for (block, indices), views in _inline(jobs) if alone else _parallel(jobs, processes):
+        block.keep(views)
+        yield len(indices)
 
 
-class Worker:
-    """Solves pairs; keeps the data sets and solvers that it has opened."""
+class PairKeeper(Callback):
+    """Adds the rows of each tested pair to the results folder before the next pair is solved."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.views: list[PairView] = []
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: Any
+    ) -> None:  # fmt: skip
+        if not outputs["prediction"].poses:
+            raise ValueError(f"expected a pose from {self.folder.name!r}, got a prediction without one")
+        append_rows(self.folder, rows_from(outputs["prediction"], batch, outputs["seconds"]))
+        self.views += views_from(outputs["prediction"], batch)
+
+
+class Tester:
+    """Tests pairs; keeps the data sets and solvers that it has opened."""
 
     def __init__(self) -> None:
         self._pairs: dict[str, TestPairs] = {}
-        self._solvers: dict[str, nn.Module] = {}
+        self._tasks: dict[str, BlindPnPTask] = {}
 
-    def solve(self, block: Block, index: int) -> list[PairRow]:
-        """The rows of one pair, alone in its batch. The time is the solver's alone."""
-        torch.manual_seed(index)
-        batch = self._opened(block.data)[index]
-        solver = self._built(block.method)
-        with torch.inference_mode():
-            start = time.perf_counter()
-            prediction = solver(batch)
-            seconds = time.perf_counter() - start
-        if not prediction.poses:
-            raise ValueError(f"expected a pose from {block.method.label!r}, got a prediction without one")
-        return rows_from(prediction, batch, seconds)
+    def test(self, block: Block, indices: Sequence[int]) -> list[PairView]:
+        """`test` some pairs, each alone in its batch, so that its time is its own; their rows go into the folder."""
+        keeper, pairs = PairKeeper(block.folder), self._opened(block.data)
+        loader = DataLoader(pairs.dataset, sampler=[[(0, i)] for i in indices], batch_size=None)
+        with quiet():
+            trainer = Trainer(
+                accelerator="cpu", devices=1, callbacks=[keeper], logger=False, enable_checkpointing=False,
+                enable_progress_bar=False, enable_model_summary=False,
+            )  # fmt: skip
+            with interruptible(trainer):
+                trainer.test(self._built(block.method), loader, verbose=False)
+        return keeper.views
 
     def _opened(self, data: dict[str, Any]) -> TestPairs:
-        key = repr(data)
-        if key not in self._pairs:
+        if (key := repr(data)) not in self._pairs:
             self._pairs[key] = TestPairs(data)
         return self._pairs[key]
 
-    def _built(self, method: Method) -> nn.Module:
-        key = repr(method)
-        if key not in self._solvers:
-            self._solvers[key] = method.build()
-        return self._solvers[key]
+    def _built(self, method: Method) -> BlindPnPTask:
+        if (key := repr(method)) not in self._tasks:
+            torch.manual_seed(0)  # of a network without a checkpoint: its weights are the same in every process
+            self._tasks[key] = BlindPnPTask(method.build())
+        return self._tasks[key]
 
 
-def _inline(tasks: Sequence[tuple[Block, int]]) -> Iterator[tuple[Block, list[PairRow]]]:
-    worker, threads = Worker(), torch.get_num_threads()
+@contextmanager
+def quiet() -> Iterator[None]:
+    """No messages of the trainer's, which would repeat for every turn, nor its advice."""
+    loggers = [logging.getLogger(f"lightning.pytorch.utilities.{name}") for name in ("rank_zero", "warnings")]
+    before = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            for advice in (".*does not have many workers.*", ".*LeafSpec.*"):
+                warnings.filterwarnings("ignore", message=advice)
+            yield
+    finally:
+        for logger, level in zip(loggers, before, strict=True):
+            logger.setLevel(level)
+
+
+def _inline(jobs: Sequence[Job]) -> Iterator[tuple[Job, list[PairView]]]:
+    tester, threads = Tester(), torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        for block, index in tasks:
-            yield block, worker.solve(block, index)
+        for job in jobs:
+            yield job, tester.test(*job)
     finally:
         torch.set_num_threads(threads)
 
 
-def _parallel(tasks: Sequence[tuple[Block, int]], processes: int) -> Iterator[tuple[Block, list[PairRow]]]:
+def _parallel(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, list[PairView]]]:
     kept = {name: os.environ.get(name) for name in THREAD_VARIABLES}
     os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read when a process starts, by libraries that never ask
     context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(processes, len(tasks)), mp_context=context, initializer=_process_worker)
+    pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_process_tester)
     try:
-        futures = {pool.submit(_solve, block, index): block for block, index in tasks}
+        futures = {pool.submit(_test, *job): job for job in jobs}
         for future in as_completed(futures):
             yield futures[future], future.result()
     finally:
@@ -151,10 +200,10 @@ def _parallel(tasks: Sequence[tuple[Block, int]], processes: int) -> Iterator[tu
 
 
 @cache
-def _process_worker() -> Worker:
+def _process_tester() -> Tester:
     torch.set_num_threads(1)
-    return Worker()
+    return Tester()
 
 
-def _solve(block: Block, index: int) -> list[PairRow]:
-    return _process_worker().solve(block, index)
+def _test(block: Block, indices: Sequence[int]) -> list[PairView]:
+    return _process_tester().test(block, indices)

@@ -23,7 +23,7 @@ def sweep_figure(lines: Sequence[Line]) -> "Figure":
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     errors, recall = figure.subplots(1, 2)
     for i, label in enumerate(labels):
-        known = [line for line in lines if line.label == label and line.rho is not None]
+        known = [line for line in lines if line.label == label and line.rho is not None and not line.spread_of]
         chosen = sorted(known, key=lambda line: line.rho or 0.0)
         shares = [line.rho for line in chosen]
         style = {"color": LIGHT[i % len(LIGHT)], "marker": "o", "ms": 3.5, "label": label.replace("$", r"\$")}

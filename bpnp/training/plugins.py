@@ -1,5 +1,8 @@
 """How the trainer reads checkpoints and runs the nets."""
 
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +50,18 @@ class InterruptedCheckpoint(Callback):
             path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
             trainer.save_checkpoint(path)
             rank_zero_info(f"interrupted in epoch {trainer.current_epoch}; go on with --ckpt_path {path}")
+
+
+@contextmanager
+def interruptible(trainer: Trainer) -> Iterator[None]:
+    """Raises KeyboardInterrupt after Ctrl-C in a run of the trainer, where Lightning ends the process with status 1."""
+    try:
+        yield
+    except SystemExit:
+        if trainer.interrupted:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            raise KeyboardInterrupt from None
+        raise
 
 
 def feature_nets(task: LightningModule) -> dict[str, nn.Module]:

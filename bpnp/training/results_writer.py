@@ -115,10 +115,11 @@ def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], li
 
 
 def _settings(trainer: Trainer) -> dict[str, Any]:
-    """The checkpoint, and of a test from the command line the data and the solver of its configuration."""
+    """The checkpoint and the seed of its training; of a test from the command line also its data and solver."""
     saved = next((own.config for own in trainer.callbacks if isinstance(own, SaveConfigCallback)), None)  # type: ignore[attr-defined]
     config = {} if saved is None else saved.as_dict()
     settings = {"checkpoint": str(trainer.ckpt_path) if trainer.ckpt_path else None}
+    settings |= {"training_seed": getattr(trainer.lightning_module, "training_seed", None)}
     return settings | {"data": config.get("data"), "solver": config.get("model", {}).get("solver")}
 
 

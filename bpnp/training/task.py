@@ -1,5 +1,6 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
+import os
 import time
 from dataclasses import replace
 from typing import Any, Literal, cast
@@ -68,6 +69,7 @@ class BlindPnPTask(LightningModule):
         self.skipped: Tensor
         self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
         self.refine_validation = refine_validation
+        self.training_seed: str | None = None  # of the checkpoint that was loaded, if it is known
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
@@ -142,10 +144,12 @@ class BlindPnPTask(LightningModule):
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
         checkpoint["solver"] = described(self.solver)
         checkpoint["skipped_steps"] = self.skipped.tolist()
+        checkpoint["seed"] = os.environ.get("PL_GLOBAL_SEED")  # where `lightning.seed_everything` leaves it
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         saved, weights = checkpoint.get("solver", {}), solver_state(checkpoint["state_dict"])
         check_solver(saved, weights, described(self.solver), self.solver.state_dict())
+        self.training_seed = checkpoint.get("seed")
         self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
 
     def on_validation_epoch_end(self) -> None:

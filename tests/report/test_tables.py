@@ -8,7 +8,9 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from bpnp.report import PairRow, learning_table, recall_table, report, results_table, write_results
+from bpnp.report import PairRow, Results, learning_table, recall_table, report, results_table, write_results
+from bpnp.report.page.text import quartiles_html
+from bpnp.report.seeds import seed_groups
 from bpnp.report.tables import FittedTable, number
 
 
@@ -123,3 +125,35 @@ def test_a_report_without_a_wide_terminal_is_wide_enough(
     assert "…" not in text
     assert max(map(len, text.splitlines())) <= 80
     assert number(results.estimates["pnp"]["seconds_mean"]) in text
+
+
+def seeded(folder: Path, error: float, **settings: object) -> Results:
+    known = {"data": {"class_path": "Meshes", "init_args": {"seed": 0, "points": 9}}, "checkpoint": str(folder)}
+    return write_results(folder, [row(0, rotation_error_deg=error)], settings=known | settings)
+
+
+def test_runs_of_several_seeds_have_rows_of_their_mean_and_spread(tmp_path: Path) -> None:
+    """Errors of 1, 2 and 6 degrees: mean 3, standard deviation sqrt((4 + 1 + 9) / 2)."""
+    runs = {f"psb-seed{i}": seeded(tmp_path / str(i), e, training_seed=str(i)) for i, e in enumerate((1.0, 2.0, 6.0))}
+    shown = results_table(runs)
+    (mean, mean_cells), (spread, spread_cells) = shown.groups[1]
+    assert (mean.plain, mean_cells[1].plain) == ("psb, mean of 3 seeds: pnp", "3.00")
+    assert (spread.plain.strip(), spread_cells[1].plain) == ("standard deviation", "2.65")
+    assert max(map(len, rendered(shown))) <= 80
+    assert "mean of 3 seeds" in quartiles_html(runs, None)
+    assert "mean of 3 seeds" in "".join(rendered(recall_table(runs)))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"training_seed": "0"},  # the same seeds: another checkpoint of the same training
+        {"training_seed": None},  # not known
+        {"training_seed": "1", "data": {"class_path": "Meshes", "init_args": {"seed": 0, "points": 10}}},
+        {"training_seed": "1", "checkpoint": None},  # untrained
+    ],
+)
+def test_runs_that_differ_otherwise_have_no_mean(tmp_path: Path, other: dict[str, object]) -> None:
+    runs = {"a": seeded(tmp_path / "a", 1.0, training_seed="0"), "b": seeded(tmp_path / "b", 2.0, **other)}
+    assert seed_groups(runs) == {}
+    assert results_table(runs).groups[1] == []

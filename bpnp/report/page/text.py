@@ -9,6 +9,7 @@ import numpy as np
 
 from bpnp.report.palette import DASHES, styles
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
+from bpnp.report.seeds import seed_groups, with_spread
 from bpnp.report.tables import RESULT_COLUMNS, Paper, best_texts, cell, published_rows
 
 # Options of the data that change no result.
@@ -111,6 +112,9 @@ def quartiles_html(runs: Mapping[str, Results], paper: Paper | None) -> str:
             exact = "" if value is None else f' data-value="{str(value).replace("inf", "Infinity")}" title="{value}"'
             cells += f"<td{' class=best' if text == best[column.key] else ''}{exact}>{text}</td>"
         body += f'<tr data-series="{i}"><th scope="row">{swatch}{visible(labels(runs)[key])}</th>{cells}</tr>'
+    for label, values in with_spread(rows, seed_groups(runs)):
+        cells = "".join(f"<td>{cell(column, values)}</td>" for column in RESULT_COLUMNS)
+        body += f'<tr class="seeds"><th scope="row">{visible(label)}</th>{cells}</tr>'
     for name, printed in published_rows(paper).items():
         cells = "".join(f"<td>{printed.get(column.key, '-')}</td>" for column in RESULT_COLUMNS)
         body += f'<tr class="paper"><th scope="row">{visible(name)}</th>{cells}</tr>'
