@@ -65,11 +65,14 @@ def write_results(
         "settings": results.settings,
     }
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     # Old aggregates must not stand beside new rows, should the process end between the two files.
     (folder / "summary.json").unlink(missing_ok=True)
-    _write(folder / "pairs.csv", _encoded([COLUMNS, *map(astuple, ordered)]))
-    _write(folder / "summary.json", json.dumps(plain(summary), indent=2, allow_nan=False).encode() + b"\n")
+    for name, content in (
+        ("pairs.csv", _encoded([COLUMNS, *map(astuple, ordered)])),
+        ("summary.json", json.dumps(plain(summary), indent=2, allow_nan=False).encode() + b"\n"),
+    ):
+        with written_whole(folder / name) as temporary:
+            temporary.write_bytes(content)
     (folder / UNFINISHED).unlink(missing_ok=True)
     return results
 
@@ -239,11 +242,6 @@ def _encoded(rows: Iterable[Iterable[Any]]) -> bytes:
     text = io.StringIO(newline="")
     csv.writer(text).writerows(rows)
     return text.getvalue().encode(errors="surrogateescape")
-
-
-def _write(path: Path, content: bytes) -> None:
-    with written_whole(path) as temporary:
-        temporary.write_bytes(content)
 
 
 def _read(path: Path) -> str:
