@@ -6,7 +6,7 @@ from rich.console import Console
 
 from bpnp.report.dashboards import log_results
 from bpnp.report.dashboards import workspace as dashboard
-from bpnp.report.folder import named_runs
+from bpnp.report.runs import named_runs
 
 
 def wandb_results(

@@ -9,9 +9,9 @@ from typing import Literal
 from bpnp.commands.output import console, say
 from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.report.figures import Lines, plot_pair, recall_curve, save_figure
-from bpnp.report.folder import named_runs
 from bpnp.report.page.write import write_page
 from bpnp.report.photos import box_of
+from bpnp.report.runs import named_runs
 from bpnp.report.samples import PairView, read_views
 from bpnp.report.solutions import read_solution
 from bpnp.report.tables import Paper

@@ -13,7 +13,7 @@ from bpnp.configs import packaged_config
 from bpnp.files import claimed
 from bpnp.report.figures import save_figure
 from bpnp.report.published import Paper
-from bpnp.report.seeds import mean_and_spread
+from bpnp.report.runs import mean_and_spread
 from bpnp.table.layout import Line, as_csv, as_latex, as_markdown, terminal
 from bpnp.table.methods import Method, parse_methods
 from bpnp.table.pairs import TestPairs, read_data, with_outlier_ratio, with_setting

@@ -1,9 +1,10 @@
 """Results on disk and on screen."""
 
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
-from bpnp.report.folder import read_results, table, write_results
+from bpnp.report.folder import read_results, write_results
 from bpnp.report.page.write import write_page
 from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
+from bpnp.report.runs import table
 from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
 from bpnp.report.solutions import view_of
 from bpnp.report.tables import learning_table, recall_table, report, results_table

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from bpnp.files import written_whole
-from bpnp.report.folder import read_runs
 from bpnp.report.page.charts import sorted_errors
 from bpnp.report.palette import DASHES, LIGHT, styles
 from bpnp.report.photos import box_of
 from bpnp.report.results import Results
+from bpnp.report.runs import read_runs
 from bpnp.report.samples import Array, PairView
 from bpnp.report.solutions import Solved, solution_view
 

@@ -11,19 +11,16 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import astuple, fields
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from bpnp.files import written_whole
 from bpnp.metrics import RecallThresholds
 from bpnp.report.results import PairRow, Results, pipeline_order, summarise
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
 
 FORMAT = 1
 COLUMNS = tuple(field.name for field in fields(PairRow))
@@ -131,51 +128,6 @@ def finished_rows(folder: Path) -> list[PairRow]:
     """
     known = [path for path in (folder / "pairs.csv", folder / UNFINISHED) if path.is_file()]
     return [row for path in known for row in _rows(path, cut=path.name == UNFINISHED)]
-
-
-def read_runs(paths: Sequence[Path | str]) -> dict[str, Results]:
-    """Results by the names of `named_runs`."""
-    return {name: read_results(path) for name, path in named_runs(paths).items()}
-
-
-def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
-    """Aggregates of one or several results: a DataFrame with a row per run and estimate, and the columns "run",
-    "estimate", "correspondence_loss" and all numbers of `summarise`.
-
-    runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
-    """
-    from pandas import DataFrame
-
-    return DataFrame(
-        {"run": name, "estimate": estimate, "correspondence_loss": results.correspondence_loss, **values}
-        for name, results in (runs if isinstance(runs, Mapping) else read_runs(runs)).items()
-        for estimate, values in results.estimates.items()
-    )
-
-
-def trained_only(paths: Sequence[Path | str]) -> bool:
-    """Whether these are folders of trainings of which none has results yet."""
-    places = [place for path in paths for place in (Path(path), Path(path) / "test")]
-    return bool(paths) and not any((place / "summary.json").is_file() for place in places)
-
-
-def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
-    """Results folders by what their paths do not share, at the start or at the end. Of a run's folder, its `test`.
-
-    Raises ValueError if there is none.
-    """
-    if not paths:
-        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
-    folders = [Path(path).absolute() for path in paths]
-    folders = [
-        path / "test" if (path / "test" / "summary.json").is_file() and not (path / "summary.json").exists() else path
-        for path in folders
-    ]
-    shared = os.path.commonpath([path.parent for path in folders])
-    parts = [Path(os.path.relpath(path, shared)).parts for path in folders]
-    while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({own[-1] for own in parts}) == 1:
-        parts = [own[:-1] for own in parts]
-    return {os.path.join(*own): path for own, path in zip(parts, folders, strict=True)}
 
 
 def plain(value: Any) -> Any:

@@ -14,10 +14,10 @@ from rich.table import Table
 from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, pose_recalls
-from bpnp.report.folder import named_runs, read_results, read_runs, trained_only
+from bpnp.report.folder import read_results
 from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
-from bpnp.report.seeds import seed_groups, with_spread
+from bpnp.report.runs import named_runs, read_runs, seed_groups, trained_only, with_spread
 from bpnp.report.training_log import TrainingLog, read_training_log
 
 WIDTH = 80

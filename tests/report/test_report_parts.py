@@ -8,8 +8,8 @@ import pytest
 from report_data import rows, write_run
 
 from bpnp.report import cause_shares, read_training_log, table
-from bpnp.report.folder import named_runs
 from bpnp.report.palette import DARK, DARK_BACKGROUND, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.runs import named_runs
 
 # Machado, Oliveira, Fernandes 2009, severity 1.0, on linear RGB: how the three kinds of dichromats see.
 SEEN = {

@@ -10,7 +10,7 @@ from rich.table import Table
 
 from bpnp.report import PairRow, Results, learning_table, recall_table, report, results_table, write_results
 from bpnp.report.page.text import quartiles_html
-from bpnp.report.seeds import seed_groups
+from bpnp.report.runs import seed_groups
 from bpnp.report.tables import FittedTable, number
 
 

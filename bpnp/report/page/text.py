@@ -9,7 +9,7 @@ import numpy as np
 
 from bpnp.report.palette import DASHES, styles
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
-from bpnp.report.seeds import seed_groups, with_spread
+from bpnp.report.runs import seed_groups, with_spread
 from bpnp.report.tables import RESULT_COLUMNS, Paper, best_texts, cell, published_rows
 
 # Options of the data that change no result.

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 from bpnp.files import written_whole
-from bpnp.report.folder import named_runs, read_results, trained_only
+from bpnp.report.folder import read_results
 from bpnp.report.page.charts import chart_text, page_charts
 from bpnp.report.page.points import packed, page_points, whole
 from bpnp.report.page.text import causes_html, headline_html, quartiles_html, series_buttons, visible
 from bpnp.report.palette import DARK, DARK_BACKGROUND, LIGHT, LIGHT_BACKGROUND, styles
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import CAUSES, PairRow, Results
+from bpnp.report.runs import named_runs, trained_only
 from bpnp.report.samples import read_views
 from bpnp.report.tables import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log

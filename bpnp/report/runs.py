@@ -1,19 +1,69 @@
-"""Runs that differ by their seeds only, and the mean and the spread of their figures."""
+"""Several runs: names, figures as a DataFrame, and mean and spread of those that differ by their seeds only."""
 
 import math
 import os
 import re
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
+from bpnp.report.folder import read_results
 from bpnp.report.results import Results
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
 
 SEEDS = frozenset({"seed", "training_seed"})
 PLACES = frozenset({"checkpoint", "complete"})  # settings that need not be equal
 SPREAD = "  standard deviation"  # of a sample, n - 1; what a table calls its row
 
 Values = Mapping[str, float]
+
+
+def read_runs(paths: Sequence[Path | str]) -> dict[str, Results]:
+    """Results by the names of `named_runs`."""
+    return {name: read_results(path) for name, path in named_runs(paths).items()}
+
+
+def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
+    """Aggregates of one or several results: a DataFrame with a row per run and estimate, and the columns "run",
+    "estimate", "correspondence_loss" and all numbers of `summarise`.
+
+    runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
+    """
+    from pandas import DataFrame
+
+    return DataFrame(
+        {"run": name, "estimate": estimate, "correspondence_loss": results.correspondence_loss, **values}
+        for name, results in (runs if isinstance(runs, Mapping) else read_runs(runs)).items()
+        for estimate, values in results.estimates.items()
+    )
+
+
+def trained_only(paths: Sequence[Path | str]) -> bool:
+    """Whether these are folders of trainings of which none has results yet."""
+    places = [place for path in paths for place in (Path(path), Path(path) / "test")]
+    return bool(paths) and not any((place / "summary.json").is_file() for place in places)
+
+
+def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
+    """Results folders by what their paths do not share, at the start or at the end. Of a run's folder, its `test`.
+
+    Raises ValueError if there is none.
+    """
+    if not paths:
+        raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
+    folders = [Path(path).absolute() for path in paths]
+    folders = [
+        path / "test" if (path / "test" / "summary.json").is_file() and not (path / "summary.json").exists() else path
+        for path in folders
+    ]
+    shared = os.path.commonpath([path.parent for path in folders])
+    parts = [Path(os.path.relpath(path, shared)).parts for path in folders]
+    while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({own[-1] for own in parts}) == 1:
+        parts = [own[:-1] for own in parts]
+    return {os.path.join(*own): path for own, path in zip(parts, folders, strict=True)}
 
 
 def seed_groups(runs: Mapping[str, Results]) -> dict[str, tuple[str, ...]]:
