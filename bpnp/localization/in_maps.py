@@ -18,8 +18,9 @@ from bpnp.maps.keypoints import detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.figures import save_figure
+from bpnp.report.fitted_table import FittedTable
 from bpnp.report.pictures import VERDICTS, picture_box, solution_picture
-from bpnp.report.tables import FittedTable, number
+from bpnp.report.tables import number
 from bpnp.solving.solution import Solution
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}

@@ -1,26 +1,23 @@
-"""Tables of test results for the terminal: the paper's quartiles, recall at standard points, untrained against trained.
-
-Every table fits in `WIDTH` columns with its names and numbers whole; in narrow terminals it is broken into several.
-"""
+"""Tables of test results for the terminal: the paper's quartiles, recall at standard points, untrained against trained."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rich import box
-from rich.console import Console, ConsoleOptions
+from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, pose_recalls
+from bpnp.report.fitted_table import WIDTH, FittedTable
 from bpnp.report.folder import read_results
 from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
 from bpnp.report.runs import named_runs, read_runs, seed_groups, trained_only, with_spread
 from bpnp.report.training_log import TrainingLog, read_training_log
 
-WIDTH = 80
 Values = Mapping[str, float]
 
 
@@ -32,46 +29,6 @@ class Column:
     key: str
     header: str
     share: bool = False
-
-
-@dataclass(frozen=True)
-class FittedTable:
-    """A table that is broken into several, side by side one below the other, where its columns do not fit.
-
-    headers: of the number columns. groups: rows (name, cells), with a line between groups.
-    """
-
-    title: str
-    headers: Sequence[str]
-    groups: Sequence[Sequence[tuple[Text, Sequence[Text]]]]
-    caption: str = ""
-
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
-        rows = [row for group in self.groups for row in group]
-        name = min(max([9, *(len(label) for label, _ in rows)]), options.max_width // 3)
-        parts: list[list[int]] = [[]]
-        left = options.max_width - name - 2
-        for i, header in enumerate(self.headers):
-            width = 1 + max([*map(len, header.split("\n")), *(len(cells[i]) for _, cells in rows)])
-            if width > left and parts[-1]:
-                parts.append([])
-                left = options.max_width - name - 2
-            parts[-1].append(i)
-            left -= width
-        for number, part in enumerate(parts):
-            title, caption = (text or None for text in (self.title, self.caption))
-            table = Table(
-                title=title if number == 0 else None, caption=caption if part is parts[-1] else None,
-                box=box.SIMPLE_HEAD, padding=0, caption_justify="left", pad_edge=False,
-            )  # fmt: skip
-            table.add_column("", overflow="fold", width=name)
-            for i in part:
-                table.add_column(self.headers[i], justify="right", no_wrap=True)
-            for group in self.groups:
-                for label, cells in group:
-                    table.add_row(label, *(cells[i] for i in part))
-                table.add_section()
-            yield table
 
 
 QUARTILES = tuple(
