@@ -1,4 +1,4 @@
-"""Tables of test results for the terminal: the paper's quartiles, recall at standard points, untrained against trained."""
+"""Tables of test results for the terminal: quartiles, recall at standard points, untrained against trained."""
 
 import math
 from collections.abc import Mapping, Sequence
