@@ -77,12 +77,13 @@ def anneal_on_clusters(
 
     first_scale: in spreads of the bearings.
     """
-    clusters, outlier = scene.clusters(stage.clusters), scene.outlier_density(outliers)
+    bearings, points = scene.clusters(stage.clusters)
+    sides, outlier = (tuple(bearings), tuple(points)), scene.outlier_density(outliers)
     scales = (scene.spread * np.geomspace(first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
-        descend(*clusters, rotation[i:j], translation[i:j], scales, outlier, score[i:j])
+        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j])
 
     done = in_time(anneal, len(starts), deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
@@ -99,14 +100,14 @@ def anneal_on_points(
     fine = scene.settings.fine
     rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
-    grid = build_grid(scene.offsets[:bearings], float(scales[-1]))
-    points, outlier = np.ascontiguousarray(scene.points3d.T), scene.outlier_density(outliers)
+    image, points = scene.sides(bearings)
+    grid, outlier = build_grid(image, float(scales[-1])), scene.outlier_density(outliers)
     rotation, translation = starts.rotation.copy(), starts.translation.copy()
     result = np.empty((len(starts), 3), np.float32)
 
     def anneal(i: int, j: int) -> None:
         descend_sparse(
-            tuple(grid)[:5], points, rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j]
+            tuple(grid), tuple(points), rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j]
         )
 
     done = in_time(anneal, len(starts), deadline, torch.get_num_threads())

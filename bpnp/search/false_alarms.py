@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.compilation import compiler
-from bpnp.search.point_sets import Labels, PointSets, solid_angle
+from bpnp.search.point_sets import Labels, PointSets, faces, solid_angle
 
 Array = NDArray[np.float64]
 compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
@@ -74,7 +74,7 @@ def log10_false_alarms_of(sets: PointSets, rotations: Array, translations: Array
     if len(sets.bearings) > FIXING and len(result):
         image = _Image(sets)
         for k in range(len(result)):
-            seen = _directions(sets.points3d, rotations[k], translations[k], sets.normals3d)
+            seen = _directions(sets, rotations[k], translations[k])
             if int(np.isfinite(seen[:, 0]).sum()) > FIXING:
                 result[k] -= image.log_evidence(seen) / math.log(10)
     return result
@@ -90,13 +90,13 @@ def _log10_tests(sets: PointSets) -> float:
     return math.log10(2 * max(choices, 1.0))
 
 
-def _directions(points3d: Array, rotation: Array, translation: Array, normals3d: Array | None) -> Array:
+def _directions(sets: PointSets, rotation: Array, translation: Array) -> Array:
     """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
-    camera = points3d @ rotation.T + translation
+    camera = sets.points3d @ rotation.T + translation
     length = np.linalg.norm(camera, axis=-1, keepdims=True)
     seen = np.divide(camera, length, out=np.full_like(camera, np.nan), where=length > 0)
-    if normals3d is not None:
-        seen[(seen * (normals3d @ rotation.T)).sum(-1) >= 0] = np.nan
+    if sets.normals3d is not None:
+        seen[~faces(sets.normals3d, sets.cosines3d, camera, rotation)] = np.nan
     return seen
 
 

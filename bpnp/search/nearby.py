@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.annealing import Deadline, anneal_on_points, in_time
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
+from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Recipe
 from bpnp.search.starts import Array, PosePrior
@@ -43,7 +44,7 @@ def nearby_batch(scene: Scene, prior: PosePrior, outliers: float, deadline: Dead
     rule = scene.settings.nearby
     poses, raster = drawn_around(scene, prior, starts_of(scene, prior)), raster_of(scene)
     for points, kept in zip(rule.points, rule.kept, strict=True):
-        poses = looked_up(poses, raster, scene.points3d[:points], kept, deadline, rule.starts_a_check)
+        poses = looked_up(poses, raster, scene.sides(points=points)[1], kept, deadline, rule.starts_a_check)
     first_scale, share = rule.scale * scene.spread, max(outliers, rule.outliers)
     return anneal_on_points(
         scene, poses, first_scale, share, deadline, bearings=scene.settings.fine.bearings
@@ -73,13 +74,13 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
 
 
 def looked_up(
-    poses: Candidates, raster: Raster, points3d: Array, kept: int, deadline: Deadline, at_once: int
+    poses: Candidates, raster: Raster, points: WeightedPoints, kept: int, deadline: Deadline, at_once: int
 ) -> Candidates:
     """The `kept` poses under which the points fall best, best first."""
-    points, score = np.ascontiguousarray(points3d.T), poses.score.copy()
+    side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
-        add_up(*raster, points, poses.rotation[i:j], poses.translation[i:j], score[i:j])
+        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j])
 
     done = in_time(look_up, len(poses), deadline, at_once)
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
@@ -95,7 +96,8 @@ def raster_of(scene: Scene) -> Raster:
     cells = min(math.ceil(2 * half * rule.cells / scale), rule.most_cells)
     per_cell = cells / (2 * half)
     place = np.minimum(((at + half) * per_cell).astype(np.int64), cells - 1)
-    counts = np.bincount(place[:, 1] * cells + place[:, 0], minlength=cells**2).reshape(cells, cells).astype(float)
+    place = place[:, 1] * cells + place[:, 0]
+    counts = np.bincount(place, scene.image.weights, cells**2).reshape(cells, cells).astype(np.float64)
     wide = rule.background * scale * per_cell
     near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
     inside = around > INSIDE * around.max()

@@ -21,6 +21,8 @@ class PointSets:
 
     bearings: (m, 3) unit vectors. points3d: (n, 3). normals3d: (n, 3) outward unit normals; a point that faces away is
     not seen. labels2d (m,), labels3d (n,): only points of one label can be partners, -1 fits any.
+    cosines3d: (n,) least cosine, 0 or more, between a normal and the direction to a camera that sees the point; None
+    for 0. scores2d (m,), scores3d (n,): probability that a point has a partner, in (0, 1]; None for equal ones.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
     prior: what is known of the pose.
     """
@@ -30,8 +32,19 @@ class PointSets:
     normals3d: Array | None = None
     labels2d: Labels | None = None
     labels3d: Labels | None = None
+    cosines3d: Array | None = None
+    scores2d: Array | None = None
+    scores3d: Array | None = None
     floor: float | None = None
     prior: Prior | None = None
+
+    @property
+    def cones3d(self) -> Array | None:
+        """(n, 4) normals and `cosines3d`, None if nothing is known of them."""
+        if self.normals3d is None:
+            return None
+        cosines = np.zeros(len(self.normals3d)) if self.cosines3d is None else self.cosines3d
+        return np.column_stack([self.normals3d, cosines])
 
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
@@ -56,6 +69,14 @@ class PointSets:
             relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
             share *= min(1.0, math.pi * relative**2 / solid_angle(self.bearings)) * min(1.0, 2 * relative / LOG_DEPTHS)
         return math.log10(share)
+
+
+def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Array) -> NDArray[np.bool_]:
+    """Which points (n, 3) in the camera's frame face it: n . c > cosine, c the unit vector to the camera's centre."""
+    towards = -((normals3d @ rotation.T) * camera).sum(-1)
+    if cosines3d is None:
+        return np.asarray(towards > 0)
+    return np.asarray(towards > cosines3d * np.linalg.norm(camera, axis=-1))
 
 
 def solid_angle(bearings: Array, *, ddof: int = 1) -> float:

@@ -4,15 +4,15 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import vq
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import MIN_POINTS
+from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
+from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets, solid_angle
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread
 
-FORWARD = np.array([0.0, 0.0, 1.0])
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
@@ -25,7 +25,8 @@ class Scene:
     origin and unit; the few points of a reconstruction that lie orders of magnitude away do not.
     spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
     compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
-    smallest_scale: of the residuals, radians. rng: of all that is random.
+    image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
+    that is random.
     """
 
     def __init__(self, sets: PointSets, seed: int, settings: SearchSettings) -> None:
@@ -37,10 +38,14 @@ class Scene:
         self.centre = bulk.mean(0)
         self.size = max(float(np.sqrt(((bulk - self.centre) ** 2).sum(-1).mean())), 1e-30)
         self.frame = _turned_to(bearings.mean(0))
-        self.offsets = self.rng.permutation(bearings @ self.frame.T - FORWARD).astype(np.float32)
+        order2d = self.rng.permutation(len(bearings))
+        self.offsets = (bearings @ self.frame.T - FORWARD)[order2d].astype(np.float32)
         order = self.rng.permutation(len(points3d))
         self.points3d = ((points3d - self.centre) / self.size)[order].astype(np.float32)
         self.bulk3d = self.points3d[in_bulk[order]]
+        self.image = side_of(self.offsets, sets.scores2d, sets.labels2d, None, order2d)
+        self.seen = side_of(self.points3d, sets.scores3d, sets.labels3d, sets.cones3d, order)
+        self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
         self.spread = angular_spread(self.offsets)
         self.solid_angle = solid_angle(self.offsets.astype(np.float64), ddof=0)
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
@@ -72,24 +77,17 @@ class Scene:
         turn = self.frame.T @ Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
         return turn, translation.astype(np.float64) * self.size @ self.frame - turn @ self.centre
 
-    def clusters(self, count: int) -> tuple[Array, Array, Array, Array]:
-        """Offsets of bearings (3, k), their weights, points (3, l) and theirs."""
-        d, a = self._clustered(self.offsets, count)
-        p, b = self._clustered(self.points3d, count)
-        f = d.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
-        d = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
-        return np.ascontiguousarray(d.T), a, np.ascontiguousarray(p.T), b
+    def clusters(self, count: int) -> tuple[WeightedBearings, WeightedPoints]:
+        """Both sides in about `count` clusters each."""
+        image = self.image.clustered(count, self.settings, self.rng)
+        f = image.points.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
+        unit = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
+        seen = self.seen.clustered(count, self.settings, self.rng)
+        return kernel_sides(image._replace(points=unit), seen, self.settings.facing)
 
-    def _clustered(self, points: Array, count: int) -> tuple[Array, Array]:
-        """At most `count` cluster centres, and how many points each stands for."""
-        if len(points) <= count:
-            return points, np.ones(len(points), np.float32)
-        size = min(len(points), self.settings.sampled * count)
-        sample = points if size == len(points) else points[self.rng.choice(len(points), size, replace=False)]
-        first = sample[self.rng.choice(size, count, replace=False)]
-        centres, members = lloyd(sample, first, self.settings.lloyd_iterations)
-        weight = members.astype(np.float32) * np.float32(len(points) / size)
-        return centres[members > 0], weight[members > 0]
+    def sides(self, bearings: int | None = None, points: int | None = None) -> tuple[WeightedBearings, WeightedPoints]:
+        """All points of both sides, or so many of them."""
+        return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
 
 
 def _turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -100,22 +98,6 @@ def _turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
     forward = axis / length
     right = np.linalg.svd(forward[None])[2][1]
     return np.stack([right, np.cross(forward, right), forward])
-
-
-def lloyd(points: Array, centres: Array, iterations: int) -> tuple[Array, NDArray[np.int64]]:
-    """Centres (k, 3) after some iterations of k-means (Lloyd), and the number of points that were nearest to each.
-
-    A centre that has lost all its points stays where it was, with no members.
-    """
-    for i in range(iterations + 1):
-        nearest, _ = vq(points, centres)
-        members = np.bincount(nearest, minlength=len(centres))
-        if i == iterations:
-            break
-        sums = np.stack([np.bincount(nearest, points[:, axis], len(centres)) for axis in range(3)], -1)
-        mean = sums / np.maximum(members, 1)[:, None]
-        centres = np.where(members[:, None] > 0, mean, centres).astype(np.float32)
-    return centres, members
 
 
 def degenerate(points: NDArray[np.float64]) -> bool:

@@ -97,6 +97,20 @@ class Nearby:
 
 
 @dataclass(frozen=True)
+class Facing:
+    """From where a point with a normal is seen (`bpnp.search.kernels.weighted`).
+
+    softness: cosines from the cone's edge to where a point is seen fully, or hardly; annealed poses are some degrees
+    off, and so are normals. unseen: weight of a point that should not be seen. extent: of the scene, that counts as
+    much in a cluster as a radian between normals.
+    """
+
+    softness: float = 0.2
+    unseen: float = 0.02
+    extent: float = 0.5
+
+
+@dataclass(frozen=True)
 class RefineSettings:
     """How `refine_poses` chooses among many starts: beyond `direct` they compete on clusters.
 
@@ -174,6 +188,7 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
+    facing: Facing = Facing()
     refine: RefineSettings = RefineSettings()
     evidence: Evidence = Evidence()
     least_annealed: int = 12

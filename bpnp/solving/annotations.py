@@ -1,4 +1,4 @@
-"""What a user knows of single points: normals and labels. Every function raises ValueError for what is not usable."""
+"""What a user knows of single points: normals, labels and scores. Each function raises ValueError for unusable ones."""
 
 from typing import Any
 
@@ -39,6 +39,26 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where:
         if values is None:
             raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
     return _labels("labels2d", labels2d, counts[0], where), _labels("labels3d", labels3d, counts[1], where)
+
+
+def checked_scores(name: str, values: Any, count: int, where: str) -> Array | None:
+    """Probabilities (count,) that a point has a partner, in (0, 1]."""
+    if values is None:
+        return None
+    points = name.replace("scores", "points")
+    try:
+        scores = np.asarray(_on_host(values), np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.60}") from error
+    if scores.shape != (count,):
+        raise ValueError(f"expected `{name}` of shape ({count},) as `{points}`{where}, got {scores.shape}")
+    bad = np.flatnonzero(~((scores > 0) & (scores <= 1)))
+    if len(bad):
+        raise ValueError(
+            f"expected probabilities above 0 and up to 1 in `{name}`{where}, got {scores[bad[0]]} at point {bad[0]}; "
+            "try to divide by the largest"
+        )
+    return scores
 
 
 def _labels(name: str, values: Any, count: int, where: str) -> Labels:

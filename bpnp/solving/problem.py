@@ -6,13 +6,13 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-import torch
 
 from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.point_sets import PointSets
+from bpnp.search.point_sets import PointSets, faces
 from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.solving.annotations import UNIT_NORM, checked_labels, checked_normals
+from bpnp.solving.annotations import checked_labels, checked_normals, checked_scores
+from bpnp.solving.given_points import check_points, normalised, numbers, unit_bearings
 from bpnp.solving.priors import Prior
 
 Array = npt.NDArray[np.float64]
@@ -20,8 +20,6 @@ Unit = Literal["px", "normalised", "rad"]
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
 FLOOR_PIXELS = 0.1  # no detector of points is better
-WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
-INSIDE_ONE_PIXEL = 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +30,8 @@ class Problem:
     are measured, in `unit`: pixels with a camera, else the normalised image plane, or the unit sphere for bearings.
     points2d: (m, 2) normalised, NaN for a point that has no such coordinates. points3d: (n, 3) as given. origin: where
     solvers put the scene's origin, for scenes so far from it that float32 would lose digits. degenerate: why no pose
-    can follow from these points, if so. normals3d: (n, 3) unit; labels2d: (k,) and labels3d: (n,), -1 for any.
+    can follow from these points, if so. normals3d: (n, 3) unit; labels2d: (k,) and labels3d: (n,), -1 for any;
+    scores2d: (k,) and scores3d: (n,), probability of a partner; cosines3d: (n,) as in `PointSets`.
     prior: in the user's coordinates. taken2d: of the given 2D points, how many were left to another pair.
     """
 
@@ -48,6 +47,9 @@ class Problem:
     normals3d: Array | None = None
     labels2d: npt.NDArray[np.int64] | None = None
     labels3d: npt.NDArray[np.int64] | None = None
+    scores2d: Array | None = None
+    scores3d: Array | None = None
+    cosines3d: Array | None = None
     prior: Prior | None = None
     taken2d: int = 0
 
@@ -78,15 +80,16 @@ class Problem:
             prior = prior._replace(translation=moved)
         floor = None if self.camera is None else FLOOR_PIXELS / self.per_radian
         return PointSets(
-            self.bearings, self.local3d, self.normals3d, self.labels2d, self.labels3d, floor=floor, prior=prior
-        )
+            self.bearings, self.local3d, self.normals3d, self.labels2d, self.labels3d, self.cosines3d, self.scores2d,
+            self.scores3d, floor=floor, prior=prior,
+        )  # fmt: skip
 
     def view(self, rotation: Array, translation: Array) -> Array:
         """Where all points are seen (n, d), NaN if they cannot be, or face away."""
         seen = self.project(rotation, translation, self.local3d)
         if self.normals3d is not None:
             camera = self.local3d @ rotation.T + translation
-            seen[((self.normals3d @ rotation.T) * camera).sum(-1) >= 0] = np.nan
+            seen[~faces(self.normals3d, self.cosines3d, camera, rotation)] = np.nan
         return seen
 
     def without(self, taken: npt.NDArray[np.int64]) -> "Problem":
@@ -99,6 +102,7 @@ class Problem:
             usable=self.usable[kept],
             image=self.image[kept],
             labels2d=None if self.labels2d is None else self.labels2d[kept],
+            scores2d=None if self.scores2d is None else self.scores2d[kept],
             degenerate=None if reason is None else f"of the lights that no other pair has, {reason}",
             taken2d=int((~kept).sum()),
         )
@@ -129,30 +133,33 @@ def problem_from(
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
+    scores2d: Any = None,
+    scores3d: Any = None,
+    cosines3d: Array | None = None,
     prior: Prior | None = None,
     where: str = "",
 ) -> Problem:
     """Check the arrays of one pair.
 
     points2d: (m, 2) pixels with a camera, normalised coordinates or (m, 3) unit bearings without; points3d (n, 3).
-    where: added to the errors, to name the pair. Pixels that cannot be undistorted are left out of `usable`.
-    Raises ValueError that names the argument: wrong shape, swapped, fewer points than fix a pose (3 where gravity is
-    known, else 4), NaN, pixels without a camera or the reverse, normals or labels that do not go with the points.
+    cosines3d: as in `PointSets`, not checked. where: added to the errors, to name the pair. Pixels that cannot be
+    undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape, swapped, fewer points
+    than fix a pose (3 where gravity is known, else 4), NaN, pixels without a camera or the reverse, normals, labels or
+    scores that do not go with the points.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
-    given2d, given3d = _numbers("points2d", points2d, where), _numbers("points3d", points3d, where)
+    given2d, given3d = numbers("points2d", points2d, where), numbers("points3d", points3d, where)
     if given2d.ndim == 2 and given2d.shape[1] == 3 and (camera is not None or given3d.shape[-1:] == (2,)):
         wrong = given2d if camera is not None else given3d
         what = "`points3d` of shape (n, 3)" if camera is None else "pixels `points2d` of shape (m, 2) with a `camera`"
         raise ValueError(f"expected {what}{where}, got {wrong.shape} (are points2d and points3d swapped?)")
-    _check_points("points2d", given2d, (2, 3) if camera is None else (2,), fewest, where)
-    _check_points("points3d", given3d, (3,), fewest, where)
+    check_points("points2d", given2d, (2, 3) if camera is None else (2,), fewest, where)
+    check_points("points3d", given3d, (3,), fewest, where)
     if given2d.shape[1] == 3:
-        image, unit = _unit(given2d, where), "rad"
+        image, unit = unit_bearings(given2d, where), "rad"
         bearings, plane = image, in_front(image)[:, :2]
     else:
-        image, unit = given2d, "normalised" if camera is None else "px"
-        plane = _plane(given2d, camera, where)
+        image, unit, plane = given2d, "normalised" if camera is None else "px", normalised(given2d, camera, where)
         rays = np.column_stack([plane, np.ones(len(plane))])
         bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
@@ -160,6 +167,7 @@ def problem_from(
         raise ValueError(
             f"expected {fewest} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
         )
+    scores = checked_scores("scores2d", scores2d, len(given2d), where)
     labels = checked_labels(labels2d, labels3d, (len(given2d), len(given3d)), where)
     return Problem(
         bearings=bearings[usable],
@@ -174,60 +182,11 @@ def problem_from(
         normals3d=checked_normals(normals3d, len(given3d), where),
         labels2d=None if labels is None else labels[0][usable],
         labels3d=None if labels is None else labels[1],
+        scores2d=None if scores is None else scores[usable],
+        scores3d=checked_scores("scores3d", scores3d, len(given3d), where),
+        cosines3d=cosines3d,
         prior=prior,
     )
-
-
-def _numbers(name: str, values: Any, where: str) -> Array:
-    if isinstance(values, torch.Tensor):
-        values = values.detach().cpu().double().numpy() if not values.is_complex() else values.numpy()
-    try:
-        array = np.asarray(values)
-        if array.dtype.kind not in "fiu":
-            raise TypeError(f"{array.dtype}")
-        return array.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
-
-
-def _check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int, where: str) -> None:
-    if points.ndim != 2 or points.shape[1] not in widths:
-        shapes = " or ".join(f"(k, {width})" for width in widths)
-        swapped = points.ndim == 2 and points.shape[1] in (2, 3)
-        hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
-        raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
-    if len(points) < fewest:
-        raise ValueError(f"expected {fewest} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
-    bad = np.flatnonzero(~np.isfinite(points).all(-1))
-    if len(bad):
-        raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
-
-
-def _unit(rays: Array, where: str) -> Array:
-    length = np.linalg.norm(rays, axis=-1, keepdims=True)
-    if np.abs(length - 1).max() > UNIT_NORM:
-        worst = float(length[np.abs(length - 1).argmax(), 0])
-        raise ValueError(
-            f"expected unit bearings in `points2d` of shape (m, 3){where}, got one of length {worst:g} (are points2d "
-            "and points3d swapped?); try points2d of shape (m, 2), or to divide by the lengths"
-        )
-    return rays / length
-
-
-def _plane(given: Array, camera: Camera | None, where: str) -> Array:
-    if camera is None:
-        if np.median(np.linalg.norm(given, axis=-1)) > WIDEST:
-            raise ValueError(
-                f"expected normalised image coordinates without a `camera`{where}, got values up to "
-                f"{np.abs(given).max():g}, which look like pixels; try camera=K"
-            )
-        return given
-    if np.abs(given).max() < INSIDE_ONE_PIXEL and camera.focal > 100:
-        raise ValueError(
-            f"expected pixels with a `camera`{where}, got values up to {np.abs(given).max():g}, which look normalised; "
-            "try without the camera"
-        )
-    return camera.normalise(given)
 
 
 def _origin(points3d: Array) -> Array:

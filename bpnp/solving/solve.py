@@ -23,6 +23,8 @@ def solve(
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
+    scores2d: Any = None,
+    scores3d: Any = None,
     solver: str | Path | nn.Module = "search",
     prior: Prior | str | Path | None = None,
     inlier_threshold: float | int | None = None,
@@ -42,6 +44,8 @@ def solve(
     normals3d: (n, 3) outward unit normals: a point that faces away from the camera is not seen.
     labels2d, labels3d: (m,) and (n,) integers, such as colours, classes or identities: only points of one label are
         matched; -1 fits any.
+    scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
+        strength of a keypoint, or the number of views that see a point; only their ratios matter much.
     solver: "search", which needs no training; a module from `Batch` to `Prediction`; or a checkpoint of a
         BPnPNet or a Matcher.
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
@@ -69,9 +73,9 @@ def solve(
     True
     """
     return solve_many(
-        [points2d], [points3d], camera, normals3d=[normals3d], labels2d=[labels2d], labels3d=[labels3d], solver=solver,
-        prior=prior, inlier_threshold=inlier_threshold, clutter=clutter, seed=seed, time_limit=time_limit,
-        device=device, progress=progress,
+        [points2d], [points3d], camera, normals3d=[normals3d], labels2d=[labels2d], labels3d=[labels3d],
+        scores2d=[scores2d], scores3d=[scores3d], solver=solver, prior=prior, inlier_threshold=inlier_threshold,
+        clutter=clutter, seed=seed, time_limit=time_limit, device=device, progress=progress,
     )[0]  # fmt: skip
 
 
@@ -83,6 +87,8 @@ def solve_many(
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
+    scores2d: Any = None,
+    scores3d: Any = None,
     solver: str | Path | nn.Module = "search",
     prior: Any = None,
     inlier_threshold: float | int | None = None,
@@ -98,7 +104,7 @@ def solve_many(
     device keeps its own, and another that claimed some of them is solved again without (`stats.taken2d`).
 
     points2d: a sequence of arrays (m_i, 2). points3d: one of (n_i, 3), or one array (n, 3) that all pairs share.
-    normals3d, labels2d, labels3d: sequences with one array a pair, or one array that all pairs share.
+    normals3d, labels2d, labels3d, scores2d, scores3d: sequences with one array a pair, or one that all pairs share.
     camera, prior: one for all, or a list with one each. time_limit: seconds a pair. On a GPU a module
     solves pairs of similar size together. Raises ValueError as `solve`, before anything is solved; it names the pair.
 
@@ -116,22 +122,22 @@ def solve_many(
     )  # fmt: skip
     sets2d = each_set("points2d", points2d, None)
     count = len(sets2d)
+    known = {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d, "scores2d": scores2d,
+             "scores3d": scores3d}  # fmt: skip
+    annotations = {name: each_set(name, values, count, 1 + (name == "normals3d")) for name, values in known.items()}
     arguments = zip(
         sets2d,
         each_set("points3d", points3d, count),
         each_camera(camera, count),
-        each_set("normals3d", normals3d, count),
-        each_set("labels2d", labels2d, count, axes=1),
-        each_set("labels3d", labels3d, count, axes=1),
         map(checked_prior, each_of("prior", prior, count)),
         strict=True,
     )
     problems = {
         i: problem_from(
-            x, p, lens, normals3d=normals, labels2d=labels, labels3d=others, prior=known,
+            x, p, lens, **{name: values[i] for name, values in annotations.items()}, prior=one,
             where=f" in pair {i}" if count > 1 else "",
         )
-        for i, (x, p, lens, normals, labels, others, known) in enumerate(arguments)
+        for i, (x, p, lens, one) in enumerate(arguments)
     }  # fmt: skip
     solutions = solutions_of(problems, options)
     shared_lights(problems, solutions, lambda i, problem: solutions_of({i: problem}, options)[i])

@@ -9,8 +9,9 @@ from planted import plant
 
 from bpnp.search.annealing import Deadline, anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
+from bpnp.search.kernels.sides import lloyd
 from bpnp.search.point_sets import PointSets
-from bpnp.search.scene import Scene, lloyd
+from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import draw_poses
 
@@ -44,7 +45,7 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
 
     def counted(name: str, function):
         def count(*arguments) -> None:
-            annealed[name] += len(arguments[4 if name == "clusters" else 2])
+            annealed[name] += len(arguments[2])
             function(*arguments)
 
         return count

@@ -8,8 +8,10 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.search.kernels.dense import POWER, assign, descend, normal_equations, turn
+from bpnp.search.kernels.dense import POWER, assign, descend, normal_equations
 from bpnp.search.kernels.grid import CAPACITY, REACH, assign_sparse, build_grid, descend_sparse
+from bpnp.search.kernels.vectors import turn
+from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 
@@ -36,8 +38,26 @@ class View:
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         return self.rotation.astype(np.float32), self.translation.astype(np.float32)
 
-    def points32(self) -> np.ndarray:
-        return np.ascontiguousarray(self.points.T.astype(np.float32))
+    def sides(self, a: np.ndarray | None = None, b: np.ndarray | None = None) -> tuple[tuple, tuple]:
+        """Both sides with these weights, 1 by default, any labels, and points that are seen from everywhere."""
+        one, free = np.ones(60, np.float32), np.full(60, -1, np.int32)
+        points, everything = self.points.T.astype(np.float32).copy(), np.repeat([[0], [60], [0], [0]], 60, 1)
+        return (
+            tuple(WeightedBearings(self.offsets, one if a is None else a, one, free)),
+            tuple(
+                WeightedPoints(
+                    points,
+                    one if b is None else b,
+                    one,
+                    free,
+                    everything.astype(np.uintp),
+                    np.empty((6, 0), np.float32),
+                )
+            ),
+        )
+
+    def grid(self, smallest: float) -> tuple:
+        return tuple(build_grid(WeightedBearings(*self.sides()[0]), smallest))
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
@@ -47,8 +67,7 @@ def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative:
     q = np.empty((4, 60), np.float32)
     kernel, scratch = np.empty((60, 60), np.float32), np.empty((2, 60), np.float32)
     likelihood = assign(
-        view.offsets, view.a, view.points32(), view.b, *view.pose(), np.float32(scale), np.float32(outlier), kernel,
-        *scratch, q,
+        *view.sides(view.a, view.b), view.b, *view.pose(), np.float32(scale), np.float32(outlier), kernel, *scratch, q
     )  # fmt: skip
     a, b, u = view.a.astype(float), view.b.astype(float), view.directions()
     k = np.maximum(1 - cdist(view.bearings, u, "sqeuclidean") / (2 * scale**2 * POWER), 0) ** POWER
@@ -63,20 +82,19 @@ def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative:
 @pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
 def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters(spread: float) -> None:
     view, scale, outlier = View(spread), 0.05 * spread, 0.002
-    grid = tuple(build_grid(np.ascontiguousarray(view.offsets.T), 0.01 * spread))[:5]
+    grid, (bearings, points), one = view.grid(0.01 * spread), view.sides(), np.ones(60, np.float32)
     index, kernel = np.empty((60, CAPACITY), np.int32), np.empty((60, CAPACITY), np.float32)
     row, column, q = np.empty(60, np.float32), np.empty(60, np.float32), np.empty((4, 60), np.float32)
     likelihood, matched = assign_sparse(
-        grid, view.points32(), *view.pose(), np.float32(scale), np.float32(outlier), index, kernel,
+        grid, points, one, *view.pose(), np.float32(scale), np.float32(outlier), index, kernel,
         np.empty(60, np.int32), row, column, q,
     )  # fmt: skip
     squared = cdist(view.bearings, view.directions(), "sqeuclidean")
     k = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
-    one = np.ones(60, np.float32)
     dense = assign(
-        view.offsets, one, view.points32(), one, *view.pose(), np.float32(scale), np.float32(outlier),
+        bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier),
         np.empty((60, 60), np.float32), row, column, q,
     )  # fmt: skip
     assert dense == pytest.approx(likelihood, abs=0.1)
@@ -123,10 +141,9 @@ def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: floa
     (rotation if part == "rotation" else translation)[1].flat[0] = value
     poses = [(rotation.copy(), translation.copy()) for _ in range(2)]
     score, result = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
-    one = np.ones(60, np.float32)
-    descend(view.offsets, one, view.points32(), one, *poses[0], scales, np.float32(0.5), score)
-    grid = tuple(build_grid(np.ascontiguousarray(view.offsets.T), 0.02))[:5]
-    descend_sparse(grid, view.points32(), *poses[1], scales, np.float32(0.5), 3, result)
+    bearings, points = view.sides()
+    descend(bearings, points, *poses[0], scales, np.float32(0.5), score)
+    descend_sparse(view.grid(0.02), points, *poses[1], scales, np.float32(0.5), 3, result)
     for values in (score, result[:, 0]):
         assert values[1] == -math.inf
         assert np.isfinite(values[[0, 2]]).all()

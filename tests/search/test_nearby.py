@@ -70,7 +70,7 @@ def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
 
     poses = drawn_around(scene, PosePrior(*right, 0.0, 0.0), 2)
     score = np.empty(2, np.float32)
-    add_up(*raster, np.ascontiguousarray(scene.points3d.T), poses.rotation, poses.translation, score)
+    add_up(*raster, tuple(scene.sides()[1]), poses.rotation, poses.translation, score)
     np.testing.assert_allclose(score, expected, rtol=2e-2)
 
 

@@ -146,6 +146,12 @@ def test_a_predicted_pose_is_taken_without_a_search_if_it_fits_and_left_if_not()
             {"labels2d": np.zeros(6, int), "labels3d": np.full(6, -2)},
             "expected labels of 0 or more, or -1 for any, in `labels3d`, got -2",
         ),
+        ({"scores2d": np.ones(5)}, r"expected `scores2d` of shape \(6,\) as `points2d`, got \(5,\)"),
+        (
+            {"scores3d": np.zeros(6)},
+            "expected probabilities above 0 and up to 1 in `scores3d`, got 0.0 at point 0; try",
+        ),
+        ({"scores3d": ["a"] * 6}, "expected `scores3d` as an array of numbers"),
     ],
 )
 def test_one_clear_error_for_bad_annotations(known: dict[str, Any], message: str) -> None:

@@ -4,7 +4,7 @@ docs/search.md states the mathematics. Arrays are float32 and coordinate-major, 
 Directions are held as offsets d = f - e, e = (0, 0, 1) the view's mean bearing (`Scene`): the small numbers of a narrow
 view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
 
-Shapes, for m bearings and n points: f (3, m) offsets of the bearings; a (m,), b (n,) weights; p (3, n) points; rotation
+Shapes, for m bearings and n points: f (3, m) offsets of the bearings; p (3, n) points; rotation
 (3, 3), translation (3,); q (4, n) sums over the bearings of W_ij (f_i - u_j) and, in the last row, of W_ij, W the soft
 assignment and u_j = g(R p_j + t); hessian (6, 6), of which the lower half is used, gradient (6,), step (6,) in (w, s).
 """
@@ -14,41 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.compilation import compiler
+from bpnp.search.kernels.vectors import F, compiled, cross, direction, rotated, turn
+from bpnp.search.kernels.weighted import visible_weights
 
-F = np.float32
-# Sums in any order, but NaN and infinity keep their meaning: they mark a lost pose.
-compiled = compiler(
-    fastmath={"reassoc", "contract", "arcp", "nsz", "afn"}, error_model="numpy", boundscheck=False
-)  # fmt: skip
-LARGEST_TURN = 0.5  # radians in one step
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
 POWER = 256  # of the kernel: eight squarings
-
-
-@compiled
-def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
-    """(x, y, z) x (a, b, c)."""
-    return y * c - z * b, z * a - x * c, x * b - y * a
-
-
-@compiled
-def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
-    """R (x, y, z)."""
-    return (
-        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
-        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
-        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
-    )
-
-
-@compiled
-def direction(x: Any, y: Any, z: Any) -> Any:
-    """The unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
-    inverse = F(1) / math.sqrt(x * x + y * y + z * z + F(1e-12))
-    x, y, z = x * inverse, y * inverse, z * inverse
-    return x, y, -(x * x + y * y) / (F(1) + z) if z > F(0) else z - F(1), inverse
 
 
 @compiled
@@ -143,41 +114,22 @@ def move(
 
 
 @compiled
-def turn(rotation: Any, vector: Any) -> None:
-    """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
-    x, y, z = vector[0], vector[1], vector[2]
-    angle: Any = math.sqrt(x * x + y * y + z * z)
-    shrink = min(F(1), F(LARGEST_TURN) / (angle + F(1e-20)))
-    angle *= shrink
-    half = F(0.5) * angle
-    factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)
-    w = math.cos(half)
-    x *= factor
-    y *= factor
-    z *= factor
-    d00, d01, d02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    d10, d11, d12 = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    d20, d21, d22 = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
-    for c in range(3):
-        r0, r1, r2 = rotation[0, c], rotation[1, c], rotation[2, c]
-        rotation[0, c] = d00 * r0 + d01 * r1 + d02 * r2
-        rotation[1, c] = d10 * r0 + d11 * r1 + d12 * r2
-        rotation[2, c] = d20 * r0 + d21 * r1 + d22 * r2
-
-
-@compiled
-def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, kernel: Any,
-           base: Any, row: Any, q: Any) -> Any:  # fmt: skip
+def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
+           kernel: Any, base: Any, row: Any, q: Any) -> Any:  # fmt: skip
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
 
     The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2: within 3 % of exp(z) where it exceeds 0.02, and without a
-    call. scale: s, radians. outlier: o of `Scene.outlier_density`. kernel (n, m), base (m,), row (m,): scratch.
+    call. bearings, points: a `WeightedBearings` and a `WeightedPoints` as tuples, the bearings in the order of their
+    labels. weight (n,): of the points under this pose. scale: s, radians. outlier: o of `Scene.outlier_density`.
+    kernel (n, m), base (m,), row (m,): scratch.
     """
+    f, a, odds2d = bearings[0], bearings[1], bearings[2]
+    p, odds3d, partners = points[0], points[2], points[4]
     m, n = f.shape[1], p.shape[1]
-    total_a, total_b = F(a.sum()), F(b.sum())
+    total_a, total_b = F(a.sum()), F(weight.sum()) + F(1e-20)
     sharp = F(1) / (scale * scale * F(POWER))
     for i in range(m):
-        row[i] = outlier * total_b
+        row[i] = outlier * total_b * odds2d[i]
         base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
     for j in range(n):
         x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
@@ -185,56 +137,61 @@ def assign(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scal
         q[0, j], q[1, j], q[2, j] = x, y, z
         shift = F(-0.5) * sharp * (x * x + y * y + z * z)
         x, y, z = sharp * x, sharp * y, sharp * z
-        column, weight, line = F(0), b[j], kernel[j]
-        for i in range(m):
-            v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(0))
-            v = v * v
-            v = v * v
-            v = v * v
-            v = v * v
-            v = v * v
-            v = v * v
-            v = v * v
-            v = v * v
-            line[i] = v
-            column += a[i] * v
-            row[i] += weight * v
+        column, b, line = F(0), weight[j], kernel[j]
+        for block in range(2):
+            for i in range(partners[2 * block, j], partners[2 * block + 1, j]):
+                v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(0))
+                v = v * v
+                v = v * v
+                v = v * v
+                v = v * v
+                v = v * v
+                v = v * v
+                v = v * v
+                v = v * v
+                line[i] = v
+                column += a[i] * v
+                row[i] += b * v
         q[3, j] = column
     likelihood = F(0)
     for i in range(m):
         likelihood += a[i] * math.log(row[i] / (total_b * scale * scale))
         row[i] = a[i] / row[i]
     for j in range(n):
-        weight, line = b[j] / (q[3, j] + outlier * total_a), kernel[j]
+        b, line = weight[j] / (q[3, j] + outlier * total_a * odds3d[j]), kernel[j]
         q0, q1, q2, total = F(0), F(0), F(0), F(0)
-        for i in range(m):
-            v = line[i] * line[i] * row[i]
-            q0 += v * f[0, i]
-            q1 += v * f[1, i]
-            q2 += v * f[2, i]
-            total += v
-        q[0, j] = (q0 - total * q[0, j]) * weight
-        q[1, j] = (q1 - total * q[1, j]) * weight
-        q[2, j] = (q2 - total * q[2, j]) * weight
-        q[3, j] = total * weight
+        for block in range(2):
+            for i in range(partners[2 * block, j], partners[2 * block + 1, j]):
+                v = line[i] * line[i] * row[i]
+                q0 += v * f[0, i]
+                q1 += v * f[1, i]
+                q2 += v * f[2, i]
+                total += v
+        q[0, j] = (q0 - total * q[0, j]) * b
+        q[1, j] = (q1 - total * q[1, j]) * b
+        q[2, j] = (q2 - total * q[2, j]) * b
+        q[3, j] = total * b
     return likelihood / total_a
 
 
 @compiled
-def descend(f: Any, a: Any, p: Any, b: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
+def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
             score: Any) -> None:  # fmt: skip
     """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
 
     score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix. outlier: o / s^2 of `Scene.outlier_density`.
+    not fix. bearings, points: as for `assign`. outlier: o / s^2 of `Scene.outlier_density`.
     """
-    m, n = f.shape[1], p.shape[1]
+    p = points[0]
+    m, n = bearings[0].shape[1], p.shape[1]
     for k in range(len(rotation)):
         kernel, base, row, q = np.empty((n, m), F), np.empty(m, F), np.empty(m, F), np.empty((4, n), F)
-        hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)
+        hessian, gradient, step, weight = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F), np.empty(n, F)
         for scale in scales:
+            visible_weights(points, rotation[k], translation[k], weight)
             score[k] = assign(
-                f, a, p, b, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base, row, q
+                bearings, points, weight, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base,
+                row, q,
             )  # fmt: skip
             fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), hessian, gradient, step)
             if not (fixed and math.isfinite(score[k])):

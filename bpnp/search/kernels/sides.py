@@ -1,0 +1,138 @@
+"""The two sides of a pair with what is known of single points, as the compiled loops read them, and their clusters."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.vq import vq
+
+from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
+from bpnp.search.settings import Facing, SearchSettings
+
+Array = NDArray[np.float32]
+FORWARD = np.array([0.0, 0.0, 1.0])
+
+
+class Side(NamedTuple):
+    """One side of a pair in random order.
+
+    points: (k, 3) offsets of bearings, or points. weights: (k,) probability of a partner, 1 where nothing is known.
+    labels: (k,), -1 fits any. cones: (k, 4) unit normals and the cosine at which a point is half visible; (k, 0)
+    for bearings, and for points that are seen from everywhere.
+    """
+
+    points: Array
+    weights: Array
+    labels: NDArray[np.int32]
+    cones: Array
+
+    def at(self, chosen: slice | NDArray[np.int64]) -> "Side":
+        """Some of the points."""
+        return Side(self.points[chosen], self.weights[chosen], self.labels[chosen], self.cones[chosen])
+
+    def clustered(self, count: int, settings: SearchSettings, rng: np.random.Generator) -> "Side":
+        """About `count` clusters in the order of their labels, each of points of one label; the weights add up.
+
+        Points with normals are near each other if these are too: half an extent counts as much as half a radian.
+        """
+        parts = []
+        for label in np.unique(self.labels):
+            members = np.flatnonzero(self.labels == label)
+            share = count if len(members) == len(self.labels) else -(-count * len(members) // len(self.labels))
+            parts.append(_clusters(self.at(members), share, settings, rng))
+        return parts[0] if len(parts) == 1 else Side(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
+    """A side from points in this order already, and annotations in the user's, None for those that are missing."""
+    k = len(points)
+    return Side(
+        points,
+        np.ones(k, np.float32) if scores is None else np.asarray(scores[order], np.float32),
+        np.full(k, -1, np.int32) if labels is None else np.asarray(labels[order], np.int32),
+        np.empty((k, 0), np.float32) if cones is None else np.asarray(cones[order], np.float32),
+    )
+
+
+def with_partners(side: Side, other: Side) -> Side:
+    """The side with the weight 0 for each point whose label none of the other side fits."""
+    fitting = np.unique(other.labels)
+    possible = np.isin(side.labels, fitting) | (side.labels < 0) | (-1 in fitting)
+    return side._replace(weights=np.where(possible, side.weights, np.float32(0)))
+
+
+def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.Generator) -> Side:
+    """At most `count` clusters of points of one label."""
+    k = len(side.points)
+    if k <= count:
+        return side
+    size = min(k, settings.sampled * count)
+    chosen = slice(None) if size == k else rng.choice(k, size, replace=False)
+    sample = np.concatenate([side.points, settings.facing.extent * side.cones], 1)[chosen]
+    first = sample[rng.choice(size, count, replace=False)]
+    centres, weights = lloyd(sample, first, settings.lloyd_iterations, side.weights[chosen])
+    centres, weights = centres[weights > 0], weights[weights > 0]
+    return Side(
+        np.ascontiguousarray(centres[:, :3]),
+        weights.astype(np.float32) * np.float32(k / size),
+        np.full(len(centres), side.labels[0], np.int32),
+        centres[:, 3:] / np.float32(settings.facing.extent),
+    )
+
+
+def lloyd(
+    points: Array, centres: Array, iterations: int, weights: Array | None = None
+) -> tuple[Array, NDArray[np.float64]]:
+    """Centres (k, d) after some iterations of k-means (Lloyd), and the weights of the points that were nearest to each.
+
+    A centre that has lost all its points stays where it was, with the weight 0.
+    """
+    mass = np.ones(len(points)) if weights is None else weights
+    for i in range(iterations + 1):
+        nearest, _ = vq(points, centres)
+        members = np.bincount(nearest, mass, len(centres)).astype(np.float64)
+        if i == iterations:
+            break
+        sums = np.stack([np.bincount(nearest, mass * axis, len(centres)) for axis in points.T], -1)
+        mean = sums / np.maximum(members, 1e-12)[:, None]
+        centres = np.where(members[:, None] > 0, mean, centres).astype(np.float32)
+    return centres, members
+
+
+def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[WeightedBearings, WeightedPoints]:
+    """Both sides as the compiled loops read them; on clusters the bearings have to be in the order of their labels."""
+    m, any_label = len(bearings.labels), int(np.searchsorted(bearings.labels, 0))
+    first, last = (np.searchsorted(bearings.labels, points.labels, side) for side in ("left", "right"))
+    free = points.labels < 0
+    partners = np.stack([
+        np.zeros(len(free), np.int64), np.where(free, m, any_label), np.where(free, 0, first), np.where(free, 0, last)
+    ])  # fmt: skip
+    return (
+        WeightedBearings(
+            np.ascontiguousarray(bearings.points.T), bearings.weights, _fitting(bearings, points), bearings.labels
+        ),
+        WeightedPoints(
+            np.ascontiguousarray(points.points.T), points.weights, _fitting(points, bearings), points.labels,
+            partners.astype(np.uintp), _cones(points, facing),
+        ),
+    )  # fmt: skip
+
+
+def _fitting(side: Side, other: Side) -> Array:
+    """For each point the share, by weight, of the other side whose labels fit; above 0, for points without any."""
+    values, place = np.unique(other.labels, return_inverse=True)
+    weights, free = np.bincount(place, other.weights), other.weights[other.labels < 0].sum()
+    at = np.minimum(np.searchsorted(values, side.labels), len(values) - 1)
+    fitting = np.where(values[at] == side.labels, weights[at], 0.0) + free
+    total = max(float(weights.sum()), 1e-12)
+    return np.maximum(np.where(side.labels < 0, total, fitting) / total, 1e-6).astype(np.float32)
+
+
+def _cones(points: Side, facing: Facing) -> Array:
+    """(6, n) as `WeightedPoints` has them."""
+    if not points.cones.shape[1]:
+        return np.empty((6, 0), np.float32)
+    normals, cosine, slope = points.cones[:, :3], points.cones[:, 3], 1 / (2 * facing.softness)
+    towards = -slope * (normals * points.points).sum(1)
+    rest = 0.5 - slope * cosine, np.full(len(cosine), facing.unseen)
+    return np.ascontiguousarray(np.stack([*(slope * normals).T, towards, *rest]), np.float32)

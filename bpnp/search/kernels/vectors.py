@@ -1,0 +1,62 @@
+"""Vectors and rotations in the compiled loops, component by component, and how these loops are compiled."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bpnp.compilation import compiler
+
+F = np.float32
+# Sums in any order, but NaN and infinity keep their meaning: they mark a lost pose.
+compiled = compiler(
+    fastmath={"reassoc", "contract", "arcp", "nsz", "afn"}, error_model="numpy", boundscheck=False
+)  # fmt: skip
+LARGEST_TURN = 0.5  # radians in one step
+
+
+@compiled
+def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
+    """(x, y, z) x (a, b, c)."""
+    return y * c - z * b, z * a - x * c, x * b - y * a
+
+
+@compiled
+def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
+    """R (x, y, z)."""
+    return (
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z,
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z,
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z,
+    )
+
+
+@compiled
+def direction(x: Any, y: Any, z: Any) -> Any:
+    """The unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
+    inverse = F(1) / math.sqrt(x * x + y * y + z * z + F(1e-12))
+    x, y, z = x * inverse, y * inverse, z * inverse
+    return x, y, -(x * x + y * y) / (F(1) + z) if z > F(0) else z - F(1), inverse
+
+
+@compiled
+def turn(rotation: Any, vector: Any) -> None:
+    """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
+    x, y, z = vector[0], vector[1], vector[2]
+    angle: Any = math.sqrt(x * x + y * y + z * z)
+    shrink = min(F(1), F(LARGEST_TURN) / (angle + F(1e-20)))
+    angle *= shrink
+    half = F(0.5) * angle
+    factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)
+    w = math.cos(half)
+    x *= factor
+    y *= factor
+    z *= factor
+    d00, d01, d02 = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    d10, d11, d12 = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    d20, d21, d22 = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    for c in range(3):
+        r0, r1, r2 = rotation[0, c], rotation[1, c], rotation[2, c]
+        rotation[0, c] = d00 * r0 + d01 * r1 + d02 * r2
+        rotation[1, c] = d10 * r0 + d11 * r1 + d12 * r2
+        rotation[2, c] = d20 * r0 + d21 * r1 + d22 * r2
