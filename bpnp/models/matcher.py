@@ -16,6 +16,7 @@ from bpnp.models.composition import AnyModule, chosen
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.nets.normalisation import centred
+from bpnp.models.nets.pointwise import Pointwise
 from bpnp.models.pose_head import pnp_pose, ransac_pose
 from bpnp.models.weights import TrainedNet
 from bpnp.types import Batch, Prediction, SolveStats
@@ -66,13 +67,13 @@ class Matcher(TrainedNet):
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
         self.mu, self.tolerance = mu, tolerance
         self.backward_stats = BackwardStats()
-        self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
-        self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
+        self.enter2d = Pointwise(2 * (1 + 2 * FREQUENCIES) + 3, channels)
+        self.enter3d = Pointwise(3 * (1 + 2 * FREQUENCIES), channels)
         self.around2d = Neighbourhood(2, channels, neighbours=neighbours) if neighbours else None
         self.around3d = Neighbourhood(3, channels, neighbours=neighbours) if neighbours else None
         self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(channels)
-        self.project = nn.Linear(channels, channels)
+        self.project = Pointwise(channels, channels)
         self.leave = nn.Linear(channels, 1)
         self.bin_cost = nn.Parameter(torch.ones(()))
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))

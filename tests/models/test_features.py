@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
-from bpnp.models.nets.normalisation import MaskedBatchNorm, context_norm
+from bpnp.models.nets.normalisation import MaskedBatchNorm
+from bpnp.models.nets.pointwise import pointwise_norm
 from bpnp.training.plugins import CompileNets
 
 SIZES = (9, 1, 14)
@@ -28,6 +29,11 @@ def plain_context_norm(x: Tensor) -> Tensor:
     deviation = x - x.mean(0)
     variance = (deviation**2).sum(0) / max(len(x) - 1, 1)
     return deviation / (variance + 1e-3).sqrt()
+
+
+def context_norm(x: Tensor, mask: Tensor | None) -> Tensor:
+    channels = x.shape[-1]
+    return pointwise_norm(x, torch.eye(channels).to(x), torch.zeros(channels).to(x), mask)
 
 
 def randomise(module: nn.Module) -> nn.Module:
@@ -68,7 +74,7 @@ def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
     single, padded, mask = sets(2)
     features = net(padded, mask)
     for i, x in enumerate(single):
-        z = net.enter(x)
+        z = net.enter(x[None])[0]
         for block in net.blocks:
             z = block(z[None], torch.ones(1, len(x)).bool())[0]
         z = z - z.mean(0) if centre else z
@@ -174,7 +180,7 @@ def test_the_input_transform_is_pointnets() -> None:
     for i, x in enumerate(single):
         z = x
         for k in range(3):
-            z = F.relu(norm(k)(net.linears[k](z)))
+            z = F.relu(norm(k)(F.linear(z, net.linears[k].weight, net.linears[k].bias)))
         z = z.max(0, keepdim=True).values
         for k in (3, 4):
             z = F.relu(norm(k)(net.linears[k](z)))
@@ -193,19 +199,36 @@ def test_normalised_scenes_forget_their_unit_and_origin() -> None:
     torch.testing.assert_close(moved, normalised, atol=2e-5, rtol=0)
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.bfloat16])
-def test_the_context_norm_has_the_gradient_of_its_formula(dtype: torch.dtype) -> None:
-    _, x, mask = sets(5, garbage=3.0)
-    x, weight = x.double(), torch.randn(x.shape, dtype=torch.float64)
-    if dtype == torch.float64:
-        assert torch.autograd.gradcheck(lambda x: context_norm(x, mask), x.requires_grad_())
-        return
-    gradients = []
-    for value in (x.requires_grad_(), x.detach().to(dtype).requires_grad_()):
-        out = context_norm(value, mask)
-        assert out.dtype == value.dtype
-        gradients.append(torch.autograd.grad((out.double() * weight).sum(), value)[0].double())
-    assert (gradients[1] - gradients[0]).norm() < 0.02 * gradients[0].norm()  # 8 bits
+@pytest.mark.parametrize("padded", [True, False])
+@pytest.mark.parametrize("residual", [True, False])
+def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: bool) -> None:
+    x, mask = sets(5, garbage=3.0)[1:]
+    weight, bias, skip = torch.randn(6, 5), torch.randn(6), torch.randn(*x.shape[:2], 6)
+    inputs = [value.double().requires_grad_() for value in (x, weight, bias, skip)]
+    assert torch.autograd.gradcheck(
+        lambda x, w, b, s: pointwise_norm(x, w, b, mask if padded else None, s if residual else None), inputs
+    )
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
+def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype) -> None:
+    block = PointFeatures(3, channels=16, depth=3)
+    _, points, mask = sets(3, garbage=1.0)
+    weights = torch.randn(*mask.shape, 16, dtype=torch.float64)
+
+    def gradients(dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
+        net = PointFeatures(3, channels=16, depth=3).to(torch.float64 if dtype == torch.float64 else torch.float32)
+        net.load_state_dict(block.state_dict())
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
+            out = net(points.to(net.enter.weight.dtype), mask)
+        (out * weights)[mask].sum().backward()
+        return out[mask].double(), [p.grad.double() for n, p in net.named_parameters() if "bias" not in n]
+
+    (out, grads), (exact, exact_grads) = gradients(dtype), gradients(torch.float64)
+    rounding = 1e-5 if dtype == torch.float32 else 0.05
+    assert (out - exact).abs().max() < rounding
+    for got, expected in zip(grads, exact_grads, strict=True):
+        assert (got - expected).norm() < 10 * rounding * expected.norm()
 
 
 def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
+from bpnp.models.nets.pointwise import Pointwise
+
 
 class Attention(nn.Module):
     """x + out(softmax(q k^T / sqrt(d)) v), with q of the points x and k, v of the points it looks at, both normalised.
@@ -18,9 +20,9 @@ class Attention(nn.Module):
             raise ValueError(f"expected `channels` a multiple of `heads`, got {channels} and {heads}")
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
-        self.query = nn.Linear(channels, channels)
-        self.key_value = nn.Linear(channels, 2 * channels)
-        self.out = nn.Linear(channels, channels)
+        self.query = Pointwise(channels, channels)
+        self.key_value = Pointwise(channels, 2 * channels)
+        self.out = Pointwise(channels, channels)
 
     def forward(
         self, x: Float[Tensor, "b k c"], seen: Float[Tensor, "b l c"], mask: Bool[Tensor, "b l"]
@@ -41,8 +43,8 @@ class FeedForward(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(channels)
-        self.enter = nn.Linear(channels, 2 * channels)
-        self.out = nn.Linear(2 * channels, channels)
+        self.enter = Pointwise(channels, 2 * channels)
+        self.out = Pointwise(2 * channels, channels)
 
     def forward(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b k c"]:
         return x + self.out(nn.functional.gelu(self.enter(self.norm(x))))
@@ -80,7 +82,7 @@ class Neighbourhood(nn.Module):
         super().__init__()
         self.neighbours = neighbours
         self.enter = nn.Linear(coordinates + 1, channels)
-        self.out = nn.Linear(channels, channels)
+        self.out = Pointwise(channels, channels)
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         k = min(self.neighbours, points.shape[1] - 1)

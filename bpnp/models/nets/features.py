@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.models.nets.normalisation import MaskedBatchNorm, centred, context_norm
+from bpnp.models.nets.normalisation import MaskedBatchNorm, centred
+from bpnp.models.nets.pointwise import Pointwise, pointwise_norm, unpadded
 
 
 class ResidualBlock(nn.Module):
@@ -23,12 +24,14 @@ class ResidualBlock(nn.Module):
         self.norm_b = MaskedBatchNorm(channels) if batch_norm else None
         self.norm_c = MaskedBatchNorm(channels) if batch_norm else None
 
-    def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        z = context_norm(nn.functional.linear(x, *self._first_map()), mask)
-        z = z if self.norm_b is None else self.norm_b(z, mask)
-        z = context_norm(self.linear_c(z), mask)
-        z = z if self.norm_c is None else self.norm_c(z, mask)
-        return x + torch.relu(z)
+    def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
+        """mask: None where nothing is padded."""
+        z = pointwise_norm(x, *self._first_map(), mask)
+        c = self.linear_c
+        if self.norm_b is None or self.norm_c is None:
+            return pointwise_norm(z, c.weight, c.bias, mask, skip=x)
+        z = pointwise_norm(self.norm_b(z, mask), c.weight, c.bias, mask)
+        return x + torch.relu(self.norm_c(z, mask))
 
     def _first_map(self) -> tuple[Tensor, Tensor]:
         """Weight and bias; under autocast, their product keeps its digits."""
@@ -55,13 +58,13 @@ class PointFeatures(nn.Module):
         super().__init__()
         self.coordinates, self.channels, self.depth = coordinates, channels, depth
         self.batch_norm, self.centre = batch_norm, centre
-        self.enter = nn.Linear(coordinates, channels)
+        self.enter = Pointwise(coordinates, channels)
         self.blocks = nn.ModuleList(ResidualBlock(channels, batch_norm=batch_norm) for _ in range(depth))
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-        z = self.enter(points)
+        z, seen = self.enter(points), None if unpadded(mask) else mask
         for block in self.blocks:
-            z = block(z, mask)
+            z = block(z, seen)
         return nn.functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
 
 
@@ -122,15 +125,20 @@ class InputTransform(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         widths = (3, 64, 128, 1024, 512, 256)
-        self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        kinds = (Pointwise, Pointwise, Pointwise, nn.Linear, nn.Linear)
+        sizes = zip(kinds, widths[:-1], widths[1:], strict=True)
+        self.linears = nn.ModuleList(kind(a, b) for kind, a, b in sizes)
         self.norms = nn.ModuleList(MaskedBatchNorm(width) for width in widths[1:])
         self.out = nn.Linear(256, 9)
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
-        z = points
-        for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
-            z = torch.relu(norm(linear(z), mask))
-        z = z.masked_fill(~mask.unsqueeze(-1), -math.inf).amax(1)
+        z, seen = points, None if unpadded(mask) else mask
+        for linear, norm in zip(self.linears[:2], self.norms[:2], strict=True):
+            z = torch.relu(norm(linear(z), seen))
+        z = self.norms[2](self.linears[2](z), seen)
+        z = z if seen is None else z.masked_fill(~seen.unsqueeze(-1), -math.inf)
+        # The pooling is a maximum whose gradient is written in one pass, to the first of equal values.
+        z = torch.relu(nn.functional.adaptive_max_pool2d(z.mT.unsqueeze(2), 1).flatten(1))
         for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
             z = torch.relu(norm(linear(z)))
         transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))

@@ -1,52 +1,10 @@
 """Normalisation over sets of different sizes, padded: no statistic sees a padded point."""
 
-from typing import Any
-
 import torch
 import torch.distributed as dist
 import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
-
-CONTEXT_EPS = 1e-3  # as in the released code
-
-
-def context_norm(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
-    """(x - mean) / sqrt(var + 1e-3) over the points of each set, per channel, with the unbiased variance.
-
-    The only exchange between points of a set. A set of one point has variance zero. The statistics of half-precision
-    values are made in float32.
-    """
-    with torch.autocast(x.device.type, enabled=False):
-        return _ContextNorm.apply(x, mask)
-
-
-class _ContextNorm(torch.autograd.Function):
-    """Its gradient in closed form, dx = (g - mean(g) - y sum(g y) / (count - 1)) / std: half the passes of autograd."""
-
-    @staticmethod
-    def forward(ctx: Any, x: Tensor, mask: Tensor) -> Tensor:
-        wide = x if x.dtype == torch.float64 else x.float()
-        weight = mask.unsqueeze(-1).to(wide.dtype)
-        count = weight.sum(1, keepdim=True)
-        mean = (wide * weight).sum(1, keepdim=True) / count
-        y = (wide - mean).mul_(weight)
-        variance = y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1)
-        scale = torch.rsqrt(variance + CONTEXT_EPS)
-        y.mul_(scale)
-        ctx.save_for_backward(y.to(x.dtype), weight, count, scale)
-        return y.to(x.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None]:
-        y, weight, count, scale = ctx.saved_tensors
-        g = gradient.to(weight.dtype) * weight
-        mean = g.sum(1, keepdim=True) / count
-        along = (g * y).sum(1, keepdim=True) / (count - 1).clamp_min(1)
-        dx = torch.addcmul(g, y.to(g.dtype), along, value=-1).sub_(mean).mul_(scale).mul_(weight)
-        return dx.to(gradient.dtype), None
 
 
 def centred(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:

@@ -1,0 +1,108 @@
+"""One linear map for all points of a padded set, and the same followed by the context norm (Yi et al. 2018)."""
+
+from typing import Any
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn.grad import conv2d_weight
+
+CONTEXT_EPS = 1e-3  # as in the released code
+
+
+def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
+    """Whether every point is known to be real, so that masks need not be applied.
+
+    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
+    """
+    return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
+
+
+def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Tensor | None) -> Float[Tensor, "b k d"]:
+    """x W^T + b.
+
+    On the CPU as a 1 x 1 convolution whose channels are last in memory: oneDNN has AVX-512 for every processor, while
+    MKL's matrix products leave half of the peak of those that are not Intel's.
+    """
+    if not x.is_cpu or x.dtype == torch.float64:
+        return nn.functional.linear(x, weight, bias)
+    return nn.functional.conv2d(x.mT.unsqueeze(2), weight[..., None, None], bias).squeeze(2).mT
+
+
+class Pointwise(nn.Linear):
+    """`pointwise` with its weights as a module."""
+
+    def forward(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b k d"]:
+        return pointwise(x, self.weight, self.bias)
+
+
+def pointwise_norm(
+    x: Float[Tensor, "b k c"],
+    weight: Float[Tensor, "d c"],
+    bias: Float[Tensor, " d"],
+    mask: Bool[Tensor, "b k"] | None,
+    skip: Float[Tensor, "b k d"] | None = None,
+) -> Float[Tensor, "b k d"]:
+    """y = CN(x W^T + b) with CN(z) = (z - mean) / sqrt(var + 1e-3) over the points of each set, per channel.
+
+    With `skip` the result is skip + relu(y). The context norm is the only exchange between the points of a set; its
+    variance is unbiased, and zero for a set of one point. Padded points have y = 0; mask None: there are none. The
+    statistics of half-precision values are made in float32. The bias has no effect and its gradient is zero.
+    """
+    device = x.device.type
+    if torch.is_autocast_enabled(device):
+        dtype = torch.get_autocast_dtype(device)
+        x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
+    with torch.autocast(device, enabled=False):
+        return _PointwiseNorm.apply(x, weight, bias, mask, skip)
+
+
+class _PointwiseNorm(torch.autograd.Function):
+    """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic.
+
+    dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std for the gradient g of y.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None
+    ) -> Tensor:  # fmt: skip
+        z = pointwise(x, weight, bias)
+        y = z if z.dtype == torch.float64 else z.float()
+        real = None if mask is None else mask.unsqueeze(-1).to(y.dtype)
+        count = y.new_full((1, 1, 1), y.shape[1]) if real is None else real.sum(1, keepdim=True)
+        y.sub_((y if real is None else y * real).sum(1, keepdim=True) / count)
+        y = y if real is None else y.mul_(real)
+        variance = y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        scale = torch.rsqrt(variance + CONTEXT_EPS)
+        y = y.mul_(scale).to(x.dtype)
+        ctx.save_for_backward(x, weight, y, scale, count, real)
+        ctx.rectified = skip is not None
+        return y if skip is None else torch.relu(y).add_(skip)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, y, scale, count, real = ctx.saved_tensors
+        g = gradient.to(y.dtype)
+        g = torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g
+        g = g if real is None else g * real
+        wide = y.to(scale.dtype)
+        dz = g * wide
+        along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
+        torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
+        dz = (dz if real is None else dz.mul_(real)).to(x.dtype)
+        to_x, to_weight = ctx.needs_input_grad[:2]
+        dx = pointwise(dz, weight.mT, None) if to_x else None
+        dw = _weight_gradient(x, dz) if to_weight else None
+        return dx, dw, torch.zeros_like(dz[0, 0]), None, gradient if ctx.rectified else None
+
+
+def _weight_gradient(x: Float[Tensor, "b k c"], dz: Float[Tensor, "b k d"]) -> Float[Tensor, "d c"]:
+    """sum of dz x^T over all points, by the kernels of `pointwise`."""
+    if not x.is_cpu or x.dtype == torch.float64:
+        return dz.flatten(0, 1).mT @ x.flatten(0, 1)
+    size = (dz.shape[-1], x.shape[-1], 1, 1)
+    return conv2d_weight(x.mT.unsqueeze(2), size, dz.mT.unsqueeze(2))[..., 0, 0]
