@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.facades.views import LONG_SIDE, SfmOptions, draw_sfm_pair
 from bpnp.datamodules.meshes.procedural import procedural_shape
 from bpnp.datamodules.meshes.surfaces import sample_surface
+from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_pair
 
 Kind = Literal["mesh", "photo", "leds"]
 CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # of 1280 x 960 pixels
@@ -42,7 +42,7 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
     """A problem of one kind; the same for the same seed.
 
     - "mesh": 200 points on a shape, all of them seen, from any side;
-    - "photo": keypoints of a photo and points of a map, of which half have no partner;
+    - "photo": keypoints of a photo and points of a map, of which a third have no partner;
     - "leds": 17 LEDs on a ring with their normals, those that face the camera, and 3 background lights.
 
     Raises ValueError for another kind.
@@ -67,7 +67,10 @@ def _mesh(rng: np.random.Generator) -> Example:
 
 
 def _photo(rng: np.random.Generator) -> Example:
-    pair = draw_sfm_pair("photo", SfmOptions(num_points=200, min_points=200, clutter=0.5, noise_px=NOISE_PX), rng)
+    options = MapOptions(
+        num_points=300, min_points=150, outliers=0.33, views=(1, 1), kinds={"facades": 1.0}, noise_px=NOISE_PX
+    )
+    pair = draw_map_pair("photo", options, rng)
     camera = np.diag([LONG_SIDE, LONG_SIDE, 1.0])
     return Example(
         LONG_SIDE * pair.points2d.astype(np.float64), pair.points3d.astype(np.float64), camera,

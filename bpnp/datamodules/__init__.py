@@ -2,12 +2,12 @@
 
 from bpnp.datamodules.augment import Outliers
 from bpnp.datamodules.colmap.module import ColmapDataModule
-from bpnp.datamodules.facades.module import SfmSceneDataModule
 from bpnp.datamodules.meshes.module import MeshDataModule
 from bpnp.datamodules.module import PairDataModule
 from bpnp.datamodules.pair import Pair, PairSource
 from bpnp.datamodules.released.module import PreprocessedDataModule
 from bpnp.datamodules.stored_pairs import write_pairs
+from bpnp.datamodules.synthetic_maps.module import SfmSceneDataModule
 
 __all__ = [
     "ColmapDataModule",

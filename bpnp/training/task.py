@@ -16,7 +16,14 @@ from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.composition import AnyModule, chosen, described
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.weights import TrainedNet, check_solver, solver_state
+from bpnp.models.weights import (
+    TrainedNet,
+    check_solver,
+    pretrained_names,
+    pretrained_path,
+    read_checkpoint,
+    solver_state,
+)
 from bpnp.training.supervision import Losses, MatchingLoss, correspondence_losses, matching_losses, pose_losses
 from bpnp.types import Batch, Prediction
 
@@ -36,6 +43,8 @@ class BlindPnPTask(LightningModule):
         solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses, the first of
             which is reported without its name (`val/rotation_q2_deg`) and selects checkpoints. If it has a method
             `match(batch)` for a prediction without poses, that is what a training step without a pose calls.
+        weights: packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
+            those that it was built with. Optimiser and step start anew, other than with `--ckpt_path`.
         learning_rate: of Adam; the paper has 1e-5.
         weight_decay: of Adam; the paper has 0, the released code 1e-3.
         pose_weight: gamma_p of Eq. 13, for the pose "pnp". While it is 0 no pose is solved in training;
@@ -52,6 +61,7 @@ class BlindPnPTask(LightningModule):
         self,
         solver: TrainedNet | AnyModule | None = None,
         *,
+        weights: str | None = None,
         learning_rate: float = 1e-5,
         weight_decay: float = 0.0,
         pose_weight: float = 0.0,
@@ -61,6 +71,8 @@ class BlindPnPTask(LightningModule):
     ) -> None:
         super().__init__()
         self.solver = chosen(solver, BPnPNet)
+        if weights is not None:
+            start_from(weights, self.solver)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
@@ -206,6 +218,14 @@ class BlindPnPTask(LightningModule):
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
             loss.reset()
+
+
+def start_from(weights: str, solver: nn.Module) -> None:
+    """Load packaged weights, by their name, or a checkpoint of `bpnp fit`. Raises ValueError if they do not fit."""
+    content = read_checkpoint(pretrained_path(weights) if weights in pretrained_names() else weights)
+    state = solver_state(content["state_dict"])
+    check_solver(content.get("solver", {}), state, described(solver), solver.state_dict())
+    solver.load_state_dict(state)
 
 
 def _wait(device: torch.device) -> None:

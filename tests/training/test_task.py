@@ -198,3 +198,19 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
 def test_wrong_settings_are_refused() -> None:
     with pytest.raises(ValueError, match="expected start_epoch >= 0"):
         PoseLossWarmup(start_epoch=-1)
+
+
+def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Path) -> None:
+    packaged = Matcher.from_pretrained("matcher-clutter")
+    task = BlindPnPTask(Matcher(), weights="matcher-clutter")
+    assert all(torch.equal(own, packaged.state_dict()[key]) for key, own in task.solver.state_dict().items())
+    trainer = Trainer(max_epochs=0, accelerator="cpu", logger=False, default_root_dir=tmp_path, barebones=False)
+    small = BlindPnPTask(Matcher(channels=16, depth=1))
+    trainer.strategy.connect(small)
+    trainer.save_checkpoint(tmp_path / "small.ckpt", weights_only=True)
+    other = BlindPnPTask(Matcher(channels=16, depth=1), weights=str(tmp_path / "small.ckpt"))
+    assert all(torch.equal(a, b) for a, b in zip(small.parameters(), other.parameters(), strict=True))
+    with pytest.raises(ValueError, match="expected a checkpoint of the configured Matcher, got channels=16, depth=1"):
+        BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
+    with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
+        BlindPnPTask(Matcher(), weights="matcher-of-nobody")

@@ -1,1 +1,0 @@
-"""Random scenes like sparse SfM maps of buildings."""

@@ -1,0 +1,276 @@
+"""Synthetic maps: exact geometry under the true pose, laws of sight and triangulation, and pure functions."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from jsonargparse import ArgumentParser
+from scipy.spatial.transform import Rotation
+
+from bpnp.datamodules import Outliers, Pair, PairSource, SfmSceneDataModule
+from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, MapOptions, draw_map_pair, triangulated
+from bpnp.datamodules.synthetic_maps.module import MapSource
+from bpnp.datamodules.synthetic_maps.objects import blob_points
+from bpnp.datamodules.synthetic_maps.photos import camera_at, details, look
+from bpnp.datamodules.synthetic_maps.scene import (
+    NO_BLOBS,
+    NO_WALLS,
+    Blobs,
+    Scene,
+    Viewpoint,
+    Walls,
+    hidden_by_blobs,
+    hidden_by_walls,
+)
+
+
+def source(*, seed: tuple[int, ...] = (0, 0), **options: object) -> MapSource:
+    return MapSource(MapOptions(**options), num_pairs=100, seed=seed, label="train")
+
+
+def pairs(count: int, **options: object) -> list[Pair]:
+    rngs = (np.random.default_rng([0, 0, 0, i]) for i in range(count))
+    return [draw_map_pair(f"map/{i}", MapOptions(**options), rng) for i, rng in enumerate(rngs)]
+
+
+def shown(pair: Pair) -> np.ndarray:
+    """Image points of all 3D points, NaN behind the camera."""
+    x, y, z = (pair.points3d @ pair.rotation.T + pair.translation).T
+    return np.stack([x, y], 1) / np.where(z > 0, z, np.nan)[:, None]
+
+
+def errors_px(pair: Pair) -> np.ndarray:
+    """Of each coordinate of the true pairs' keypoints."""
+    return (shown(pair)[: pair.matched] - pair.points2d[: pair.matched]).ravel() * pair.focal
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_true_pairs_reproject_within_the_noise(kind: str) -> None:
+    for pair in pairs(4, num_points=100, kinds={kind: 1.0}, noise_px=0.0):
+        assert np.abs(errors_px(pair)).max() < 0.1  # float32
+        np.testing.assert_allclose(pair.rotation @ pair.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(pair.rotation) == pytest.approx(1)
+    noise = np.concatenate([errors_px(pair) for pair in pairs(12, num_points=200, kinds={kind: 1.0}, noise_px=0.8)])
+    assert 0.75 < np.median(np.abs(noise)) / (0.8 * 0.6745) < 2.0  # the keypoint's, and more from the triangulation
+    assert np.abs(noise).max() < MOST_ERROR_PX
+
+
+def test_the_pose_is_what_opencv_finds_from_the_true_pairs() -> None:
+    found = 0
+    for pair in pairs(16, num_points=150, noise_px=(0.2, 0.5), scale_range=(1.0, 1.0), kinds={"facades": 1.0}):
+        points3d = pair.points3d[: pair.matched].astype(float)
+        points2d = pair.points2d[: pair.matched].astype(float)
+        middle = points3d.mean(0)
+        ok, turn, shift = cv2.solvePnP(points3d - middle, points2d, np.eye(3), np.zeros(5), flags=cv2.SOLVEPNP_SQPNP)
+        turn, shift = cv2.solvePnPRefineLM(points3d - middle, points2d, np.eye(3), np.zeros(5), turn, shift)
+        angle = np.degrees(Rotation.from_matrix(cv2.Rodrigues(turn)[0] @ pair.rotation.T).magnitude())
+        found += bool(ok) and angle < 1
+    assert found >= 14
+
+
+@pytest.mark.parametrize("limit", [0.0, 0.5, 0.8])
+def test_of_each_side_at_most_a_share_has_no_partner(limit: float) -> None:
+    for pair in pairs(15, num_points=120, outliers=limit):
+        for count in (len(pair.points2d), len(pair.points3d)):
+            assert 16 <= pair.matched <= count <= 120
+            assert 1 - pair.matched / count <= limit + 1 / pair.matched
+    everything = pairs(15, num_points=120, outliers=1.0)
+    without = [1 - pair.matched / len(pair.points2d) for pair in everything]
+    assert np.median(without) > 0.6  # most keypoints of a photo are in no other photo, or not in the view's
+
+
+def test_a_pair_is_a_function_of_seed_epoch_and_index() -> None:
+    options = {"num_points": 40}
+    first, index = source(**options), torch.tensor([3, 4])
+    assert isinstance(first, PairSource)
+    pair = first.batch(index[1:], 2)
+    size = int(pair.count3d)
+    assert torch.equal(pair.points3d[0], source(**options).batch(index, 2).points3d[1, :size])
+    others = [first.batch(index[1:], 1), first.batch(index[:1], 2)]
+    others += [source(seed=seed, **options).batch(index[1:], 2) for seed in ((1, 0), (0, 1))]
+    assert not any(torch.equal(pair.points3d[0, :16], other.points3d[0, :16]) for other in others)
+
+
+def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
+    plenty = pairs(60, num_points=40, noise_px=0.0)
+    for pair in plenty:
+        half = 600 / pair.focal
+        assert 24 <= 2 * np.degrees(np.arctan(half)) <= 115
+        assert np.abs(pair.points2d).max() <= half * (1 + 1e-6)
+        assert np.abs(pair.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
+    for rotate in (False, True):
+        kinds = {"facades": 1.0}
+        data = SfmSceneDataModule(num_points=40, test_pairs=60, eval_batch_size=60, rotate=rotate, kinds=kinds)
+        data.setup("test")
+        (batch,) = data.test_dataloader()
+        if rotate:
+            assert batch.rotation.mean(0).abs().max() < 0.35
+        else:
+            assert batch.rotation[:, 1, 2].quantile(0.75) < -0.8  # the third axis is upwards in the image
+    extents = [np.median(np.ptp(pair.points3d, axis=0)) for pair in plenty]
+    assert max(extents) / min(extents) > 20
+
+
+def test_a_wall_hides_what_is_behind_it_and_nothing_else() -> None:
+    """A wall 4 m wide and 3 m high on the x axis; rays from (2, -10, 1.5) by hand."""
+    one = np.ones(1)
+    wall = Walls(
+        np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([[0.0, -1.0]]), 4 * one, 3 * one, one, one, 0.8 * one
+    )
+    points = {
+        (2.0, 10.0, 1.5): True,
+        (5.9, 10.0, 1.5): True,  # crosses at x = 3.95
+        (6.2, 10.0, 1.5): False,  # passes at x = 4.1
+        (2.0, 10.0, 4.6): False,  # passes at 3.05 m
+        (2.0, 0.3, 1.5): False,  # in a window's recess
+        (2.0, -1.0, 1.5): False,
+        (2.0, -12.0, 1.5): False,
+    }
+    found = hidden_by_walls(wall, np.array([2.0, -10.0, 1.5]), np.array(list(points)))
+    assert found.tolist() == list(points.values())
+
+
+def test_an_ellipsoid_hides_what_is_behind_it_and_nothing_else() -> None:
+    """Radii 1, 1 and 2 around (0, 0, 3); rays along x from (-10, 0, 3) and to its surface."""
+    blob = Blobs(np.array([[0.0, 0.0, 3.0]]), np.diag([1.0, 1.0, 0.5])[None])
+    points = {
+        (5.0, 0.0, 3.0): True,
+        (5.0, 1.4, 3.0): True,  # the ray passes at y = 0.93, within the radius of 1
+        (5.0, 1.6, 3.0): False,
+        (5.0, 0.0, 5.9): True,  # passes 1.93 above the centre
+        (5.0, 0.0, 6.2): False,
+        (-1.0, 0.0, 3.0): False,  # the surface that faces the camera
+        (1.0, 0.0, 3.0): True,  # the one on the other side
+        (-12.0, 0.0, 3.0): False,
+    }
+    found = hidden_by_blobs(blob, np.array([-10.0, 0.0, 3.0]), np.array(list(points)))
+    assert found.tolist() == list(points.values())
+
+
+def test_points_of_blobs_are_on_a_surface_outside_of_the_others() -> None:
+    rng = np.random.default_rng(0)
+    radii = rng.uniform(0.5, 2, (4, 3))
+    turn = Rotation.random(4, random_state=1).as_matrix()
+    blobs = Blobs(rng.normal(0, 1.5, (4, 3)), turn / radii[:, :, None])
+    points, normals, _ = blob_points(blobs, 500, rng)
+
+    def level(at: np.ndarray) -> np.ndarray:
+        """Of each point the smallest ||to_sphere (p - centre)||: 1 on the surface of the union, more outside."""
+        place = np.einsum("kij,nkj->nki", blobs.to_sphere, at[:, None] - blobs.centre)
+        return np.linalg.norm(place, axis=-1).min(1)
+
+    np.testing.assert_allclose(level(points), 1, atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
+    assert (level(points + 1e-5 * normals) > level(points - 1e-5 * normals)).all()
+
+
+def plane(count: int, rng: np.random.Generator, *, repeatability: float) -> Scene:
+    """A wall of points at x = 0 that faces the negative x axis; nothing hides them."""
+    points = np.stack([np.zeros(count), *rng.uniform(-2, 2, (2, count))], 1)
+    normals = np.tile([-1.0, 0.0, 0.0], (count, 1))
+    return Scene(points, normals, np.full(count, repeatability), NO_WALLS, NO_BLOBS)
+
+
+FRONT = Viewpoint(np.array([-10.0, 0, 0]), np.zeros(3), orbit=0.0, shift=0.0, heading=0.0, parallax=(0.1, 0.1))
+SQUARE = np.array([0.5, 0.5])
+
+
+def test_a_photo_has_keypoints_where_points_repeat_face_it_and_are_near_enough() -> None:
+    rng = np.random.default_rng(0)
+    scene = plane(20_000, rng, repeatability=0.6)
+    everywhere = np.full(20_000, np.inf)
+    front = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
+    assert len(look(scene, front, everywhere, rng, alone=True).of) / 20_000 == pytest.approx(0.6, abs=0.02)
+    behind = camera_at(-FRONT.centre, FRONT.target, SQUARE, rng)
+    assert len(look(scene, behind, everywhere, rng, alone=True).of) == 0
+    reach = details(scene, FRONT, 0.5, rng)
+    shares = []
+    for far in (20.0, 40.0):
+        camera = camera_at(np.array([-far, 0.0, 0.0]), FRONT.target, SQUARE, rng)
+        shares.append(len(look(scene, camera, reach, rng, alone=False).of) / (0.6 * 20_000))
+    np.testing.assert_allclose(shares, [1 / 4, 1 / 16], rtol=0.1)  # as the square of the distance
+    single = scene._replace(repeatability=np.zeros(20_000))
+    assert len(look(single, front, everywhere, rng, alone=False).of) == 0
+    assert len(look(single, front, everywhere, rng, alone=True).of) > 0
+
+
+def test_a_triangulated_point_is_off_along_its_ray_by_the_square_of_its_depth() -> None:
+    """Inverse depths are off by noise / (baseline sqrt(photos)), the same at every depth."""
+    rng = np.random.default_rng(0)
+    scene = plane(20_000, rng, repeatability=1.0)
+    camera = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
+    spread = []
+    for depth in (10.0, 20.0):
+        moved = scene._replace(points=scene.points + [depth - 10.0, 0.0, 0.0])
+        seed = np.random.default_rng(5)  # the same number of photos
+        found = triangulated(moved, FRONT, [camera], np.full(20_000, np.inf), 1e-4, seed)
+        exact, points = moved.points[found.of] - camera.centre, found.points - camera.centre
+        assert np.abs(np.cross(exact, points)).max() < 1e-9 * np.abs(exact).max() ** 2
+        spread.append(np.std(1 / (points @ camera.rotation[2]) - 1 / (exact @ camera.rotation[2])))
+    assert spread[0] == pytest.approx(spread[1], rel=0.05)
+    photos = (1e-4 / (1.0 * spread[0])) ** 2  # the baseline is 1: a tenth of the distance to the target
+    assert photos == pytest.approx(round(photos), rel=0.05)
+    assert 2 <= round(photos) <= 16
+
+
+def test_the_map_has_no_point_that_one_photo_alone_has_a_keypoint_of() -> None:
+    rng = np.random.default_rng(0)
+    camera = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
+    far = np.full(1000, np.inf)
+    counts = [
+        len(triangulated(plane(1000, rng, repeatability=share), FRONT, [camera], far, 1e-4, rng).of)
+        for share in (0.0, 0.05, 0.9)
+    ]
+    assert counts[0] == 0
+    assert counts[1] < 50  # seen by this camera and one of at most 16 others
+    assert counts[2] > 850
+
+
+def test_density_is_uneven_as_that_of_keypoints() -> None:
+    """Counts in cells of the image vary several times as much as those of uniform points would."""
+    spread = []
+    for pair in pairs(20, num_points=250, min_points=40):
+        half = np.abs(pair.points2d).max(0)
+        cells = np.histogram2d(*pair.points2d.T, bins=6, range=[(-h, h) for h in half])[0]
+        spread.append(cells.var() / cells.mean())
+    assert np.median(spread) > 2.5
+
+
+def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
+    (tmp_path / "sfm.yaml").write_text(
+        "{num_points: 48, outliers: [0, 0.5], views: [1, 2], kinds: {statue: 1, street: 2}, noise_px: 1,"
+        " train_pairs: 8, val_pairs: 3, test_pairs: 3, batch_size: 4, train_outliers: {ratio: [0, 1]}}"
+    )
+    parser = ArgumentParser()
+    parser.add_class_arguments(SfmSceneDataModule, "data")
+    data = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'sfm.yaml'}"])).data
+    with pytest.raises(ValueError, match="expected `setup` before the train loader"):
+        data.train_dataloader()
+    data.setup()
+    assert data.options.outliers == (0.0, 0.5)
+    assert data.options.kinds == {"statue": 1, "street": 2}
+    assert data.outliers["train"] == Outliers(ratio=(0.0, 1.0))
+    batches = list(data.train_dataloader())
+    assert sorted(i for batch in batches for i in batch.index.tolist()) == list(range(8))
+    assert max(batch.points3d.shape[1] for batch in batches) <= data.datasets["train"].sizes[0]
+    assert sum(len(batch) for batch in data.test_dataloader()) == 3
+
+
+WRONG: list[tuple[str, object]] = [
+    ("min_points", 3), ("min_points", 400), ("outliers", -0.1), ("outliers", (1.0, 0.5)), ("field_of_view", 170.0),
+    ("noise_px", (0.0, np.inf)), ("scale_range", (0.0, 1.0)), ("views", (0, 2)), ("kinds", {"caves": 1.0}),
+    ("kinds", {"statue": 0.0}), ("train_pairs", 0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_wrong_options_are_named(name: str, value: object) -> None:
+    with pytest.raises(ValueError, match="at least one train pair" if name == "train_pairs" else name):
+        SfmSceneDataModule(**{name: value}).setup("fit")  # type: ignore[arg-type]
+
+
+def test_a_photo_that_never_shares_enough_is_an_error() -> None:
+    with pytest.raises(ValueError, match="expected a photo that shares 500 points with its map in 50 scenes"):
+        pairs(1, num_points=500, min_points=500, field_of_view=5.0)
