@@ -12,7 +12,7 @@ import numpy as np
 
 from bpnp.files import written_whole
 from bpnp.report.page.charts import sorted_errors
-from bpnp.report.palette import DASHES, LIGHT, styles
+from bpnp.report.palette import DASHES, LIGHT, QUIET, styles
 from bpnp.report.photos import box_of
 from bpnp.report.results import Results
 from bpnp.report.runs import read_runs
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 Lines = Literal["match3d", "assigned3d"]
 SUFFIXES = (".png", ".svg", ".pdf")
-QUIET = "#59626d"
 
 
 def recall_curve(

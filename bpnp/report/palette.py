@@ -10,6 +10,11 @@ LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#580
 DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
 LIGHT_BACKGROUND = "#ffffff"
 DARK_BACKGROUND = "#14171c"
+# Colours of the page itself: quiet text, lines between rows, panels, what has the focus, wrong matches.
+INKS = ("text", "quiet", "line", "panel", "focus", "wrong")
+LIGHT_INKS = ("#1b1f24", "#59626d", "#d5dae0", "#f5f6f8", "#0b57d0", "#b3261e")
+QUIET = LIGHT_INKS[1]
+DARK_INKS = ("#e6e8eb", "#a0a8b3", "#363c45", "#1d2128", "#8ab4f8", "#ff8a80")
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bpnp.cameras import in_front
-from bpnp.report.palette import LIGHT
+from bpnp.report.palette import LIGHT, QUIET
 from bpnp.report.photos import MARGIN, Box
 from bpnp.report.samples import Array
 
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
-QUIET = "#59626d"
 WIDTH, CAPTIONS = 8.0, 1.3  # inches
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.report.palette import DASHES, LIGHT, styles
+from bpnp.report.palette import DASHES, LIGHT, QUIET, styles
 from bpnp.report.results import Results
 from bpnp.report.samples import Array
 from bpnp.report.training_log import TrainingLog
@@ -129,7 +129,9 @@ def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
                 )  # fmt: skip
             if own.switch_step is not None and known and known[0].startswith("train"):
                 text = "pose loss joins" if len(logs) == 1 else f"{run}: pose loss"
-                figure.add_vline(x=own.switch_step, line={"dash": "dash", "width": 1}, annotation={"text": text})
+                figure.add_vline(
+                    x=own.switch_step, line={"dash": "dash", "width": 1, "color": QUIET}, annotation={"text": text}
+                )
         if figure.data:
             charts.append(figure)
     return charts
@@ -164,7 +166,7 @@ def _figure(title: str, x: str, y: str, runs: Mapping[str, Results], *, log: boo
     from plotly.graph_objects import Figure
 
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x", "template": "none"})
-    figure.update_xaxes(title={"text": x}, type="log" if log else "linear", exponentformat="power")
+    figure.update_xaxes(title={"text": x}, type="log" if log else "linear", **({"tickformat": "~g"} if log else {}))
     figure.update_yaxes(title={"text": y})
     return figure
 

@@ -2,7 +2,7 @@
 
 import html
 import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,11 @@ LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_poi
 def visible(text: object) -> str:
     """A text for HTML; bytes that are no UTF-8 are replaced."""
     return html.escape(str(text).encode("utf-8", "replace").decode())
+
+
+def options(texts: Iterable[str]) -> str:
+    """The options of a select element, numbered."""
+    return "".join(f'<option value="{i}">{visible(text)}</option>' for i, text in enumerate(texts))
 
 
 def labels(runs: Mapping[str, Results]) -> dict[tuple[str, str], str]:

@@ -16,10 +16,11 @@ from typing import Any
 
 from bpnp.files import written_whole
 from bpnp.report.folder import read_results
+from bpnp.report.page import templates
 from bpnp.report.page.charts import chart_text, page_charts
 from bpnp.report.page.points import packed, page_points, whole
-from bpnp.report.page.text import causes_html, headline_html, quartiles_html, series_buttons, visible
-from bpnp.report.palette import DARK, DARK_BACKGROUND, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.page.text import causes_html, headline_html, labels, options, quartiles_html, series_buttons, visible
+from bpnp.report.palette import DARK, DARK_BACKGROUND, DARK_INKS, INKS, LIGHT, LIGHT_BACKGROUND, LIGHT_INKS, styles
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import CAUSES, PairRow, Results
 from bpnp.report.runs import named_runs, trained_only
@@ -27,11 +28,32 @@ from bpnp.report.samples import read_views
 from bpnp.report.tables import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log
 
-SCRIPTS = ("charts.js", "pairs.js", "scene.js")
+SCRIPTS = ("results.js", "pairs.js", "viewer.js")
 MOST_BYTES = 19_850_000
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "iterations")
 SIZES = ("m", "n", "true_pairs")
+COLUMNS = {  # of the table of pairs: head and hover text
+    "rotation_error_deg": ("rot deg", "rotation error, degrees"),
+    "translation_error": ("trans", "translation error, scene units"),
+    "centre_error": ("centre", "distance of the camera centres, scene units"),
+    "reprojection_error_deg": ("repr deg", "mean reprojection error of the true matches, degrees"),
+    "inliers": ("inliers", "2D points with a reprojected 3D point beside them"),
+    "m": ("2D points", "2D points of the pair"),
+    "n": ("3D points", "3D points of the pair"),
+    "true_pairs": ("true pairs", "3D points with a true match"),
+    "iterations": ("iterations", "iterations of the solver"),
+    "seconds": ("sec", "seconds, the pair's share of its batch"),
+}
+# Of plotly's buttons those that are not shown.
+BUTTONS = (
+    "sendChartToCloud",
+    "select2d",
+    "lasso2d",
+    "autoScale2d",
+    "tableRotation",
+    "resetCameraLastSave3d",
+)  # not shown
 STATUSES = ("converged", "not converged", "no pose")
 HEADINGS = {"recall": "Recall", "errors": "Errors against size", "time": "Time", "training": "Training"}
 
@@ -65,12 +87,14 @@ def page_html(
     several = sum(len(results.estimates) for results in runs.values()) > 1
     sections = {
         **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
-        **({"versus-section": ("Run against run", VERSUS)} if several else {}),
+        **({"versus-section": ("Run against run", VERSUS.format(options(labels(runs).values())))} if several else {}),
         **{name: (HEADINGS[name], _charts_html(own, figures)) for name, own in charts.items()},
         **({"failures": ("Failures", causes_html(runs))} if runs else {}),
     }
     data = script_json(page_data(runs) | {
-        "photos": page_photos(views, photo), "charts": [chart.to_json() for chart in figures]
+        "photos": page_photos(views, photo), "charts": [chart.to_json() for chart in figures], "buttons": BUTTONS,
+        "figures": {name: json.dumps(figure) for name, figure in templates.figures().items()},
+        "look": json.dumps(templates.look()),
     })  # fmt: skip
     plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
     places = {name: _places(results) for name, results in runs.items()}
@@ -83,6 +107,12 @@ def page_html(
         "plotly": plotly,
         "title": html.escape("bpnp: " + ", ".join(folders)),
         "headline": headline_html(runs),
+        "list": options(labels(runs).values()),
+        "causes": options(CAUSES),
+        "statuses": options(STATUSES),
+        "no-pairs": "" if runs else " hidden",
+        "pair-head": pair_head("pair", sort=True),
+        "number-head": pair_head("estimate"),
         "series": series_buttons(runs),
         "navigation": " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in links.items()),
         "sections": "\n".join(
@@ -96,8 +126,8 @@ def page_html(
 
 
 VERSUS = (
-    '<div class="controls"><label>A <select id="a" data-state></select></label>'
-    '<label>B <select id="b" data-state></select></label></div><p id="versus-text" role="status"></p>'
+    '<div class="controls"><label>A <select id="a" data-state>{0}</select></label>'
+    '<label>B <select id="b" data-state>{0}</select></label></div><p id="versus-text" role="status"></p>'
     '<div class="chart" id="versus" role="img" style="height: 420px; max-width: 42rem"></div>'
     '<p class="note">A point above the diagonal is a pair that A solves better. Click a point to open its pair.</p>'
 )
@@ -118,7 +148,20 @@ def page_data(runs: Mapping[str, Results]) -> dict[str, Any]:
         }
         sizes = {key: whole([getattr(row, key) for row in pairs]) for key in SIZES}
         shown.append({"name": name, "ids": ids.index(own), "sizes": sizes, "estimates": estimates})
-    return {"runs": shown, "ids": ids, "causes": CAUSES, "statuses": STATUSES, "colours": [LIGHT, DARK]}
+    columns = [{"key": key, "whole": key in (*COUNTS, *SIZES)} for key in COLUMNS]
+    colours = [[*LIGHT, *LIGHT_INKS], [*DARK, *DARK_INKS]]
+    return {"runs": shown, "ids": ids, "columns": columns, "causes": CAUSES, "colours": colours}
+
+
+def pair_head(first: str, *, sort: bool = False) -> str:
+    """The head of a table of pairs or of estimates of a pair, with buttons that sort."""
+    cells = [("id", first, ""), *((key, *shown) for key, shown in COLUMNS.items())]
+    texts = (
+        (title, f'<button type="button" data-key="{key}">{text}</button>' if sort else text)
+        for key, text, title in cells
+    )
+    heads = "".join(f'<th scope="col" title="{title}">{text}</th>' for title, text in texts)
+    return f'<thead><tr>{heads}<th scope="col" class="words">cause</th></tr></thead><tbody></tbody>'
 
 
 def script_json(value: Any) -> str:
@@ -172,9 +215,16 @@ def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
 
 
 def _colours() -> str:
-    schemes = ((LIGHT, LIGHT_BACKGROUND), (DARK, DARK_BACKGROUND))
+    schemes = ((LIGHT, LIGHT_BACKGROUND, LIGHT_INKS), (DARK, DARK_BACKGROUND, DARK_INKS))
     light, dark = (
-        " ".join(f"--c{i}: {colour};" for i, colour in enumerate(colours)) + f" --background: {background};"
-        for colours, background in schemes
+        " ".join(
+            f"--{name}: {colour};"
+            for name, colour in (
+                *((f"c{i}", colour) for i, colour in enumerate(colours)),
+                ("background", background),
+                *zip(INKS, inks, strict=True),
+            )
+        )
+        for colours, background, inks in schemes
     )
     return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"

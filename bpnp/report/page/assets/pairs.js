@@ -1,13 +1,10 @@
-// The list of pairs with its filters, and one pair with the cameras of all runs.
+// The list of pairs with its filters, the first of them as small pictures, and the points of a pair.
 
-const ROWS = 25;
-const PICTURES = 12;
+const [ROWS, PICTURES] = [25, 12];
 const POINTS = JSON.parse(byId("points").textContent);
-const COLUMNS = { rotation_error_deg: "rot deg", translation_error: "trans", centre_error: "centre", reprojection_error_deg: "repr deg",
-  inliers: "inliers", m: "2D points", n: "3D points", true_pairs: "true pairs", iterations: "iterations", seconds: "sec" };
-const WHOLE = new Set(["inliers", "m", "n", "true_pairs", "iterations"]);
-const text = (series, key, i) => (WHOLE.has(key) ? String(series.get(key)[i]) : number(series.get(key)[i]));
+const text = (series, { key, whole }, i) => (whole ? String(series.get(key)[i]) : number(series.get(key)[i]));
 const listed = () => SERIES[state.list] ?? SERIES[0];
+const labelled = (id) => id || "(no name)";
 let chosen = [];
 let open = null;
 
@@ -15,8 +12,9 @@ for (const group of POINTS) {
   let [at2d, at3d] = [0, 0];
   const counts = column(group.counts);
   group.place = new Map(Array.from(column(group.rows), (row, k) => {
-    const start = { k, at2d, at3d, m: counts[3 * k], n: counts[3 * k + 1], matched: counts[3 * k + 2] };
-    [at2d, at3d] = [at2d + start.m, at3d + start.n];
+    const [m, n, matched] = counts.subarray(3 * k, 3 * k + 3);
+    const start = { k, at2d, at3d, m, n, matched };
+    [at2d, at3d] = [at2d + m, at3d + n];
     return [row, start];
   }));
 }
@@ -59,7 +57,7 @@ function selectPairs() {
     error[i] >= Number(state.least) && (!state.drawn || groupOf(series.run, i)));
   const sign = state.up ? 1 : -1;
   if (state.sort === "id") return found.sort((a, b) => sign * series.ids[a].localeCompare(series.ids[b]));
-  const values = series.get(state.sort in COLUMNS ? state.sort : "rotation_error_deg");
+  const values = series.get(DATA.columns.some(({ key }) => key === state.sort) ? state.sort : DEFAULTS.sort);
   const order = (a, b) => (values[a] === values[b] ? 0 : sign * (values[a] < values[b] ? -1 : 1));
   return found.sort((a, b) => Number.isNaN(values[a]) - Number.isNaN(values[b]) || order(a, b) || a - b);
 }
@@ -67,7 +65,7 @@ function selectPairs() {
 function pairRow(series, i, head) {
   const cause = series.get("cause")[i];
   return element("tr", {}, element("th", { scope: "row" }, head),
-    ...Object.keys(COLUMNS).map((key) => element("td", {}, text(series, key, i))),
+    ...DATA.columns.map((shape) => element("td", {}, text(series, shape, i))),
     element("td", { class: "words" }, element("span", { class: `fill cause${cause}` }), ` ${DATA.causes[cause]}`));
 }
 
@@ -76,71 +74,34 @@ function drawPairs() {
   chosen = selectPairs();
   const pages = Math.max(1, Math.ceil(chosen.length / ROWS));
   const page = Math.min(Number(state.page), pages - 1);
-  const sort = (key) => () => { setState({ up: state.sort === key && !state.up ? "1" : "", sort: key, page: "0" }); drawPairs(); };
-  const head = (key, label) => element("th", { scope: "col", "aria-sort": state.sort === key && (state.up ? "ascending" : "descending") },
-    element("button", { type: "button", "data-key": key, onclick: sort(key) }, label));
-  byId("pair-table").replaceChildren(
-    element("thead", {}, element("tr", {}, head("id", "pair"), ...Object.entries(COLUMNS).map(([key, label]) => head(key, label)),
-      element("th", { scope: "col", class: "words" }, "cause"))),
-    element("tbody", {}, ...chosen.slice(page * ROWS, (page + 1) * ROWS).map((i) => pairRow(series, i, element("button",
-      { type: "button", class: "link", onclick: () => openPair(i) }, `${groupOf(series.run, i) ? "◉ " : ""}${series.ids[i] || "(no name)"}`)))));
-  const turn = (by) => () => { setState({ page: String(page + by) }); drawPairs(); byId(by < 0 ? "page-back" : "page-on").focus(); };
-  byId("pager").replaceChildren(
-    element("button", { type: "button", id: "page-back", onclick: turn(-1), disabled: page === 0 }, "← back"),
-    element("span", { role: "status" }, `${page + 1} / ${pages} · ${chosen.length} of ${series.ids.length} pairs`),
-    element("button", { type: "button", id: "page-on", onclick: turn(1), disabled: page === pages - 1 }, "on →"));
+  for (const { dataset, parentNode } of document.querySelectorAll("#pair-table [data-key]"))
+    parentNode.setAttribute("aria-sort", dataset.key !== state.sort ? "none" : state.up ? "ascending" : "descending");
+  byId("pair-table").tBodies[0].replaceChildren(...chosen.slice(page * ROWS, (page + 1) * ROWS).map((i) => pairRow(series, i,
+    element("button", { type: "button", class: "link", onclick: () => openPair(i) }, `${groupOf(series.run, i) ? "◉ " : ""}${labelled(series.ids[i])}`))));
+  byId("page-back").disabled = page === 0;
+  byId("page-on").disabled = page === pages - 1;
+  byId("page").textContent = `${page + 1} / ${pages} · ${chosen.length} of ${series.ids.length} pairs`;
   const kept = series.ids.reduce((sum, _, i) => sum + (groupOf(series.run, i) ? 1 : 0), 0);
   byId("kept").textContent = `◉: points in this page, of ${kept === series.ids.length ? "all" : kept} of the ${series.ids.length} pairs; ` +
     "24 a side, of the worst pairs and some others up to 300. ← and → go through the list while a pair is open.";
   byId("gallery").replaceChildren(...chosen.filter((i) => groupOf(series.run, i)).slice(0, PICTURES).map((i) => thumbnail(series, i)));
 }
 
-const sparse = (points) => points.filter((_, i) => i % Math.ceil(points.length / 40) === 0);
-
 // Image points as circles, 3D points reprojected by the listed estimate as crosses.
 function thumbnail(series, i) {
   const view = viewOf(groupOf(series.run, i), i);
+  const sparse = (points) => points.filter((_, k) => k % Math.ceil(points.length / 40) === 0);
   const [x, y, width, height] = view.box;
   const unit = Math.max(width, height, 1e-9) / 100;
   const pose = view.cameras.find((camera) => camera.series === series)?.pose;
   const photo = DATA.photos[series.ids[i]];
   const crosses = !pose ? "" : sparse(view.points3d).map((p) => projected(pose, p)).filter(Boolean)
     .map(([u, v]) => `M${u - 2 * unit},${v - 2 * unit}l${4 * unit},${4 * unit}m0,${-4 * unit}l${-4 * unit},${4 * unit}`).join("");
-  const frame = { viewBox: `${x - 8 * unit} ${y - 8 * unit} ${width + 16 * unit} ${height + 16 * unit}`, "aria-hidden": "true" };
   const [l, t, r, b] = photo?.box ?? [];
-  return element("button", { type: "button", onclick: () => openPair(i) }, element("svg", frame,
-    ...(photo ? [element("image", { href: `data:image/jpeg;base64,${photo.jpeg}`, x: l, y: t, width: r - l, height: b - t })] : []),
-    ...sparse(view.points2d).map(([cx, cy]) => element("circle", { cx, cy, r: 2 * unit, fill: "none", stroke: css("--text"), "stroke-width": unit / 2 })),
-    element("path", { d: crosses, stroke: colour(series), "stroke-width": unit, fill: "none" })),
+  return element("button", { type: "button", onclick: () => openPair(i) },
+    element("svg", { viewBox: `${x - 8 * unit} ${y - 8 * unit} ${width + 16 * unit} ${height + 16 * unit}`, "aria-hidden": "true" },
+      ...(photo ? [element("image", { href: `data:image/jpeg;base64,${photo.jpeg}`, x: l, y: t, width: r - l, height: b - t })] : []),
+      ...sparse(view.points2d).map(([cx, cy]) => element("circle", { cx, cy, r: 2 * unit, stroke: photo ? "#ffffff" : ink("text"), "stroke-width": unit / 2 })),
+      element("path", { d: crosses, stroke: ink(`c${series.index}`), "stroke-width": unit })),
     `${number(series.get("rotation_error_deg")[i])} deg, ${series.ids[i]}`);
-}
-
-function openPair(i) {
-  const series = listed();
-  open = { i, series, id: series.ids[i], at: (other) => (other.ids === series.ids ? i : other.ids.indexOf(series.ids[i])) };
-  setState({ pair: wellFormed(open.id) || "(no name)" });
-  byId("pair-title").textContent = open.id || "(no name)";
-  byId("pair-numbers").replaceChildren(
-    element("thead", {}, element("tr", {}, ...["estimate", ...Object.values(COLUMNS), "cause"].map((label) => element("th", { scope: "col" }, label)))),
-    element("tbody", {}, ...SERIES.filter((other) => open.at(other) >= 0).map((other) => pairRow(other, open.at(other), other.name))));
-  const rank = chosen.indexOf(i);
-  byId("previous").disabled = rank <= 0;
-  byId("next").disabled = rank < 0 || rank === chosen.length - 1;
-  const owner = [series, ...SERIES].find((other) => open.at(other) >= 0 && groupOf(other.run, open.at(other)));
-  byId("views").hidden = !owner;
-  byId("missing").hidden = Boolean(owner);
-  if (!byId("pair").open) byId("pair").showModal();
-  if (!owner) return;
-  open.view = viewOf(groupOf(owner.run, open.at(owner)), open.at(owner));
-  open.poses = [...(open.view.truth ? [{ name: "true pose", pose: open.view.truth }] : []),
-    ...open.view.cameras.map(({ series: own, pose }) => ({ name: own.name, pose, series: own }))];
-  byId("pose").replaceChildren(...open.poses.map(({ name }, k) => element("option", { value: k }, name)));
-  byId("pose").value = String(Math.max(0, open.poses.findIndex((camera) => camera.series === series)));
-  byId("photo-label").hidden = !(open.id in DATA.photos);
-  drawPair();
-}
-
-function step(by) {
-  const next = chosen[chosen.indexOf(open.i) + by];
-  if (next !== undefined && byId("pair").open) openPair(next);
 }

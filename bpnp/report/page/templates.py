@@ -1,0 +1,86 @@
+"""The figures that the page fills with the data of a pair or of two runs, and the look of all its figures.
+
+Colours are those of the light scheme; the page replaces each by that of the dark scheme where that is asked for.
+"""
+
+from typing import Any
+
+from bpnp.report.palette import INKS, LIGHT_INKS
+
+INK = dict(zip(INKS, LIGHT_INKS, strict=True))
+CLEAR = "rgba(0,0,0,0)"
+AXIS = {"gridcolor": INK["line"], "zerolinecolor": INK["line"], "linecolor": INK["quiet"], "automargin": True}
+AXES_3D = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
+PICKED = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}}
+
+
+def look() -> dict[str, Any]:
+    """The plotly template of every figure."""
+    axis3d = {
+        "gridcolor": INK["line"], "zerolinecolor": INK["line"], "color": INK["quiet"], "backgroundcolor": CLEAR,
+        "showspikes": False,
+    }  # fmt: skip
+    layout = {
+        "margin": {"l": 50, "r": 12, "t": 44, "b": 40}, "showlegend": False, "paper_bgcolor": CLEAR,
+        "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11}, "hoverlabel": {"namelength": 60},
+        "modebar": {"bgcolor": CLEAR, "color": INK["quiet"], "activecolor": INK["focus"]},
+        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": AXIS, "yaxis": AXIS,
+        "scene": {"xaxis": axis3d, "yaxis": axis3d, "zaxis": axis3d},
+    }  # fmt: skip
+    return {"layout": layout}
+
+
+def figures() -> dict[str, dict[str, Any]]:
+    """By the id of their element: run against run, a pair in space, a pair in the image."""
+    degrees = {"type": "log", "tickformat": "~g"}
+    diagonal = {"x": [1e-4, 180], "y": [1e-4, 180], "mode": "lines", "hoverinfo": "skip"}
+    versus = {
+        "data": [
+            diagonal | {"line": {"color": INK["quiet"], "width": 1, "dash": "dash"}},
+            {
+                "mode": "markers", "marker": {"size": 5, "color": INK["text"], "opacity": 0.5},
+                "hovertemplate": "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>",
+            },
+        ],
+        "layout": {
+            "title": {"text": "Rotation error of each pair"}, "hovermode": "closest", "xaxis": degrees, "yaxis": degrees
+        },
+    }  # fmt: skip
+    axes = {
+        f"{name}axis": {"title": {"text": text}} for name, text in zip("xyz", ("right", "forward", "up"), strict=True)
+    }
+    scene = {
+        "data": [
+            _marks(size=3.5, line={"width": 0}) | {"type": "scatter3d"},
+            {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 9}},
+        ],
+        "layout": {
+            "margin": dict.fromkeys("lrtb", 0), "hovermode": "closest",
+            "scene": axes | {
+                "aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 0.9, "y": -1.5, "z": 0.7}}
+            },
+        },
+    }  # fmt: skip
+    image = {
+        "data": [
+            _lines(color=INK["quiet"]),
+            _lines(color=INK["wrong"], dash="dot"),
+            _marks(symbol="circle-open", line={"width": 1.6}),
+            _marks(symbol="x-thin"),
+            {"mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 16}},
+        ],
+        "layout": {
+            "margin": {"l": 40, "r": 10, "t": 10, "b": 30}, "hovermode": "closest", "dragmode": "pan",
+            "xaxis": {"constrain": "domain", "zeroline": False},
+            "yaxis": {"constrain": "domain", "zeroline": False, "scaleanchor": "x"},
+        },
+    }  # fmt: skip
+    return {"versus": versus, "scene": scene, "image": image}
+
+
+def _marks(**marker: Any) -> dict[str, Any]:
+    return {"mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
+
+
+def _lines(**line: Any) -> dict[str, Any]:
+    return {"mode": "lines", "hoverinfo": "skip", "opacity": 0.7, "line": {"width": 1, **line}}
