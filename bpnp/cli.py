@@ -6,107 +6,12 @@ import os
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from contextlib import nullcontext
 from importlib.metadata import version
-from pathlib import Path
-from typing import Any
-
-from lightning import LightningDataModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import OneLineParser, first_line, run_command
+from bpnp.commands.parser import first_line, run_command
+from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
 from bpnp.configs import config_names, packaged_config
-from bpnp.files import claimed
-from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO, interruptible
-from bpnp.training.results_writer import ResultsWriter
-from bpnp.training.task import BlindPnPTask, TrainingDivergedError
-
-LIGHTNING = {
-    "fit": "Train a solver.",
-    "validate": "Evaluate a solver on the validation pairs.",
-    "test": "Evaluate a solver on the test pairs and write their results.",
-    "predict": "Write the poses of pairs whose true pose need not be known.",
-}
-
-
-class _Parser(OneLineParser, LightningArgumentParser):
-    """Lightning's parser with errors of one line."""
-
-
-class BpnpCLI(LightningCLI):
-    """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir."""
-
-    def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
-        parser = _Parser(**kwargs)
-        parser.add_argument("-c", "--config", action="config", help="configuration file, or the name of a packaged one")
-        return parser
-
-    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
-        parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
-        parser.add_lightning_class_args(ResultsWriter, "results")
-        parser.set_defaults(
-            {
-                "trainer.default_root_dir": "runs/default",
-                "best_checkpoint.monitor": "val/rotation_q2_deg",
-                "best_checkpoint.filename": "best",
-                "best_checkpoint.enable_version_counter": False,
-                "last_checkpoint.filename": "last",
-                "last_checkpoint.enable_version_counter": False,
-            }
-        )
-        for name in ("best_checkpoint", "last_checkpoint"):
-            parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
-
-    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
-        if self._get(self.config, "trainer.enable_progress_bar") is False:
-            self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
-        # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
-        plugins = self._get(self.config_init, "trainer.plugins") or []
-        own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
-        trainer = super().instantiate_trainer(**{"plugins": own} | kwargs)
-        wanted = self._get(self.config, "trainer.logger") is not False
-        if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
-            trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
-        return trainer
-
-    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
-        """Our own tables instead of a list of all metrics, and no assignments kept in memory."""
-        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        if subcommand == "test":
-            parser.set_defaults({"verbose": False})
-        if subcommand == "predict":
-            parser.set_defaults({"return_predictions": False})
-        return parser
-
-    def _parse_ckpt_path(self) -> None:
-        """Nothing to do: our checkpoints hold no settings of the trainer's. The trainer reads them, once."""
-
-    def _run_subcommand(self, subcommand: str) -> None:
-        """In a run folder that no other training holds."""
-        self._check_checkpoint(subcommand)
-        training = subcommand == "fit" and self.trainer.global_rank == 0
-        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext(), interruptible(self.trainer):
-            super()._run_subcommand(subcommand)
-
-    def _check_checkpoint(self, subcommand: str) -> None:
-        """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""
-        path = self._get(self.config, "ckpt_path")
-        folder = Path(_checkpoint_folder(self.trainer.default_root_dir))
-        if path == "last" and not list(folder.glob("last*.ckpt")):
-            raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
-        trained = [name for name in ("checkpoint", "pretrained") if name in str(self._get(self.config, "model.solver"))]
-        if subcommand != "fit" and path is None and not trained and any(True for _ in self.model.parameters()):
-            print("bpnp: no --ckpt_path: the weights of the solver are untrained", file=sys.stderr)
-
-
-def _checkpoint_folder(root: str) -> str:
-    return str(Path(root) / "checkpoints")
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -116,7 +21,7 @@ def main(args: Sequence[str] | None = None) -> None:
     _quieten()
     try:
         _run(arguments)
-    except (ValueError, OSError, TrainingDivergedError, MisconfigurationException) as error:
+    except (ValueError, OSError) as error:
         if os.environ.get("BPNP_TRACEBACK"):
             raise
         # Names of files that are not UTF-8 reach us as surrogates, which a terminal cannot show.
@@ -133,7 +38,13 @@ def _run(arguments: list[str]) -> None:
     elif arguments[0] == "--version":
         print(f"bpnp {version('bpnp')}")
     elif arguments[0] in LIGHTNING:
-        _lightning(_with_packaged_configs(arguments))
+        group = group_asked_for(arguments)
+        if group == "":
+            print(short_help(arguments[0]))
+            return
+        from bpnp.commands.training import run_training  # imports torch and Lightning: seconds
+
+        run_training(_with_packaged_configs(arguments), help_of=group)
     else:
         name, *rest = arguments
         command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]
@@ -185,23 +96,6 @@ def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
         elif text.startswith("--config="):
             found[i] = f"--config={packaged_config(text.removeprefix('--config='))}"
     return found
-
-
-def _lightning(arguments: list[str]) -> None:
-    BpnpCLI(
-        BlindPnPTask,
-        LightningDataModule,
-        subclass_mode_data=True,
-        seed_everything_default=0,
-        save_config_kwargs={"overwrite": True},
-        trainer_defaults={
-            "callbacks": [RichProgressBar(), InterruptedCheckpoint()],
-            "max_epochs": 200,
-            "num_sanity_val_steps": 0,
-        },
-        parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
-        args=arguments,
-    )
 
 
 def _quieten() -> None:

@@ -2,18 +2,23 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
+import numpy as np
 import pytest
 
 import bpnp
+from bpnp.examples import load
 
 HEAVY = ("roma", "torch._dynamo", "lightning", "wandb", "bpnp.models", "sympy")
+COSTLY = ("lightning", "wandb", "trimesh", "pandas", "matplotlib", "plotly", "torchmetrics")
 
 
 def loaded(statements: str, names: tuple[str, ...]) -> list[str]:
     """Which of the modules `names` are loaded after `statements` in a new interpreter."""
     ask = f"import sys\n{statements}\nprint(*[name for name in {names} if name in sys.modules])"
-    return subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True).stdout.split()
+    done = subprocess.run([sys.executable, "-c", ask], capture_output=True, text=True, check=True)
+    return done.stdout.splitlines()[-1].split()
 
 
 def test_importing_the_package_loads_neither_compilers_nor_optimisers() -> None:
@@ -23,6 +28,30 @@ def test_importing_the_package_loads_neither_compilers_nor_optimisers() -> None:
 def test_solving_two_arrays_loads_neither_networks_nor_torchs_compiler() -> None:
     assert loaded("from bpnp import solve, solve_many, PosePrior, GravityPrior, Solution, Batch", HEAVY) == []
     assert loaded("from bpnp import BPnPNet", HEAVY) != []  # the check sees what is loaded
+
+
+def run_loads(*arguments: str) -> list[str]:
+    """Which of the modules COSTLY a command loads, and torch."""
+    call = f"from bpnp.cli import main\ntry:\n    main({list(arguments)})\nexcept SystemExit:\n    pass"
+    return loaded(call, (*COSTLY, "torch"))
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["--help", "--version", "slove", "fit --help", "solve --help", "solve --bogus", "solve", "prepare --help",
+     *(f"{name} --help" for name in ("localize", "report", "view", "table", "convert-weights", "wandb"))],
+)  # fmt: skip
+def test_help_and_mistakes_load_no_torch(line: str) -> None:
+    assert run_loads(*line.split()) == []
+
+
+def test_the_command_that_solves_loads_neither_lightning_nor_wandb(tmp_path: Path) -> None:
+    example = load("mesh")
+    for name, points in (("points2d", example.points2d), ("points3d", example.points3d), ("camera", example.camera)):
+        np.savetxt(tmp_path / f"{name}.csv", points, delimiter=",")
+    files = [str(tmp_path / f"{name}.csv") for name in ("points2d", "points3d", "camera")]
+    assert run_loads("solve", *files[:2], "--camera", files[2]) == ["torch"]
+    assert "lightning" in run_loads("convert-weights", "nowhere", "out.ckpt")  # the check sees what is loaded
 
 
 @pytest.mark.parametrize("name", bpnp.__all__)

@@ -4,10 +4,6 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bpnp.report.dashboards import log_results
-from bpnp.report.dashboards import workspace as dashboard
-from bpnp.report.runs import named_runs
-
 
 def wandb_results(
     runs: list[Path], *, project: str = "bpnp", directory: Path = Path("runs"), workspace: str | None = None
@@ -20,6 +16,10 @@ def wandb_results(
         directory: where the folders of offline runs go.
         workspace: entity whose project gets the dashboard as well; goes online.
     """
+    from bpnp.report.dashboards import log_results
+    from bpnp.report.dashboards import workspace as dashboard
+    from bpnp.report.runs import named_runs
+
     console = Console()
     for name, folder in named_runs(runs).items():
         written = log_results(folder, project=project, name=name, directory=directory)

@@ -2,30 +2,15 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from bpnp.commands.output import console
-from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.files import claimed
-from bpnp.localization.from_models import draw_image, image_source, localize_image, model_photos, write_localized
-from bpnp.localization.in_maps import (
-    PhotoOptions,
-    check_settings,
-    draw_photo,
-    finished_solution,
-    localize_photo,
-    photo_files,
-    photos_table,
-    solution_file,
-    write_poses,
-)
-from bpnp.localization.localized import Localized, localized_table, summary
-from bpnp.localization.point_files import read_camera
-from bpnp.localization.slow_progress import SlowProgress
-from bpnp.localization.solved import write_text
-from bpnp.maps.regions import read_pairs
-from bpnp.maps.scene_map import SceneMap
-from bpnp.solving.solution import Solution
+
+if TYPE_CHECKING:
+    from bpnp.localization.in_maps import PhotoOptions
+    from bpnp.localization.localized import Localized
+    from bpnp.solving.solution import Solution
 
 
 def localize(
@@ -75,6 +60,10 @@ def localize(
         device: such as cuda; cpu by default.
     """
     if map is not None and model is None:
+        from bpnp.localization.in_maps import PhotoOptions
+        from bpnp.localization.point_files import read_camera
+        from bpnp.maps.regions import read_pairs
+
         options = PhotoOptions(
             camera=None if camera is None else read_camera(camera),
             pairs=None if views is None else read_pairs(views),
@@ -97,15 +86,29 @@ def localize(
 def _localize_photos(
     place: Path,
     photos: list[Path],
-    options: PhotoOptions,
+    options: "PhotoOptions",
     asked: dict[str, str | None],
     output: Path,
     *,
     pictures: bool,
 ) -> None:
     """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
+    from bpnp.localization.in_maps import (
+        check_settings,
+        draw_photo,
+        finished_solution,
+        localize_photo,
+        photo_files,
+        photos_table,
+        solution_file,
+        write_poses,
+    )  # fmt: skip
+    from bpnp.localization.slow_progress import SlowProgress
+    from bpnp.localization.solved import write_text
+    from bpnp.maps.scene_map import SceneMap
+
     files, scene = photo_files(photos), SceneMap.from_colmap(place)
-    done: dict[str, Solution] = {}
+    done: dict[str, "Solution"] = {}
     errors: dict[str, str] = {}
     with claimed(output), SlowProgress("localizing", total=len(files)) as progress:
         check_settings(output, asked)
@@ -148,9 +151,14 @@ def _localize_images(
     device: str | None,
 ) -> None:
     """The images of a model."""
+    from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+    from bpnp.localization.from_models import draw_image, image_source, localize_image, model_photos, write_localized
+    from bpnp.localization.localized import localized_table, summary
+    from bpnp.localization.slow_progress import SlowProgress
+
     source = image_source(read_reconstruction(model), image, points, clutter, seed)
     draw = None if no_pictures else partial(draw_image, *model_photos(model))
-    done: list[Localized] = []
+    done: list["Localized"] = []
     with claimed(output), SlowProgress("localizing", total=len(source.images)) as progress:
         for index, (_, own) in enumerate(source.images):
             progress.describe(own.name)

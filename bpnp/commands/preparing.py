@@ -2,15 +2,14 @@
 
 import os
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.console import Console
 
 from bpnp.commands.parser import at_least
-from bpnp.datamodules.colmap.prepare import prepare_colmap
-from bpnp.datamodules.meshes.prepare import prepare_meshes
-from bpnp.datamodules.prepare import Prepared
-from bpnp.datamodules.released.prepare import prepare_preprocessed
+
+if TYPE_CHECKING:
+    from bpnp.datamodules.prepare import Prepared
 
 PROCESSES = os.cpu_count() or 1
 
@@ -32,6 +31,8 @@ def prepare_modelnet40(
         normalisation: of each mesh.
         processes: worker processes.
     """
+    from bpnp.datamodules.meshes.prepare import prepare_meshes
+
     at_least(4, points=points)
     at_least(1, processes=processes)
     _show(prepare_meshes(source, output, points=points, normalisation=normalisation, processes=processes))
@@ -54,6 +55,8 @@ def prepare_megadepth(
         clutter: natural clutter to keep, as a ratio to the true pairs; 0.5 adds half as many points.
         processes: worker processes.
     """
+    from bpnp.datamodules.colmap.prepare import prepare_colmap
+
     at_least(4, min_points=min_points)
     at_least(1, processes=processes)
     at_least(0, clutter=clutter)
@@ -68,10 +71,12 @@ def prepare_released(source: Path, *, output: Path = Path("data/preprocessed"), 
         output: new folder.
         dataset: where there are several, such as data61_2d3d.
     """
+    from bpnp.datamodules.released.prepare import prepare_preprocessed
+
     _show(prepare_preprocessed(source, output, dataset=dataset))
 
 
-def _show(prepared: Prepared) -> None:
+def _show(prepared: "Prepared") -> None:
     console = Console()
     counts = ", ".join(f"{count:,} {what}" for what, count in prepared.counts.items())
     console.print(f"{prepared.folder}: {counts}", highlight=False, soft_wrap=True)

@@ -2,22 +2,18 @@
 
 import re
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from bpnp.commands.output import console, say
-from bpnp.datamodules.colmap.photos import photo_finder
-from bpnp.report.figures import Lines, plot_pair, recall_curve, save_figure
-from bpnp.report.page.write import write_page
-from bpnp.report.photos import box_of
-from bpnp.report.runs import named_runs
-from bpnp.report.samples import PairView, read_views
-from bpnp.report.solutions import read_solution
-from bpnp.report.tables import Paper
-from bpnp.report.tables import report as print_tables
+from bpnp.report.published import Paper
 
-LINES: dict[str, Lines | None] = {"true": "match3d", "assigned": "assigned3d", "none": None}
+if TYPE_CHECKING:
+    from bpnp.report.figures import Lines
+    from bpnp.report.samples import PairView
+
+LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
 
 
 def report(
@@ -39,6 +35,12 @@ def report(
         photos: the COLMAP scenes, to put the images under the page's 2D views.
         recall: write the recall curves as .png, .svg or .pdf.
     """
+    from bpnp.datamodules.colmap.photos import photo_finder
+    from bpnp.report.figures import recall_curve, save_figure
+    from bpnp.report.page.write import write_page
+    from bpnp.report.runs import named_runs
+    from bpnp.report.tables import report as print_tables
+
     paths = list(named_runs(runs).values())
     if html is not None:
         say(write_page(paths, html, paper=paper, photo=None if photos is None else photo_finder(photos)))
@@ -68,6 +70,12 @@ def view(
         photos: the COLMAP scenes, with the images beside them.
         open: show the file with the system's viewer.
     """
+    from bpnp.datamodules.colmap.photos import photo_finder
+    from bpnp.report.figures import plot_pair, save_figure
+    from bpnp.report.photos import box_of
+    from bpnp.report.runs import named_runs
+    from bpnp.report.solutions import read_solution
+
     wanted = pairs or []
     if output is not None and len(wanted) > 1:
         raise ValueError(f"expected one pair with --output, got {len(wanted)}; try without --output")
@@ -90,8 +98,10 @@ def view(
             webbrowser.open(written.absolute().as_uri())
 
 
-def chosen_views(folder: Path, wanted: Sequence[str]) -> list[PairView]:
+def chosen_views(folder: Path, wanted: Sequence[str]) -> list["PairView"]:
     """The views of the named pairs; the worst if none is named. Raises ValueError for a name of none or of several."""
+    from bpnp.report.samples import read_views
+
     views = {view.id: view for view in read_views(folder)}
     if not views:
         raise ValueError(f"expected points.npz in {folder}, got none; try `bpnp test` again, which keeps points")

@@ -5,15 +5,6 @@ from pathlib import Path
 from rich.console import Console
 
 from bpnp.commands.output import console, say
-from bpnp.localization.point_files import read_camera, read_image, read_scene
-from bpnp.localization.priors import read_prior
-from bpnp.localization.slow_progress import SlowProgress
-from bpnp.localization.solved import solution_table, write_text
-from bpnp.report.figures import SUFFIXES, save_figure
-from bpnp.report.pictures import solution_picture
-from bpnp.search.starts import GravityPrior
-from bpnp.solving.priors import Prior
-from bpnp.solving.solve import solve as find_pose
 
 Vector = tuple[float, float, float]
 
@@ -66,9 +57,15 @@ def solve(
         seed: of the search.
         device: such as cuda; cpu by default.
     """
+    from bpnp.localization.point_files import read_camera, read_image, read_scene
+    from bpnp.localization.priors import known_pose
+    from bpnp.localization.slow_progress import SlowProgress
+    from bpnp.localization.solved import solution_table, write_text
+    from bpnp.solving.solve import solve as find_pose
+
     image_points, labels2d = read_image(points2d)
     scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
-    known = _known(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
+    known = known_pose(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
     _prepare(output, picture)
     with SlowProgress("searching the pose") as progress:
         solution = find_pose(
@@ -95,27 +92,19 @@ def solve(
     if output is not None:
         say(write_text(output, solution.to_json() + "\n"), to=said)
     if picture is not None:
+        from bpnp.report.figures import save_figure
+        from bpnp.report.pictures import solution_picture
+
         say(save_figure(solution_picture(solution, title=points2d.stem), picture), to=said)
-
-
-def _known(
-    prior: Path | None, degrees: float, distance: float | None, up_camera: Vector | None, up_scene: Vector | None,
-    up_degrees: float,
-) -> Prior | str | Path | None:  # fmt: skip
-    """The prior that the options describe."""
-    if (up_camera is None) != (up_scene is None):
-        raise ValueError("expected --up_camera and --up_scene together, got one of them")
-    if up_camera is None or up_scene is None:
-        return None if prior is None else read_prior(prior, degrees, distance)
-    if prior is not None:
-        raise ValueError("expected --prior or --up_camera with --up_scene, got both")
-    return GravityPrior(up_camera, up_scene, up_degrees)
 
 
 def _prepare(output: Path | None, picture: Path | None) -> None:
     """Raise before the search where its result could not be written."""
-    if picture is not None and picture.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
+    if picture is not None:
+        from bpnp.report.figures import SUFFIXES
+
+        if picture.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
     for path in (output, picture):
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,9 +1,8 @@
 """`bpnp table`: several methods on the same pairs, in the form of the paper's tables."""
 
-from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 from rich.progress import Progress
 
@@ -11,14 +10,10 @@ from bpnp.commands.output import console, say
 from bpnp.commands.parser import at_least
 from bpnp.configs import packaged_config
 from bpnp.files import claimed
-from bpnp.report.figures import save_figure
 from bpnp.report.published import Paper
-from bpnp.report.runs import mean_and_spread
-from bpnp.table.layout import Line, as_csv, as_latex, as_markdown, terminal
-from bpnp.table.methods import Method, parse_methods
-from bpnp.table.pairs import TestPairs, read_data, with_outlier_ratio, with_setting
-from bpnp.table.run import Block, run
-from bpnp.table.sweep import sweep_figure
+
+if TYPE_CHECKING:
+    from bpnp.table.run import Block
 
 PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}
 
@@ -54,13 +49,19 @@ def table(
         output: folder of the results.
         paper: published rows beneath.
     """
+    from bpnp.table.blocks import blocks_of, lines_of, write_tables
+    from bpnp.table.layout import terminal
+    from bpnp.table.methods import parse_methods
+    from bpnp.table.pairs import read_data
+    from bpnp.table.run import run
+
     at_least(1, limit=limit, processes=processes)
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
     described = read_data(Path(packaged_config(data)), overrides or [])
     every: list[int | None] = [None] if seeds is None else [*dict.fromkeys(seeds)]
-    lists: list[tuple[float | None, list[Block]]] = [
-        (share, [block for seed in every for block in _blocks(output, chosen, described, limit, share, seed)])
+    lists: list[tuple[float | None, list["Block"]]] = [
+        (share, [block for seed in every for block in blocks_of(output, chosen, described, limit, share, seed)])
         for share in ([None] if rho is None else dict.fromkeys(rho))
     ]
     blocks = [block for _, own in lists for block in own]
@@ -74,64 +75,12 @@ def table(
             bar = progress.add_task("pairs", total=missing)
             for tested in run(blocks, processes=processes):
                 progress.advance(bar, tested)
-        lines = [line for ratio, own in lists for line in _lines(own, ratio, len(every))]
+        lines = [line for ratio, own in lists for line in lines_of(own, ratio, len(every))]
     published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else _paper(paper)
     out.print(terminal(lines, published))
-    for path in _write(output, lines, published):
+    for path in write_tables(output, lines, published):
         say(path, to=out)
-
-
-def _blocks(
-    output: Path,
-    methods: Sequence[Method],
-    data: dict[str, Any],
-    limit: int | None,
-    rho: float | None,
-    seed: int | None,
-) -> list[Block]:
-    """The tests of all methods on the data with an outlier share and a seed, each in a folder of its own."""
-    folder = output
-    if rho is not None:
-        data, folder = with_outlier_ratio(data, rho), folder / f"rho-{rho:g}"
-    if seed is not None:
-        data, folder = with_setting(data, "seed", seed), folder / f"seed-{seed}"
-    indices = tuple(TestPairs(data).order[:limit])
-    return [Block(method, data, folder / _folder_name(method.label), indices) for method in methods]
-
-
-def _lines(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Line]:
-    """The rows of a share: each estimate of each method, its mean and standard deviation where there are several seeds.
-
-    blocks: those of all methods for the first seed, then for the next.
-    """
-    results = [(block, block.summarise()) for block in blocks]
-    lines = []
-    for k in range(len(blocks) // seeds):
-        own = results[k :: len(blocks) // seeds]
-        block, first = own[0]
-        for estimate in first.estimates:
-            label = f"{block.method.label} {estimate}" if len(first.estimates) > 1 else block.method.label
-            pairs = sum(len(block.indices) for block, _ in own)
-            mean, spread = mean_and_spread([each.estimates[estimate] for _, each in own])
-            lines.append(Line(label, pairs, mean, rho))
-            if seeds > 1:
-                lines.append(Line(label, pairs, spread, rho, spread_of=seeds))
-    return lines
-
-
-def _write(folder: Path, lines: Sequence[Line], paper: Paper | None) -> list[Path]:
-    written = []
-    for name, write in (("table.csv", as_csv), ("table.md", as_markdown), ("table.tex", as_latex)):
-        (folder / name).write_text(write(lines, paper), encoding="utf-8", newline="")
-        written.append(folder / name)
-    if any(line.rho is not None for line in lines):
-        written.append(save_figure(sweep_figure(lines), folder / "outliers.png"))
-    return written
 
 
 def _paper(wanted: str) -> Paper | None:
     return next((paper for paper in PAPERS.values() if paper == wanted), None)
-
-
-def _folder_name(label: str) -> str:
-    return "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in label)

@@ -4,12 +4,7 @@ import logging
 from pathlib import Path
 from typing import Any, Literal
 
-import lightning
-import torch
-
 from bpnp.files import written_whole
-from bpnp.models.released import load_released
-from bpnp.training.task import BlindPnPTask
 
 logger = logging.getLogger(__name__)
 
@@ -32,6 +27,12 @@ def convert_weights(
         ransac: backend of the RANSAC step; opencv is the paper's.
         pnp: solver of the weighted PnP; lbfgs is the paper's.
     """
+    import lightning
+    import torch
+
+    from bpnp.models.released import load_released
+    from bpnp.training.task import BlindPnPTask
+
     task = BlindPnPTask(load_released(file, backend=ransac, method=pnp))
     checkpoint: dict[str, Any] = {
         "epoch": 0,

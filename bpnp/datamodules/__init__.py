@@ -1,13 +1,18 @@
 """Sources of pairs: meshes and SfM-like scenes seen by virtual cameras, COLMAP models, and published pairs."""
 
-from bpnp.datamodules.augment import Outliers
-from bpnp.datamodules.colmap.module import ColmapDataModule
-from bpnp.datamodules.meshes.module import MeshDataModule
-from bpnp.datamodules.module import PairDataModule
-from bpnp.datamodules.pair import Pair, PairSource
-from bpnp.datamodules.released.module import PreprocessedDataModule
-from bpnp.datamodules.stored_pairs import write_pairs
-from bpnp.datamodules.synthetic_maps.module import SfmSceneDataModule
+from typing import TYPE_CHECKING
+
+from bpnp.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from bpnp.datamodules.augment import Outliers
+    from bpnp.datamodules.colmap.module import ColmapDataModule
+    from bpnp.datamodules.meshes.module import MeshDataModule
+    from bpnp.datamodules.module import PairDataModule
+    from bpnp.datamodules.pair import Pair, PairSource
+    from bpnp.datamodules.released.module import PreprocessedDataModule
+    from bpnp.datamodules.stored_pairs import write_pairs
+    from bpnp.datamodules.synthetic_maps.module import SfmSceneDataModule
 
 __all__ = [
     "ColmapDataModule",
@@ -20,3 +25,20 @@ __all__ = [
     "SfmSceneDataModule",
     "write_pairs",
 ]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "bpnp.datamodules.augment": ("Outliers",),
+        "bpnp.datamodules.colmap.module": ("ColmapDataModule",),
+        "bpnp.datamodules.meshes.module": ("MeshDataModule",),
+        "bpnp.datamodules.module": ("PairDataModule",),
+        "bpnp.datamodules.pair": (
+            "Pair",
+            "PairSource",
+        ),
+        "bpnp.datamodules.released.module": ("PreprocessedDataModule",),
+        "bpnp.datamodules.stored_pairs": ("write_pairs",),
+        "bpnp.datamodules.synthetic_maps.module": ("SfmSceneDataModule",),
+    },
+)

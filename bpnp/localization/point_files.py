@@ -6,8 +6,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
-
 Array = npt.NDArray[np.float64]
 TEXTS = (".csv", ".txt", ".xyz")
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
@@ -24,10 +22,15 @@ def read_points(path: Path, width: int | None = None, *, surface: int | None = N
     if not path.is_file():
         raise ValueError(f"expected a file of points, got no file {path}")
     suffix = path.suffix.lower()
-    if suffix in SUFFIXES and width == 3:
-        if surface is not None:
-            return sample_surface(read_mesh(path), surface, np.random.default_rng(seed))
-        return read_vertices(path)
+    meshes: tuple[str, ...] = ()
+    if width == 3 and suffix not in (".npy", *TEXTS):
+        from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
+
+        meshes = SUFFIXES
+        if suffix in meshes:
+            if surface is not None:
+                return sample_surface(read_mesh(path), surface, np.random.default_rng(seed))
+            return read_vertices(path)
     if surface is not None:
         raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
     if suffix == ".npy":
@@ -35,7 +38,7 @@ def read_points(path: Path, width: int | None = None, *, surface: int | None = N
     elif suffix in TEXTS:
         points, _ = _columns(path)
     else:
-        known = (".npy", *TEXTS, *(SUFFIXES if width == 3 else ()))
+        known = (".npy", *TEXTS, *meshes)
         raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
     widths = (2, 3) if width is None else (width,)
     if points.ndim != 2 or points.shape[1] not in widths:

@@ -6,7 +6,24 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.search.starts import PosePrior
+from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.solving.priors import Prior
+
+Vector = tuple[float, float, float]
+
+
+def known_pose(
+    prior: Path | None, degrees: float, distance: float | None, up_camera: Vector | None, up_scene: Vector | None,
+    up_degrees: float,
+) -> Prior | str | Path | None:  # fmt: skip
+    """The prior that the options of a command describe. Raises ValueError for options that contradict each other."""
+    if (up_camera is None) != (up_scene is None):
+        raise ValueError("expected --up_camera and --up_scene together, got one of them")
+    if up_camera is None or up_scene is None:
+        return None if prior is None else read_prior(prior, degrees, distance)
+    if prior is not None:
+        raise ValueError("expected --prior or --up_camera with --up_scene, got both")
+    return GravityPrior(up_camera, up_scene, up_degrees)
 
 
 def read_prior(path: Path, degrees: float, distance: float | None) -> Any:

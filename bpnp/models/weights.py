@@ -40,6 +40,7 @@ class TrainedNet(nn.Module):
     def from_checkpoint(cls: type[Net], path: str | Path, *, parts: Iterable[type[nn.Module]] = ()) -> Net:
         """The network of a checkpoint that `bpnp fit` wrote; by `TrainedNet` whichever it is.
 
+        path: a file, or the name of packaged weights.
         parts: classes outside this package that the network is made of; a checkpoint names them, and only those given
             here are used.
         Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
@@ -78,6 +79,21 @@ def pretrained_names() -> list[str]:
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 
+def checkpoint_path(given: str | Path) -> Path:
+    """The file of a checkpoint: a path that is a file as it is, or that of packaged weights by their name.
+
+    Raises FileNotFoundError for anything else.
+    """
+    if Path(given).is_file():
+        return Path(given)
+    if str(given) in pretrained_names():
+        return pretrained_path(str(given))
+    raise FileNotFoundError(
+        f"expected a checkpoint, got no file at {given}; try runs/<name>/checkpoints/last.ckpt, or packaged weights: "
+        f"{', '.join(pretrained_names())}"
+    )
+
+
 def pretrained_path(name: str) -> Path:
     """The checkpoint of packaged weights. Raises ValueError that lists the names there are."""
     if name not in pretrained_names():
@@ -90,11 +106,10 @@ def pretrained_path(name: str) -> Path:
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
     """Content of a checkpoint that `bpnp fit` wrote, restricted to tensors, numbers and plain containers.
 
+    path: a file, or the name of packaged weights.
     Raises FileNotFoundError if there is no such file, ValueError naming it if it is truncated, foreign or holds code.
     """
-    file = Path(path)
-    if not file.is_file():
-        raise FileNotFoundError(f"expected a checkpoint, got no file at {file}; try runs/<name>/checkpoints/last.ckpt")
+    file = checkpoint_path(path)
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
     except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, LookupError, OSError) as error:

@@ -1,14 +1,19 @@
 """Results on disk and on screen."""
 
-from bpnp.report.figures import plot_pair, recall_curve, save_figure
-from bpnp.report.folder import read_results, write_results
-from bpnp.report.page.write import write_page
-from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
-from bpnp.report.runs import table
-from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
-from bpnp.report.solutions import view_of
-from bpnp.report.tables import learning_table, recall_table, report, results_table
-from bpnp.report.training_log import TrainingLog, read_training_log
+from typing import TYPE_CHECKING
+
+from bpnp.lazy import lazy_names
+
+if TYPE_CHECKING:
+    from bpnp.report.figures import plot_pair, recall_curve, save_figure
+    from bpnp.report.folder import read_results, write_results
+    from bpnp.report.page.write import write_page
+    from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
+    from bpnp.report.runs import table
+    from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
+    from bpnp.report.solutions import view_of
+    from bpnp.report.tables import learning_table, recall_table, report, results_table
+    from bpnp.report.training_log import TrainingLog, read_training_log
 
 __all__ = [
     "PairRow",
@@ -37,3 +42,46 @@ __all__ = [
     "write_results",
     "write_views",
 ]
+
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "bpnp.report.figures": (
+            "plot_pair",
+            "recall_curve",
+            "save_figure",
+        ),
+        "bpnp.report.folder": (
+            "read_results",
+            "write_results",
+        ),
+        "bpnp.report.page.write": ("write_page",),
+        "bpnp.report.results": (
+            "PairRow",
+            "Results",
+            "cause_shares",
+            "count_inliers",
+            "rows_from",
+            "summarise",
+        ),
+        "bpnp.report.runs": ("table",),
+        "bpnp.report.samples": (
+            "PairView",
+            "read_views",
+            "select_views",
+            "views_from",
+            "write_views",
+        ),
+        "bpnp.report.solutions": ("view_of",),
+        "bpnp.report.tables": (
+            "learning_table",
+            "recall_table",
+            "report",
+            "results_table",
+        ),
+        "bpnp.report.training_log": (
+            "TrainingLog",
+            "read_training_log",
+        ),
+    },
+)

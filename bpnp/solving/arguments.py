@@ -16,11 +16,15 @@ def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
         return solver
     if solver == "search":
         return None
-    if isinstance(solver, Path) or Path(str(solver)).suffix or Path(str(solver)).is_file():
-        from bpnp.models.weights import TrainedNet  # the networks, where one is asked for
+    from bpnp.models.weights import TrainedNet, pretrained_names  # the networks, where one is asked for
 
-        return TrainedNet.from_checkpoint(solver)
-    raise ValueError(f'expected `solver` "search", a module from Batch to Prediction, or a checkpoint, got {solver!r}')
+    path = Path(str(solver))
+    if not isinstance(solver, (str, Path)) or not (path.suffix or path.is_file() or str(solver) in pretrained_names()):
+        raise ValueError(
+            f'expected `solver` "search", a module from Batch to Prediction, a checkpoint, or packaged weights '
+            f"({', '.join(pretrained_names())}), got {solver!r}"
+        )
+    return TrainedNet.from_checkpoint(solver)
 
 
 def device_from(wanted: str | torch.device | None) -> torch.device | None:

@@ -5,7 +5,7 @@ from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from bpnp.training.losses import (
     correspondence_loss,
@@ -60,6 +60,16 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
             "expected pairs with `match3d` for matching_loss correspondence, got none; try matching_loss reprojection"
         )
     return Losses(known, everyone)
+
+
+def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
+    """The values of a user's loss. Raises ValueError unless they are one number a pair."""
+    values = loss(prediction, batch)
+    if not isinstance(values, Tensor) or values.shape != (len(batch),):
+        got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
+        raise ValueError(f"expected a tensor of shape ({len(batch)},) from {type(loss).__name__}, got {got}")
+    matched = ~values.isnan()
+    return Losses(torch.where(matched, values, 0), matched)
 
 
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:

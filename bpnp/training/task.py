@@ -19,12 +19,17 @@ from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.weights import (
     TrainedNet,
     check_solver,
-    pretrained_names,
-    pretrained_path,
     read_checkpoint,
     solver_state,
 )
-from bpnp.training.supervision import Losses, MatchingLoss, correspondence_losses, matching_losses, pose_losses
+from bpnp.training.supervision import (
+    Losses,
+    MatchingLoss,
+    correspondence_losses,
+    matching_losses,
+    own_losses,
+    pose_losses,
+)
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
@@ -54,6 +59,8 @@ class BlindPnPTask(LightningModule):
             between the pairs under the solved pose, without labels (Eq. 2).
         correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
             correspondences; null for the true ones.
+        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a pair (b,); NaN for a pair that
+            has none. With its attribute `needs_pose = False`, a training step gives it a prediction without poses.
         refine_validation: whether validation refines poses, as tests do; it takes most of the time of a validation.
     """
 
@@ -67,12 +74,14 @@ class BlindPnPTask(LightningModule):
         pose_weight: float = 0.0,
         matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
+        loss: AnyModule | None = None,
         refine_validation: bool = False,
     ) -> None:
         super().__init__()
         self.solver = chosen(solver, BPnPNet)
         if weights is not None:
             start_from(weights, self.solver)
+        self.loss = None if loss is None else chosen(loss, nn.Module)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
@@ -94,7 +103,8 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection"
+        own_pose = self.loss is not None and getattr(self.loss, "needs_pose", True)
+        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection" or own_pose
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
         losses = self.losses(prediction, batch)
@@ -115,7 +125,10 @@ class BlindPnPTask(LightningModule):
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
         """The matching loss and, with a weight, that of the pose; a sample whose pose did not converge has none."""
-        losses = matching_losses(prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle)
+        if self.loss is not None:
+            losses = own_losses(self.loss, prediction, batch)
+        else:
+            losses = matching_losses(prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle)
         if self.pose_weight == 0:
             return losses
         pose = prediction.poses["pnp"]
@@ -193,7 +206,7 @@ class BlindPnPTask(LightningModule):
         known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if known is not None:
             figures["correspondence_loss"] = known.detach().mean()
-        if self.matching_loss != "correspondence":
+        if self.loss is not None or self.matching_loss != "correspondence":
             figures["matching_loss"] = losses.matching.sum() / losses.matched.sum()
             figures["left_out"] = 1 - losses.matched.float().mean()
         if losses.pose is not None and losses.posed is not None:
@@ -222,7 +235,7 @@ class BlindPnPTask(LightningModule):
 
 def start_from(weights: str, solver: nn.Module) -> None:
     """Load packaged weights, by their name, or a checkpoint of `bpnp fit`. Raises ValueError if they do not fit."""
-    content = read_checkpoint(pretrained_path(weights) if weights in pretrained_names() else weights)
+    content = read_checkpoint(weights)
     state = solver_state(content["state_dict"])
     check_solver(content.get("solver", {}), state, described(solver), solver.state_dict())
     solver.load_state_dict(state)

@@ -129,7 +129,7 @@ def test_bad_points_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[s
 def test_an_unwritable_output_is_known_before_the_search(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("bpnp.commands.solving.find_pose", None)
+    monkeypatch.setattr("bpnp.solving.solve.solve", None)
     (tmp_path / "file").write_text("")
     assert "file" in fails([*write(tmp_path), "--output", str(tmp_path / "file" / "r.json")], capsys)
 
@@ -140,7 +140,7 @@ def test_an_interruption_is_one_line(
     def interrupted(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("bpnp.commands.solving.find_pose", interrupted)
+    monkeypatch.setattr("bpnp.solving.solve.solve", interrupted)
     with pytest.raises(SystemExit) as stop:
         main(["solve", *write(tmp_path)])
     assert stop.value.code == 130

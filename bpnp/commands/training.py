@@ -1,0 +1,169 @@
+"""`bpnp fit`, `validate`, `test` and `predict`: Lightning's own command line, with this project's run folder."""
+
+import sys
+from argparse import SUPPRESS
+from collections.abc import Sequence
+from contextlib import nullcontext
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import yaml
+from lightning import LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
+from lightning.pytorch.loggers import CSVLogger
+from lightning.pytorch.utilities.exceptions import MisconfigurationException
+
+import bpnp.datamodules
+from bpnp.commands.parser import OneLineParser
+from bpnp.commands.training_help import GROUPS
+from bpnp.files import claimed
+from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO, interruptible
+from bpnp.training.results_writer import ResultsWriter
+from bpnp.training.task import BlindPnPTask, TrainingDivergedError
+
+
+class _Parser(OneLineParser, LightningArgumentParser):
+    """Lightning's parser with errors of one line."""
+
+
+class BpnpCLI(LightningCLI):
+    """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir.
+
+    command: the one to parse and run. shown: beginnings of the options to show in place of that.
+    """
+
+    def __init__(self, command: str, *args: Any, shown: tuple[str, ...] | None = None, **kwargs: Any) -> None:
+        self.command, self.shown = command, shown
+        super().__init__(*args, **kwargs)
+
+    def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
+        """The one that was asked for: its parser alone takes a second to build."""
+        return {self.command: super().subcommands()[self.command]}
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        if self.shown is not None:
+            sys.stdout.write(_options_help(self._subcommand_parsers[self.command], self.command, self.shown))
+            raise SystemExit(0)
+        self.config = parser.parse_args(args)
+
+    def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
+        parser = _Parser(**kwargs)
+        parser.add_argument("-c", "--config", action="config", help="configuration file, or the name of a packaged one")
+        return parser
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
+        parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
+        parser.add_lightning_class_args(ResultsWriter, "results")
+        parser.set_defaults(
+            {
+                "trainer.default_root_dir": "runs/default",
+                "best_checkpoint.monitor": "val/rotation_q2_deg",
+                "best_checkpoint.filename": "best",
+                "best_checkpoint.enable_version_counter": False,
+                "last_checkpoint.filename": "last",
+                "last_checkpoint.enable_version_counter": False,
+            }
+        )
+        for name in ("best_checkpoint", "last_checkpoint"):
+            parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
+        if self._get(self.config, "trainer.enable_progress_bar") is False:
+            self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
+        # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
+        plugins = self._get(self.config_init, "trainer.plugins") or []
+        own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
+        trainer = super().instantiate_trainer(**{"plugins": own} | kwargs)
+        wanted = self._get(self.config, "trainer.logger") is not False
+        if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
+            trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
+        return trainer
+
+    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
+        """Our own tables instead of a list of all metrics, and no assignments kept in memory."""
+        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
+        if subcommand == "test":
+            parser.set_defaults({"verbose": False})
+        if subcommand == "predict":
+            parser.set_defaults({"return_predictions": False})
+        return parser
+
+    def _parse_ckpt_path(self) -> None:
+        """Nothing to do: our checkpoints hold no settings of the trainer's. The trainer reads them, once."""
+
+    def _run_subcommand(self, subcommand: str) -> None:
+        """In a run folder that no other training holds."""
+        self._check_checkpoint(subcommand)
+        training = subcommand == "fit" and self.trainer.global_rank == 0
+        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext(), interruptible(self.trainer):
+            super()._run_subcommand(subcommand)
+
+    def _check_checkpoint(self, subcommand: str) -> None:
+        """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""
+        path = self._get(self.config, "ckpt_path")
+        folder = Path(_checkpoint_folder(self.trainer.default_root_dir))
+        if path == "last" and not list(folder.glob("last*.ckpt")):
+            raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
+        trained = [name for name in ("checkpoint", "pretrained") if name in str(self._get(self.config, "model.solver"))]
+        if subcommand != "fit" and path is None and not trained and any(True for _ in self.model.parameters()):
+            sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
+
+
+def _checkpoint_folder(root: str) -> str:
+    return str(Path(root) / "checkpoints")
+
+
+def run_training(arguments: Sequence[str], *, help_of: str | None = None) -> None:
+    """Parse the arguments of fit, validate, test or predict, and run it; or show the options of a group of `GROUPS`.
+
+    Raises ValueError for a mistake of the user's, and for a training that diverged.
+    """
+    for name in bpnp.datamodules.__all__:  # those that are imported are listed by --help and have short names
+        getattr(bpnp.datamodules, name)
+    own_task = _names_a_task(arguments)
+    try:
+        BpnpCLI(
+            arguments[0],
+            LightningModule if own_task else BlindPnPTask,
+            LightningDataModule,
+            shown=None if help_of is None else GROUPS[help_of],
+            subclass_mode_model=own_task,
+            subclass_mode_data=True,
+            seed_everything_default=0,
+            save_config_kwargs={"overwrite": True},
+            trainer_defaults={
+                "callbacks": [RichProgressBar(), InterruptedCheckpoint()],
+                "max_epochs": 200,
+                "num_sanity_val_steps": 0,
+            },
+            parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
+            args=list(arguments),
+        )
+    except (MisconfigurationException, TrainingDivergedError) as error:
+        raise ValueError(str(error)) from error
+
+
+def _names_a_task(arguments: Sequence[str]) -> bool:
+    """Whether the options or a configuration file name a LightningModule in place of BlindPnPTask."""
+    words = [word for text in arguments for word in text.split("=", 1)]
+    files = [Path(value) for name, value in pairwise(words) if name in ("-c", "--config")]
+    contents = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files if file.is_file()]
+    models = [content.get("model") for content in contents if isinstance(content, dict)]
+    named = any(isinstance(model, str) or (isinstance(model, dict) and "class_path" in model) for model in models)
+    return named or not {"--model", "--model.class_path"}.isdisjoint(words)
+
+
+def _options_help(parser: LightningArgumentParser, command: str, beginnings: tuple[str, ...]) -> str:
+    """The help of the options that begin so, group by group."""
+    for group in parser._action_groups:
+        names = [action.dest.split(".")[0] for action in group._group_actions]
+        group.title, group.description = f"Options of {names[0]}" if names else None, None
+        for name, action in zip(names, group._group_actions, strict=True):
+            if name not in beginnings and "" not in beginnings:
+                action.help = SUPPRESS
+    parser.usage, parser.description = f"bpnp {command} [options]", None
+    return parser.format_help()

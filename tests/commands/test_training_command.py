@@ -1,0 +1,143 @@
+"""Short help with groups on request, and a user's own task, loss and weights by name."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import LightningModule
+from small_data import SMALL_MESHES, SMALL_NET
+from torch import Tensor, nn
+
+import bpnp.commands.training_help as training_help
+from bpnp import BPnPNet, Matcher
+from bpnp.cli import main
+from bpnp.models.weights import TrainedNet
+from bpnp.solving.arguments import source_from
+from bpnp.solving.priors import checked_prior
+
+MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
+SHORT = ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1"]
+seen: list[Any] = []
+
+
+class Squares(nn.Module):
+    """A loss of a user's: the sum of squares of the assignment, and none for the first pair."""
+
+    needs_pose = False
+
+    def __init__(self, factor: float = 1.0) -> None:
+        super().__init__()
+        self.factor = factor
+
+    def forward(self, prediction: Any, batch: Any) -> Tensor:
+        seen.append((self.factor, set(prediction.poses)))
+        values = self.factor * prediction.assignment.square().sum((-2, -1))
+        return torch.cat([values.new_full((1,), torch.nan), values[1:]])
+
+
+class OneNumber(nn.Module):
+    def forward(self, prediction: Any, batch: Any) -> Tensor:
+        return prediction.assignment.sum()
+
+
+class OwnTask(LightningModule):
+    """A task of a user's with one weight."""
+
+    def __init__(self, rate: float = 1.0) -> None:
+        super().__init__()
+        self.rate, self.weight = rate, nn.Parameter(torch.zeros(()))
+
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        seen.append(self.rate)
+        return (self.weight - batch.points2d.mean()) ** 2
+
+    def validation_step(self, batch: Any, batch_idx: int) -> None:
+        self.log("val/rotation_q2_deg", 0.0)
+
+    def configure_optimizers(self) -> Any:
+        return torch.optim.SGD(self.parameters(), lr=self.rate)
+
+
+def folders(path: Path) -> list[str]:
+    return [f"--trainer.default_root_dir={path}/run", f"--data.cache_dir={path}"]
+
+
+def options_of(text: str) -> set[str]:
+    return set(re.findall(r"^  (?:-\w [A-Z_]+, |-h, )?(--[\w.]+)", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("command", training_help.LIGHTNING)
+def test_help_is_short(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    main([command, "--help"])
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) < 40
+    assert max(map(len, lines)) <= 110
+    assert lines[0] == f"usage: bpnp {command} --config NAME [options]"
+
+
+def test_groups_list_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:
+    listed = {}
+    for group in training_help.GROUPS:
+        with pytest.raises(SystemExit):
+            main(["fit", "--help", group])
+        listed[group] = options_of(capsys.readouterr().out)
+    everything = listed.pop("all")
+    of_no_group = {"--help", "--config", "--print_config", "--seed_everything", "--ckpt_path", "--weights_only"}
+    assert set().union(*listed.values()) == everything - of_no_group
+    assert sum(map(len, listed.values())) == len(set().union(*listed.values()))
+    told = {option.split()[0] for option in training_help.OPTIONS if not option.startswith("--data.")}
+    assert told <= everything
+
+
+def test_another_group_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", "--help", "modle"])
+    assert "one of model, data, trainer, files, all, got 'modle'" in capsys.readouterr().err
+
+
+def test_a_loss_by_class_path_trains(tmp_path: Path) -> None:
+    seen.clear()
+    loss = ["--model.loss=test_training_command.Squares", "--model.loss.factor=2"]
+    main(["fit", *MESHES, *SMALL_NET, *loss, *SHORT, *folders(tmp_path)])
+    assert seen == [(2.0, set()), (2.0, set())]
+
+
+def test_a_loss_of_the_wrong_shape_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", *MESHES, *SMALL_NET, "--model.loss=test_training_command.OneNumber", *SHORT, *folders(tmp_path)])
+    assert "expected a tensor of shape (4,) from OneNumber, got ()" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("given", ["options", "file"])
+def test_a_task_by_class_path_trains(given: str, tmp_path: Path) -> None:
+    seen.clear()
+    config = tmp_path / "own.yaml"
+    config.write_text("model:\n  class_path: test_training_command.OwnTask\n  init_args:\n    rate: 0.5\n")
+    own = (
+        ["--model=test_training_command.OwnTask", "--model.rate=0.5"] if given == "options" else [f"--config={config}"]
+    )
+    main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path)])
+    assert seen == [0.5, 0.5]
+    assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+
+
+@pytest.mark.parametrize(("name", "kind"), [("procedural-so3", BPnPNet), ("matcher-sfm", Matcher)])
+def test_packaged_weights_are_found_by_name_wherever_a_checkpoint_is_taken(name: str, kind: type) -> None:
+    for net in (source_from(name), checked_prior(name), TrainedNet.from_checkpoint(name)):
+        assert type(net) is kind
+
+
+def test_a_test_takes_packaged_weights_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sizes = ["--data.num_points=24", "--data.test_shapes=1", "--data.pool_size=64", *folders(tmp_path)]
+    main(["test", "--config=quickstart", "--ckpt_path=procedural-euler", *sizes])
+    assert (tmp_path / "run" / "test" / "summary.json").is_file()
+    assert "untrained" not in capsys.readouterr().err
+
+
+def test_an_unknown_name_lists_the_packaged_weights() -> None:
+    with pytest.raises(ValueError, match=r"or packaged weights \(matcher-clutter, .*\), got 'procedural-so2'"):
+        source_from("procedural-so2")
+    with pytest.raises(FileNotFoundError, match="no file at procedural-so2; try .*, or packaged weights: matcher-c"):
+        TrainedNet.from_checkpoint("procedural-so2")
