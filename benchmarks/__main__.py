@@ -1,14 +1,17 @@
 """All benchmarks of the layers on a CPU, in one command.
 
     python benchmarks [--quick]
+    python benchmarks --against REV: this tree beside an older commit (`against.py`)
 
 Prints the tables of the layers against the paper's method, of time and memory by size, and of RANSAC's backends, and
 writes them with their plots to benchmarks/results/<machine kind>.json, scaling-<...>.json and ransac-<...>.json.
 """
 
 import argparse
+import sys
 from pathlib import Path
 
+import against
 import bench_layers
 import bench_ransac
 import bench_scaling
@@ -32,5 +35,8 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    restart_with_settings()
-    main()
+    if any(argument.startswith("--against") for argument in sys.argv):
+        against.main()
+    else:
+        restart_with_settings()
+        main()

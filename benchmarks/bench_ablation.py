@@ -18,7 +18,7 @@ def variants(full: SearchSettings) -> dict[str, SearchSettings]:
     return {
         "everything": full,
         "random points instead of cluster centres": replace(full, lloyd_iterations=0),
-        "no middle stage": replace(full, middle=replace(full.middle, iterations=1)),
+        "no middle stage": replace(full, middle=tuple(replace(stage, iterations=1) for stage in full.middle)),
         "no poses shaken around the best": replace(full, shaking=Shaking(poses=0)),
         "one recipe for all batches": replace(full, recipes=full.recipes[:1]),
         "300 starts a batch": replace(full, starts=300),

@@ -1,10 +1,13 @@
-"""Loops on the CPU: how they are compiled, and how they are shared among threads."""
+"""Loops on the CPU: how they are compiled, shared among threads, and ended when their time is over."""
 
 import inspect
 import logging
+import math
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -71,3 +74,35 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
 def _pool(process: int) -> ThreadPoolExecutor:
     """The threads of a process; a fork inherits none of its parent's, so each has its own."""
     return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
+
+
+@dataclass(frozen=True)
+class Deadline:
+    """When to stop, in seconds of `time.monotonic`. A stage that has begun ends what it is at and drops the rest."""
+
+    at: float = math.inf
+
+    @classmethod
+    def after(cls, seconds: float | None) -> "Deadline":
+        """So many seconds from now; None: never."""
+        return cls() if seconds is None else cls(time.monotonic() + seconds)
+
+    def passed(self) -> bool:
+        return time.monotonic() >= self.at
+
+
+def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
+    """Run work(first, last) on shares of range(count) in threads; how many were done when the deadline passed.
+
+    The first `at_once` are always done.
+    """
+    step = count if math.isinf(deadline.at) else at_once
+    done = 0
+    while done < count and not (done and deadline.passed()):
+        last = min(done + step, count)
+        in_threads(lambda i, j, first=done: work(first + i, first + j), last - done)  # type: ignore[misc]
+        done = last
+    return done
+
+
+NEVER = Deadline()

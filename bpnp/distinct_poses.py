@@ -15,11 +15,16 @@ def turned_by(one: Array, other: Array) -> float:
     return math.acos(min(max(cosine, -1.0), 1.0))
 
 
-def same_pose(rotation: Array, translation: Array, i: int, degrees: float, shift: float) -> NDArray[np.bool_]:
-    """Which poses (c, 3, 3), (c, 3) are within `degrees` and `shift` of pose i, itself among them; NaN is not."""
+def same_pose(
+    rotation: Array, translation: Array, i: int | NDArray[np.int64], degrees: float, shift: float
+) -> NDArray[np.bool_]:
+    """Which poses (c, 3, 3), (c, 3) are within `degrees` and `shift` of pose i, itself among them; NaN is not.
+
+    Of several poses i (k,): (k, c).
+    """
     flat = rotation.reshape(-1, 9)
-    turned = flat @ flat[i] < 1 + 2 * math.cos(math.radians(degrees))
-    return ~turned & (np.linalg.norm(translation - translation[i], axis=-1) <= shift)
+    turned = flat[i] @ flat.T < 1 + 2 * math.cos(math.radians(degrees))
+    return ~turned & (np.linalg.norm(translation - translation[i][..., None, :], axis=-1) <= shift)
 
 
 def distinct(

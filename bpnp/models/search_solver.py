@@ -1,6 +1,7 @@
 """The search and the refinement over the samples of a batch, and the search as a solver."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,8 +9,8 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from bpnp.compilation import Deadline
 from bpnp.geometry import bearings as bearings_of
-from bpnp.search.annealing import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.refine import refine_poses
@@ -28,12 +29,10 @@ def search(
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
     prior: Prior | None = None,
-    clutter: float | None = None,
-    seed: int = 0,
     time_limit: float | None = None,
-    settings: SearchSettings = DEFAULT,
+    **options: Any,
 ) -> Found:
-    """`search_poses` for each sample: rotation, translation and stats of the best pose.
+    """`search_poses` with its other `options` for each sample: rotation, translation and stats of the best pose.
 
     time_limit: seconds a sample. In the stats, iterations are batches of starts, residual is the scale of the residuals
     in radians, and converged says that the verdict is "confident". A sample without a pose holds NaN. Not
@@ -43,12 +42,9 @@ def search(
     if time_limit is not None and not time_limit > 0:
         raise ValueError(f"expected a positive `time_limit` in seconds, got {time_limit}")
     results = (
-        search_poses(
-            PointSets(f, p, prior=prior), clutter=clutter, seed=seed, deadline=Deadline.after(time_limit),
-            settings=settings,
-        )
+        search_poses(PointSets(f, p, prior=prior), deadline=Deadline.after(time_limit), **options)
         for f, p in _samples(bearings, points3d, mask2d, mask3d)
-    )  # fmt: skip
+    )
     return _best(results, points3d)
 
 

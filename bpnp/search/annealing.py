@@ -1,16 +1,14 @@
 """The stages of the search: starts annealed on coarse clusters, the best on finer ones, few on all points."""
 
 import math
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import in_threads
-from bpnp.search.candidates import Candidates, best_distinct, merged
+from bpnp.compilation import in_time
+from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
@@ -18,86 +16,48 @@ from bpnp.search.settings import Batch, ClusterStage, Recipe
 from bpnp.search.starts import Prior, draw_poses
 
 
-@dataclass(frozen=True)
-class Deadline:
-    """When to stop, in seconds of `time.monotonic`. A stage that has begun ends what it is at and drops the rest."""
-
-    at: float = math.inf
-
-    @classmethod
-    def after(cls, seconds: float | None) -> "Deadline":
-        """So many seconds from now; None: never."""
-        return cls() if seconds is None else cls(time.monotonic() + seconds)
-
-    def passed(self) -> bool:
-        return time.monotonic() >= self.at
-
-
-def run_batch(
-    scene: Scene,
-    size: Batch,
-    recipe: Recipe,
-    prior: Prior | None,
-    best: Candidates,
-    outliers: float,
-    deadline: Deadline,
-) -> Candidates:
+def run_batch(scene: Scene, size: Batch, recipe: Recipe, prior: Prior | None, best: Candidates) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
     rotation, translation = draw_poses(scene.spread, scene.bulk3d, size.starts, recipe, prior, scene.rng)
-    starts = Candidates.unscored(rotation, translation, hits=1)
-    coarse = anneal_on_clusters(scene, starts, size.coarse, recipe.first_scale, outliers, deadline)
-    poses = Candidates.concatenated([coarse, shaken(scene, best)])
-    return _anneal_further(scene, poses, size.middle, outliers, deadline)
+    poses = Candidates.unscored(rotation, translation, hits=1)
+    for stage in size.coarse:
+        poses = anneal_on_clusters(scene, poses, stage)
+    return anneal_further(scene, Candidates.concatenated([poses, shaken(scene, best)]), size.middle)
 
 
-def refine_batch(scene: Scene, starts: Candidates, outliers: float, deadline: Deadline) -> Candidates:
-    """From a few poses, and from poses shaken around them, through the finer clusters to all points."""
-    around = Candidates.concatenated([starts, shaken(scene, starts)])
-    clustered = _anneal_further(scene, around, scene.settings.middle, outliers, deadline)
-    # A start that is right already needs no clusters, which would only shake it.
-    first_scale = scene.settings.middle.last_scale * scene.spread
-    direct = anneal_on_points(scene, starts, first_scale, outliers, deadline, bearings=scene.settings.fine.bearings)
-    return merged([clustered, direct], scene)
-
-
-def _anneal_further(
-    scene: Scene, poses: Candidates, middle: ClusterStage, outliers: float, deadline: Deadline
-) -> Candidates:
+def anneal_further(scene: Scene, poses: Candidates, stages: tuple[ClusterStage, ...]) -> Candidates:
     """From coarse poses through the finer clusters to all points."""
-    settings = scene.settings
-    poses = anneal_on_clusters(scene, poses, middle, settings.coarse.last_scale, outliers, deadline)
-    first_scale = settings.middle.last_scale * scene.spread
-    return anneal_on_points(scene, poses, first_scale, outliers, deadline, bearings=settings.fine.bearings)
+    for stage in stages:
+        poses = anneal_on_clusters(scene, poses, stage)
+    return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(
-    scene: Scene, starts: Candidates, stage: ClusterStage, first_scale: float, outliers: float, deadline: Deadline
-) -> Candidates:
-    """The likeliest distinct poses that `starts` reach on the stage's clusters, best first; translations may be alike.
-
-    first_scale: in spreads of the bearings.
-    """
+def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage) -> Candidates:
+    """The likeliest poses that `starts` reach on the clusters, best first, of different rotations."""
     bearings, points = scene.clusters(stage.clusters)
-    sides, outlier = (tuple(bearings), tuple(points)), scene.outlier_density(outliers)
-    scales = (scene.spread * np.geomspace(first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
+    sides, outlier = (tuple(bearings), tuple(points)), scene.outlier_density(scene.settings.outliers)
+    scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
         descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j])
 
-    done = in_time(anneal, len(starts), deadline, scene.settings.starts_a_check)
+    done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
+    if not stage.apart_deg:
+        return ends[np.argsort(-ends.score, kind="stable")[: stage.kept]]
     return best_distinct(ends, scene, stage.kept, degrees=stage.apart_deg, shift=math.inf)
 
 
 def anneal_on_points(
-    scene: Scene, starts: Candidates, first_scale: float, outliers: float, deadline: Deadline, *, bearings: int | None
+    scene: Scene, starts: Candidates, first_scale: float, *, outliers: float | None = None, every: bool = False
 ) -> Candidates:
-    """Distinct poses that `starts` reach on all 3D points and the first `bearings` bearings (None for all).
+    """Distinct poses that `starts` reach on all 3D points and as many bearings as the fine stage uses, or `every` one.
 
-    first_scale: radians.
+    first_scale: radians. outliers: share to expect, None for that of the settings.
     """
-    fine = scene.settings.fine
+    fine, bearings = scene.settings.fine, None if every else scene.settings.fine.bearings
+    outliers = scene.settings.outliers if outliers is None else outliers
     rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
     image, points = scene.sides(bearings)
@@ -110,7 +70,7 @@ def anneal_on_points(
             tuple(grid), tuple(points), rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j]
         )
 
-    done = in_time(anneal, len(starts), deadline, torch.get_num_threads())
+    done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared
     ends = replace(
         starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2],
@@ -131,44 +91,18 @@ def shaken(scene: Scene, poses: Candidates) -> Candidates:
     return Candidates.unscored(turned.astype(np.float32), moved.astype(np.float32))
 
 
-def finish(
-    scene: Scene,
-    poses: Candidates,
-    outliers: float,
-    deadline: Deadline,
-    others: tuple[float, ...] | None = None,
-    annealed: int | None = None,
-) -> Candidates:
-    """One or more poses, annealed once more on every bearing, the best two with several shares of outliers.
+def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Candidates:
+    """The poses, of which the first `annealed` (None for all) are annealed once more on every bearing.
 
-    others: these shares beside `outliers`; None for `settings.end_outliers`. annealed: of the poses, from the best one;
-    the rest stay as they are. None for all.
+    The best two of these with each of `settings.end_outliers` too.
     """
-    shares = scene.settings.end_outliers if others is None else others
-    rest = poses[len(poses) if annealed is None else annealed :]
-    poses = poses[: len(poses) - len(rest)]
-    runs = [(i, outliers) for i in range(len(poses))]
-    runs += [(i, share) for i in range(min(2, len(poses))) for share in shares]
+    settings, count = scene.settings, len(poses) if annealed is None else min(annealed, len(poses))
+    runs = [(i, settings.outliers) for i in range(count)]
+    runs += [(i, share) for i in range(min(2, count)) for share in settings.end_outliers]
     ends: list[Candidates] = []
     for i, share in runs:
-        if deadline.passed():
-            ends.append(poses[len(ends) :])  # as they are
+        if scene.deadline.passed():
             break
-        pose = poses[i : i + 1]
-        first_scale = scene.settings.end_scale * float(pose.scale[0])
-        ends.append(anneal_on_points(scene, pose, first_scale, share, deadline, bearings=None))
-    return best_distinct(Candidates.concatenated([*ends, rest]), scene, scene.settings.kept)
-
-
-def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:
-    """Run work(first, last) on shares of range(count) in threads; how many were done when the deadline passed.
-
-    The first `at_once` are always done.
-    """
-    step = count if math.isinf(deadline.at) else at_once
-    done = 0
-    while done < count and not (done and deadline.passed()):
-        last = min(done + step, count)
-        in_threads(lambda i, j, first=done: work(first + i, first + j), last - done)  # type: ignore[misc]
-        done = last
-    return done
+        first_scale = settings.end_scale * float(poses.scale[i])
+        ends.append(anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True))
+    return best_distinct(Candidates.concatenated([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)

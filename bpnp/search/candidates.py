@@ -83,12 +83,10 @@ def best_distinct(
     )
     poses = candidates.rotation, candidates.translation * scene.shift_weight
     kept = distinct(*poses, candidates.score, count, *limits)
+    same = same_pose(*poses, kept, *limits)
     origin = np.zeros(len(candidates), np.int64) if sources is None else sources
-    hits = []
-    for i in kept.tolist():
-        same = same_pose(*poses, i, *limits)
-        hits.append(sum(int(candidates.hits[same & (origin == source)].max()) for source in np.unique(origin[same])))
-    return replace(candidates[kept], hits=np.array(hits, np.int64))
+    own = (np.where(same & (origin == source), candidates.hits, 0).max(-1, initial=0) for source in np.unique(origin))
+    return replace(candidates[kept], hits=np.asarray(sum(own, start=np.zeros(len(kept), np.int64))))
 
 
 def merged(parts: Sequence[Candidates], scene: Scene) -> Candidates:

@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from bpnp.search.annealing import Deadline, finish, run_batch
+from bpnp.compilation import NEVER, Deadline
+from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.few.search import is_few, judged_few, search_few
 from bpnp.search.nearby import cooled, nearby_batch
@@ -27,7 +28,6 @@ from bpnp.search.verdict import (
 )
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
-LEADERS = 3  # candidates that are weighed after a batch; all of them are in the end
 
 
 def search_poses(
@@ -36,7 +36,7 @@ def search_poses(
     around: Prior | None = None,
     clutter: float | None = None,
     seed: int = 0,
-    deadline: Deadline | None = None,
+    deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
     progress: Progress | None = None,
 ) -> SearchResult:
@@ -48,53 +48,53 @@ def search_poses(
 
     Few points (`bpnp.search.few`) are enumerated first, and annealed only if that leaves a doubt.
 
-    around: where to start instead, if that is no more than a guess from the same points. seed: of all that is random.
-    clutter: share of the points without a partner to expect, from 0 to below 1; it is then the only one
-        that is tried, which saves time at the end. None for that of the settings, and several at the end.
+    around: a guess from the same points, such as a network's pose: the first `settings.around` batches start there, and
+        that they end alike is no evidence. seed: of all that is random.
+    clutter: share of the points without a partner to expect, from 0 to below 1 (`SearchSettings.expecting`); None for
+        that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
         depends on the machine. progress: called after each batch, and with 0 after the enumeration of few points.
 
     With fewer than 4 points of a side, or all bearings or all points on one line or in one place, there are no
     candidates. Raises ValueError for `clutter` out of range.
     """
-    if clutter is not None and not 0 <= clutter < 1:
-        raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
-    start, end = time.monotonic(), deadline or Deadline()
-    few = Candidates.none()
-    if is_few(sets) and not end.passed():
-        few, exhausted = search_few(sets, end, settings)
+    settings = settings if clutter is None else settings.expecting(clutter)
+    start, rule, few = time.monotonic(), settings.evidence, Candidates.none()
+    if is_few(sets) and not deadline.passed():
+        few, exhausted = search_few(sets, deadline, settings)
         result = judged_few(sets, few, settings)
         if progress is not None:
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        if exhausted or small or result.log10_false_alarms <= settings.evidence.false_alarms:
+        if exhausted or small or result.log10_false_alarms <= rule.false_alarms:
             return result
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
-    scene, prior = Scene(sets, seed, settings), around or sets.prior
-    known = None if prior is None else scene.enter_prior(prior)
-    share = settings.outliers if clutter is None else max(clutter, settings.least_outliers)
-    candidates = Candidates.none()
+    scene = Scene(sets, seed, settings, deadline)
+    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
+    candidates = few
     if len(few):
         rotation, translation = scene.enter(few.rotation, few.translation)
         candidates = replace(few, rotation=rotation, translation=translation)
-    rule, batches, best = settings.evidence, 0, -math.inf
+    batches, best = 0, -math.inf
     searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
 
-    def finished(annealed: int | None = None) -> SearchResult:
-        poses = candidates
-        if len(poses):
-            poses = finish(scene, poses, share, end, None if clutter is None else (), annealed)
+    def finished(poses: Candidates, annealed: int) -> SearchResult:
+        poses = finish(scene, poses, annealed) if len(poses) else poses
         return judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
 
     exhausted = False
-    while searched < settings.max_batches and not (exhausted or end.passed()):
-        found, size = _batch(scene, batches, known, candidates, share, end)
+    while searched < settings.max_batches and not (exhausted or deadline.passed()):
+        if guess is not None and batches < settings.around:
+            found, _ = _batch(scene, batches, guess, candidates)
+            found = replace(found, hits=np.zeros_like(found.hits))
+        else:
+            found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
+            searched += size
         candidates = merged([candidates, found], scene)
         batches += 1
-        searched += size
         if progress is not None:
             progress(batches, time.monotonic() - start)
         if not len(candidates):
@@ -106,16 +106,14 @@ def search_poses(
         # A pose that was just found may be an optimum beside a better one, which starts around it will find.
         settled = stalled or is_unique(leaders, sets, rule)
         if settled and is_certain(leaders, sets, rule, batches=batches):
-            certain = finished(LEADERS)
+            certain = finished(candidates[np.isfinite(candidates.log10_false_alarms)], 1)
             if certain.verdict == "confident":  # on all bearings too
                 return certain
         exhausted = is_exhausted(candidates, scene, searched - bettered)
-    return finished()
+    return finished(candidates, settings.finished)
 
 
-def _batch(
-    scene: Scene, number: int, prior: Prior | None, best: Candidates, outliers: float, deadline: Deadline
-) -> tuple[Candidates, float]:
+def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:
     """One batch of starts, and its share of a full one.
 
     Of a rough pose all batches are full, and every other one is looked up in a raster, which finds other poses.
@@ -124,14 +122,15 @@ def _batch(
     size, recipe = settings.batch(number), settings.recipes[number % len(settings.recipes)]
     if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
         if number % 2 == 0:
-            return nearby_batch(scene, prior, outliers, deadline), 1.0
-        size = Batch(settings.starts, settings.coarse, settings.middle)
-        recipe = cooled(settings.recipes[number // 2 % len(settings.recipes)], prior, scene)
-    return run_batch(scene, size, recipe, prior, best, outliers, deadline), size.starts / settings.starts
+            return nearby_batch(scene, prior), 1.0
+        size = Batch(settings.starts, cooled(settings.coarse, prior, scene), settings.middle)
+        recipe = settings.recipes[number // 2 % len(settings.recipes)]
+    return run_batch(scene, size, recipe, prior, best), size.starts / settings.starts
 
 
 def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:
     """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
-    leaders = with_false_alarms(in_user_frame(candidates[:LEADERS], scene), sets)
-    alarms = np.concatenate([leaders.log10_false_alarms, candidates.log10_false_alarms[LEADERS:]])
+    count = scene.settings.finished
+    leaders = with_false_alarms(in_user_frame(candidates[:count], scene), sets)
+    alarms = np.concatenate([leaders.log10_false_alarms, candidates.log10_false_alarms[count:]])
     return replace(candidates, log10_false_alarms=alarms), weighed(leaders, sets, scene.settings.evidence)

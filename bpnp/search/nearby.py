@@ -20,12 +20,13 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.annealing import Deadline, anneal_on_points, in_time
+from bpnp.compilation import in_time
+from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Recipe
+from bpnp.search.settings import ClusterStage
 from bpnp.search.starts import Array, PosePrior
 
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
@@ -39,16 +40,14 @@ class Raster(NamedTuple):
     per_cell: np.float32
 
 
-def nearby_batch(scene: Scene, prior: PosePrior, outliers: float, deadline: Deadline) -> Candidates:
+def nearby_batch(scene: Scene, prior: PosePrior) -> Candidates:
     """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed."""
     rule = scene.settings.nearby
     poses, raster = drawn_around(scene, prior, starts_of(scene, prior)), raster_of(scene)
     for points, kept in zip(rule.points, rule.kept, strict=True):
-        poses = looked_up(poses, raster, scene.sides(points=points)[1], kept, deadline, rule.starts_a_check)
-    first_scale, share = rule.scale * scene.spread, max(outliers, rule.outliers)
-    return anneal_on_points(
-        scene, poses, first_scale, share, deadline, bearings=scene.settings.fine.bearings
-    )  # fmt: skip
+        poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
+    outliers = max(scene.settings.outliers, rule.outliers)
+    return anneal_on_points(scene, poses, rule.scale * scene.spread, outliers=outliers)
 
 
 def starts_of(scene: Scene, prior: PosePrior) -> int:
@@ -73,16 +72,14 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
     return Candidates.unscored(rotation, translation.astype(np.float32), hits=1)
 
 
-def looked_up(
-    poses: Candidates, raster: Raster, points: WeightedPoints, kept: int, deadline: Deadline, at_once: int
-) -> Candidates:
+def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int) -> Candidates:
     """The `kept` poses under which the points fall best, best first."""
     side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
         add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j])
 
-    done = in_time(look_up, len(poses), deadline, at_once)
+    done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
 
 
@@ -106,12 +103,16 @@ def raster_of(scene: Scene) -> Raster:
     return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
-def cooled(recipe: Recipe, prior: PosePrior, scene: Scene) -> Recipe:
-    """The recipe with a first scale no wider than the prior: from a hotter one the starts leave what is known."""
+def cooled(stages: tuple[ClusterStage, ...], prior: PosePrior, scene: Scene) -> tuple[ClusterStage, ...]:
+    """The stages at scales no wider than the prior: from hotter ones the starts leave what is known."""
     depth = _distance(scene, prior)
     turned = math.radians(prior.rotation_sigma_deg) * float(np.sqrt(scene.bulk3d.var(0).sum())) / depth
     width = math.hypot(prior.translation_sigma / depth, turned) / scene.spread
-    return replace(recipe, first_scale=float(np.clip(width, scene.settings.coarse.last_scale, recipe.first_scale)))
+    most = float(np.clip(width, stages[-1].last_scale, stages[0].first_scale))
+    return tuple(
+        replace(stage, first_scale=min(stage.first_scale, most), last_scale=min(stage.last_scale, most))
+        for stage in stages
+    )
 
 
 def _distance(scene: Scene, prior: PosePrior) -> float:

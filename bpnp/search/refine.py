@@ -4,9 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from bpnp.search.annealing import Deadline, anneal_on_clusters, finish, refine_batch
-from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.compilation import NEVER, Deadline
+from bpnp.search.annealing import anneal_further, anneal_on_clusters, anneal_on_points, finish, shaken
+from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -18,49 +21,59 @@ def refine_poses(
     rotation: NDArray[np.float64],
     translation: NDArray[np.float64],
     *,
-    outliers: float | None = None,
     seed: int = 0,
     settings: SearchSettings = DEFAULT,
 ) -> SearchResult:
     """The likeliest poses that annealing reaches from given ones and from poses shaken around them.
 
     The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
-    beyond `settings.refine.direct` are first annealed on clusters, as the search does, and the likeliest go on.
+    beyond `settings.refined_directly` are first annealed on clusters, as the search does, and the likeliest go on.
 
-    rotation (s, 3, 3), translation (s, 3): the starts; those with NaN are missing. outliers: share of the
-    points without a partner to expect, in (0, 1); None for that of the settings.
+    rotation (s, 3, 3), translation (s, 3): the starts; those with NaN are missing.
 
     `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
-    pose, there are no candidates. Raises ValueError for `outliers` out of range.
+    pose, there are no candidates.
     """
-    share = settings.outliers if outliers is None else outliers
-    if not 0 < share < 1:
-        raise ValueError(f"expected `outliers` in (0, 1), a share of the points, got {share}")
-    given = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
-    if not given.any() or degenerate(sets.bearings) or degenerate(sets.points3d):
+    scene, starts = _entered(sets, rotation, translation, seed, settings)
+    if not len(starts) or degenerate(sets.bearings) or degenerate(sets.points3d):
         return no_pose("no start, or points that fix no pose")
-    scene, never = Scene(sets, seed, settings), Deadline()
-    starts = Candidates.unscored(*scene.enter(rotation[given], translation[given]))
     crowd = len(starts)
-    if crowd > settings.refine.direct:
-        starts = _likeliest(scene, starts, share)
-    annealed = crowd + min(len(starts), settings.shaking.poses) * settings.shaking.copies
-    poses = refine_batch(scene, starts, share, never) if len(starts) else starts
-    if len(poses):
-        poses = finish(scene, poses, share, never)
+    if crowd > settings.refined_directly:
+        for stage in (*settings.coarse, *settings.middle):
+            starts = anneal_on_clusters(scene, starts, stage)
+    around = Candidates.concatenated([starts, shaken(scene, starts)])
+    clustered = anneal_further(scene, around, settings.middle)
+    # A start that is right already needs no clusters, which would only shake it.
+    direct = anneal_on_points(scene, starts, settings.middle[-1].last_scale * scene.spread)
+    poses = finish(scene, merged([clustered, direct], scene))
+    annealed = crowd + len(around) - len(starts)
     return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
 
 
-def _likeliest(scene: Scene, starts: Candidates, outliers: float) -> Candidates:
-    """Where the likeliest starts end when they are annealed on coarse and then on finer clusters, best first."""
-    settings = scene.settings
-    stages = (
-        (settings.recipes[0].first_scale, replace(settings.coarse, kept=settings.refine.competitors)),
-        (
-            settings.coarse.last_scale,
-            replace(settings.middle, kept=settings.refine.direct, apart_deg=settings.same_deg),
-        ),
-    )
-    for first_scale, stage in stages:
-        starts = anneal_on_clusters(scene, starts, stage, first_scale, outliers, Deadline())
-    return starts
+def score_poses(
+    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
+) -> SearchResult:
+    """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
+
+    They have no hits, since no other starts were tried: only overwhelming evidence makes the best of them certain.
+    """
+    scene, starts = _entered(sets, rotation, translation, 0, DEFAULT, deadline)
+    if not len(starts):
+        return no_pose("the module found no pose")
+    # Each starts at the scale of its own residuals: the median distance of a point to the nearest bearing.
+    camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
+    length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
+    distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
+    scale = np.maximum(np.median(distance, -1), scene.smallest_scale).astype(np.float32)
+    poses = finish(scene, replace(starts, scale=scale))
+    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
+
+
+def _entered(
+    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], seed: int,
+    settings: SearchSettings, deadline: Deadline = NEVER,
+) -> tuple[Scene, Candidates]:  # fmt: skip
+    """The scene, and those of the user's poses in its frame that are not missing."""
+    scene = Scene(sets, seed, settings, deadline)
+    given = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
+    return scene, Candidates.unscored(*scene.enter(rotation[given], translation[given]))

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
@@ -26,12 +27,12 @@ class Scene:
     spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
     compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
     image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
-    that is random.
+    that is random. settings, deadline: of the search.
     """
 
-    def __init__(self, sets: PointSets, seed: int, settings: SearchSettings) -> None:
+    def __init__(self, sets: PointSets, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = sets.bearings, sets.points3d
-        self.settings = settings
+        self.settings, self.deadline = settings, deadline
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)
         bulk = points3d[in_bulk]

@@ -9,14 +9,11 @@ from typing import NamedTuple
 class Recipe:
     """How the starts of a batch are drawn around the weak-perspective pose.
 
-    first_scale: where annealing begins, in spreads of the bearings. From 0.3 most starts within 30 degrees of the true
-        rotation reach it; from far below only those within about 10.
     off_centre: 0 puts the mean of the 3D points on the mean bearing; up to 1, a point between it and any 3D point, for
         cameras that see a part of the scene.
     log_depth: the depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
     """
 
-    first_scale: float
     off_centre: float
     log_depth: float
 
@@ -26,11 +23,13 @@ class ClusterStage:
     """Annealing of many poses on weighted clusters of both sides.
 
     clusters: of each side, at most; one iteration costs their number squared.
-    last_scale: in spreads of the bearings. iterations: scales from the first to the last, one Gauss-Newton step each.
+    first_scale, last_scale: in spreads of the bearings. iterations: scales from one to the other, one Gauss-Newton step
+        each.
     kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
     """
 
     clusters: int
+    first_scale: float
     last_scale: float
     iterations: int
     kept: int
@@ -111,17 +110,6 @@ class Facing:
 
 
 @dataclass(frozen=True)
-class RefineSettings:
-    """How `refine_poses` chooses among many starts: beyond `direct` they compete on clusters.
-
-    competitors: go from the coarse clusters to the finer ones. direct: are annealed on all points.
-    """
-
-    competitors: int = 32
-    direct: int = 8
-
-
-@dataclass(frozen=True)
 class Evidence:
     """When a pose is accepted (`bpnp.search.verdict`). Logarithms to base 10.
 
@@ -168,9 +156,12 @@ class SearchSettings:
     least_annealed: points of the smaller side; fewer are only enumerated (`bpnp.search.few`), since the soft assignment
         of so few has no smooth optimum.
     outliers: share of the points without a partner that the assignment expects where the caller gives none.
-    end_outliers: shares that the two best poses are annealed with in the last stage too, and the likelihood chooses.
+    end_outliers: shares that the best poses are annealed with in the last stage too, and the likelihood chooses.
     least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
+    finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
+    around: batches from a guess of the pose before those from anywhere.
+    refined_directly: starts of `refine_poses` that need no clusters; more compete on clusters first.
     kept: candidates from batch to batch, and in the end.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
@@ -182,19 +173,24 @@ class SearchSettings:
     starts: int = 1200
     first_starts: int = 48
     least_kept: int = 3
-    recipes: tuple[Recipe, ...] = (Recipe(0.30, 0.0, 0.5), Recipe(0.30, 1.0, 0.8), Recipe(0.35, 0.5, 1.2))
-    coarse: ClusterStage = ClusterStage(64, last_scale=0.1, iterations=10, kept=48, apart_deg=3.0)
-    middle: ClusterStage = ClusterStage(256, last_scale=0.04, iterations=16, kept=10, apart_deg=1.0)
+    recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
+    coarse: tuple[ClusterStage, ...] = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0),)
+    middle: tuple[ClusterStage, ...] = (
+        ClusterStage(128, 0.1, 0.065, iterations=7, kept=24, apart_deg=1.0),
+        ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
+    )
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
     facing: Facing = Facing()
-    refine: RefineSettings = RefineSettings()
     evidence: Evidence = Evidence()
     least_annealed: int = 12
     outliers: float = 0.3
     end_outliers: tuple[float, ...] = (0.03, 0.6)
     least_outliers: float = 0.02
+    finished: int = 3
+    around: int = 4
+    refined_directly: int = 8
     end_scale: float = 2.0
     kept: int = 8
     same_deg: float = 3.0
@@ -210,25 +206,40 @@ class SearchSettings:
                 "expected one or more `max_batches`, `starts`, `first_starts` and `recipes`, got "
                 f"{self.max_batches}, {self.starts}, {self.first_starts} and {len(self.recipes)}; try SearchSettings()"
             )
-        if not (0 < self.outliers < 1 and all(0 < share < 1 for share in self.end_outliers)):
+        if not all(0 < share < 1 for share in (self.outliers, *self.end_outliers)):
             raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
+
+    def expecting(self, clutter: float) -> "SearchSettings":
+        """These settings where the share of the points without a partner is known. Raises ValueError outside [0, 1).
+
+        It is expected in all stages and the only one tried at the end, and a pose that matches the share `well_matched`
+        of the other points leaves a better one little to explain.
+        """
+        if not 0 <= clutter < 1:
+            raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")
+        evidence = replace(self.evidence, well_matched=self.evidence.well_matched * (1 - clutter))
+        return replace(self, outliers=max(clutter, self.least_outliers), end_outliers=(), evidence=evidence)
 
     def batch(self, number: int) -> "Batch":
         """The size of a batch, counted from 0."""
         starts = min(self.starts, self.first_starts * 2 ** min(number, 60))
         share = math.sqrt(starts / self.starts)
         coarse, middle = (
-            min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept))) for stage in (self.coarse, self.middle)
+            tuple(
+                replace(stage, kept=min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept))))
+                for stage in stages
+            )
+            for stages in (self.coarse, self.middle)
         )
-        return Batch(starts, replace(self.coarse, kept=coarse), replace(self.middle, kept=middle))
+        return Batch(starts, coarse, middle)
 
 
 class Batch(NamedTuple):
     """starts: that are drawn. coarse, middle: the stages that they go through, with as many poses kept as they need."""
 
     starts: int
-    coarse: ClusterStage
-    middle: ClusterStage
+    coarse: tuple[ClusterStage, ...]
+    middle: tuple[ClusterStage, ...]
 
 
 DEFAULT = SearchSettings()

@@ -79,11 +79,11 @@ def draw_poses(
     across it is seen under the angle `spread`, that of the bearings.
     """
     rotation = draw_rotations(count, prior, rng)
-    sample = points3d[rng.choice(len(points3d), min(200, len(points3d)), replace=False)]
-    across = (sample @ rotation.transpose(0, 2, 1))[..., :2]
-    extent = np.sqrt(((across - across.mean(1, keepdims=True)) ** 2).sum(-1).mean(-1))
-    depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
     middle = points3d.mean(0)
+    covariance = np.cov(points3d.T, bias=True)
+    along = np.einsum("si,ij,sj->s", rotation[:, 2], covariance, rotation[:, 2])  # variance along the view
+    extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
+    depth = extent / spread * np.exp(recipe.log_depth * rng.uniform(-1, 1, count))
     seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )

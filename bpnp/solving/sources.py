@@ -3,7 +3,6 @@
 import copy
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -11,20 +10,19 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bpnp.search.annealing import Deadline
+from bpnp.compilation import Deadline
 from bpnp.search.many import search_poses
+from bpnp.search.refine import score_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
-from bpnp.solving.given_poses import joined, scored
 from bpnp.solving.problem import Array, Problem
 from bpnp.solving.solution import Solution
 from bpnp.types import Batch
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
-AROUND_NET = replace(DEFAULT, max_batches=4)  # of starts around a net's pose, before the search goes everywhere
 GPU_PAIRS, GPU_CELLS = 64, 2**26  # solved together by a module: pairs, and pairs x 2D points x 3D points
 
 Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, seconds
@@ -60,22 +58,17 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
 
 
 def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
-    """Number, result and seconds of each problem, of the search: anywhere, or around a net's pose first."""
+    """Number, result and seconds of each problem, of the search."""
     priors = [problem.prior for problem in problems.values()]
     nets = {id(net): evaluation_copy(net, options.device) for net in priors if isinstance(net, nn.Module)}
     for i, problem in problems.items():
         start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
-        search = partial(
-            search_poses, problem.sets, clutter=options.clutter, seed=options.seed, deadline=deadline,
-            settings=options.settings, progress=None if options.progress is None else partial(options.progress, i),
-        )  # fmt: skip
         net = nets.get(id(problem.prior))
-        known = None if net is None else _net_prior(net, problem, deadline)
-        around = None if known is None else search(around=known, settings=AROUND_NET)
-        if around is None:
-            result = search()
-        else:
-            result = around if _certain(problem, around, deadline) else joined(problem, around, search())
+        result = search_poses(
+            problem.sets, around=None if net is None else _net_prior(net, problem, deadline), clutter=options.clutter,
+            seed=options.seed, deadline=deadline, settings=options.settings,
+            progress=None if options.progress is None else partial(options.progress, i),
+        )  # fmt: skip
         yield i, result, time.perf_counter() - start
 
 
@@ -121,14 +114,6 @@ def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
         yield group
 
 
-def _certain(problem: Problem, around: SearchResult, deadline: Deadline) -> bool:
-    """Whether the pose is safe by its matches alone: starts around one pose that end alike are no evidence."""
-    if around.verdict != "confident":
-        return False
-    rotation, translation = around.best
-    return scored(problem, rotation[None], translation[None], deadline).verdict == "confident"
-
-
 def _net_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrior | None:
     """The net's pose, None if it has none."""
     (asked,) = _asked(net, [problem], deadline)
@@ -153,7 +138,9 @@ def _asked(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[S
     order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
     rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
-    return [scored(problem, r, t, deadline) for problem, r, t in zip(members, rotation, translation, strict=True)]
+    return [
+        score_poses(problem.sets, r, t, deadline) for problem, r, t in zip(members, rotation, translation, strict=True)
+    ]
 
 
 def _host(values: Tensor) -> Array:

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from planted import plant
 
-from bpnp.search.annealing import Deadline, anneal_on_clusters, anneal_on_points, finish, run_batch
+from bpnp.compilation import Deadline
+from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.sides import lloyd
 from bpnp.search.point_sets import PointSets
@@ -53,23 +54,24 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
     for name, kernel in (("clusters", "descend"), ("points", "descend_sparse")):
         function = getattr(__import__("bpnp.search.annealing", fromlist=[kernel]), kernel)
         monkeypatch.setattr(f"bpnp.search.annealing.{kernel}", counted(name, function))
-    found = anneal_on_clusters(scene, starts(scene, 500), DEFAULT.coarse, 0.3, 0.3, PASSED)
+    scene.deadline = PASSED
+    found = anneal_on_clusters(scene, starts(scene, 500), DEFAULT.coarse[0])
     assert annealed["clusters"] == DEFAULT.starts_a_check
     assert len(found) > 0
-    fine = anneal_on_points(scene, found[:5], 0.04 * scene.spread, 0.3, PASSED, bearings=None)
+    fine = anneal_on_points(scene, found[:5], 0.04 * scene.spread, every=True)
     assert 1 <= annealed["points"] < 5
     before = annealed["points"]
-    assert len(finish(scene, fine, 0.3, PASSED)) == len(fine)
+    assert len(finish(scene, fine)) == len(fine)
     assert annealed["points"] == before
-    assert len(run_batch(scene, DEFAULT.batch(9), DEFAULT.recipes[0], None, Candidates.none(), 0.3, PASSED)) > 0
+    assert len(run_batch(scene, DEFAULT.batch(9), DEFAULT.recipes[0], None, Candidates.none())) > 0
 
 
 def test_a_limit_that_is_not_reached_changes_nothing(scene: Scene) -> None:
     begin = starts(scene, 100)
     ends = []
-    for deadline in (Deadline(), Deadline.after(1e6)):
+    for scene.deadline in (Deadline(), Deadline.after(1e6)):
         scene.rng = np.random.default_rng(5)  # of the clusters
-        ends.append(anneal_on_clusters(scene, begin, DEFAULT.coarse, 0.3, 0.3, deadline))
+        ends.append(anneal_on_clusters(scene, begin, DEFAULT.coarse[0]))
     np.testing.assert_array_equal(ends[0].rotation, ends[1].rotation)
     np.testing.assert_array_equal(ends[0].score, ends[1].score)
 

@@ -1,6 +1,6 @@
 """The training-free search and the refinement find planted poses, and say when they do not."""
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -51,10 +51,10 @@ def test_batches_grow_until_they_are_full():
     sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
     assert [size.starts for size in sizes] == [48, 96, 192, 384, 768, 1200, 1200, 1200]
     for stage in ("coarse", "middle"):
-        kept = [getattr(size, stage).kept for size in sizes]
+        kept = [getattr(size, stage)[-1].kept for size in sizes]
         assert kept == sorted(kept)
         assert kept[0] >= DEFAULT.least_kept
-        assert kept[-1] == getattr(DEFAULT, stage).kept
+        assert kept[-1] == getattr(DEFAULT, stage)[-1].kept
 
 
 def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
@@ -144,6 +144,25 @@ def test_a_rough_pose_saves_batches(problem):
     )
     assert rotation_error(r, problem.rotation[:1]) < 0.5
     assert stats.iterations.item() <= 1
+
+
+@pytest.mark.parametrize("off", [0.05, 1.0])
+def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, off):
+    """One near the true pose and one 57 degrees off: the search goes everywhere unless the matches are unique."""
+    rotation, translation = (values[0].numpy() for values in problem.near(off, seed=1))
+    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
+    result = search_poses(sets, around=PosePrior(rotation, translation, 4.0, 0.1))
+    assert result.verdict == "confident"
+    assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
+    assert (result.batches <= DEFAULT.around) == (off < 0.1)
+
+
+def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):
+    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
+    rotation, translation = (values[0].numpy() for values in problem.near(1.0, seed=1))
+    hopeless = replace(DEFAULT, around=6, max_batches=1, first_starts=1, starts=1)
+    result = search_poses(sets, around=PosePrior(rotation, translation, 1.0, 0.01), settings=hopeless)
+    assert (result.candidates.hits <= 1).all()
 
 
 def test_gravity_leaves_one_angle(problem):

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.annealing import Deadline, anneal_on_points
+from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.weighted import visible_weights
 from bpnp.search.many import search_poses
@@ -154,5 +154,5 @@ def test_a_point_of_another_label_neither_matches_nor_pulls() -> None:
     scene = Scene(sets, 0, DEFAULT)
     rotations, translations = (values[None] for values in scene.enter(rotation, TRANSLATION))
     right = Candidates.unscored(rotations, translations)
-    found = anneal_on_points(scene, right, 0.02 * scene.spread, 0.3, Deadline(), bearings=None)
+    found = anneal_on_points(scene, right, 0.02 * scene.spread, every=True)
     assert found.matched[0] < 0.05

@@ -11,7 +11,7 @@ from planted import plant
 from small_data import small_net
 
 from bpnp import solve
-from bpnp.search.annealing import Deadline
+from bpnp.compilation import Deadline
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving import sources
 from bpnp.solving.sources import evaluation_copy
@@ -93,16 +93,20 @@ def test_several_threads_find_what_one_does() -> None:
 
 @pytest.mark.parametrize("limit", [None, 30.0])
 def test_the_time_limit_of_a_pair_counts_once(limit: float | None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With a net as prior the search around its pose and the one everywhere have one deadline."""
+    """The seconds of a net that is asked for a prior count too."""
     deadlines: list[Deadline] = []
+
+    def ask(*arguments) -> None:
+        deadlines.append(arguments[-1])
 
     def search(*_, deadline: Deadline, **__) -> SearchResult:
         deadlines.append(deadline)
         return no_pose("none")
 
+    monkeypatch.setattr(sources, "_net_prior", ask)
     monkeypatch.setattr(sources, "search_poses", search)
     planted = plant(1, 30)
     solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=limit)
-    assert len(deadlines) == 2
-    assert deadlines[0] is deadlines[1]
-    assert np.isinf(deadlines[0].at) == (limit is None)
+    first, second = deadlines
+    assert first is second
+    assert np.isinf(first.at) == (limit is None)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.annealing import Deadline
+from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.few.knowledge import pairs_that_fix, predicted_pose
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin

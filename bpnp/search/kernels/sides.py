@@ -4,7 +4,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.cluster.vq import vq
 
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.settings import Facing, SearchSettings
@@ -89,7 +88,8 @@ def lloyd(
     """
     mass = np.ones(len(points)) if weights is None else weights
     for i in range(iterations + 1):
-        nearest, _ = vq(points, centres)
+        # |x - c|^2 without |x|^2: one product of matrices
+        nearest = ((centres * centres).sum(1) - 2 * (points @ centres.T)).argmin(1)
         members = np.bincount(nearest, mass, len(centres)).astype(np.float64)
         if i == iterations:
             break
