@@ -6,7 +6,7 @@ from torch import Tensor
 
 from bpnp.layers.implicit import projected
 from bpnp.layers.laplacian import solve_laplacian
-from bpnp.layers.plan import Plan, divide, transpose_times
+from bpnp.layers.plan import Plan, cached_parts, divide, transpose_times
 
 TOLERANCE = {torch.float32: 5e-6, torch.float64: 1e-13}  # of conjugate gradients, relative
 TOLERANCE_PROMOTED = 1e-8  # in float64 for float32 data
@@ -22,14 +22,20 @@ def solve_multipliers(
     The last value tells which samples converged. Samples whose plan is sharp, where differences of nearly equal numbers
     decide, and samples that stall are solved in float64, by a Cholesky factorisation at last.
     """
-    a, b, solved, trusted = _solve(plan, gradient, TOLERANCE[plan.dtype])
+    a, b, solved, trusted = _solve_parts(plan, gradient, TOLERANCE[plan.dtype])
     if plan.dtype != torch.float64 and not bool(trusted.all()):
         hard = (~trusted).nonzero().squeeze(-1)
-        exact = _solve(plan[hard].double(), gradient[hard].double(), TOLERANCE_PROMOTED)
+        exact = _solve_parts(plan[hard].double(), gradient[hard].double(), TOLERANCE_PROMOTED)
         a, b, solved = (
             old.index_copy(0, hard, new.to(old.dtype)) for old, new in zip((a, b, solved), exact[:3], strict=True)
         )
     return a, b, solved & a.isfinite().all(-1) & b.isfinite().all(-1)
+
+
+def _solve_parts(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, ...]:
+    """`_solve` of a few samples at a time."""
+    parts = [_solve(p, v, tolerance) for p, v in cached_parts(plan, gradient)]
+    return tuple(map(torch.cat, zip(*parts, strict=True)))
 
 
 def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.layers.plan import cached_parts
 from bpnp.precision import exact_products
 
 
@@ -132,7 +133,10 @@ def entropic_plan(
 
 def projected(plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor) -> Float[Tensor, "b m n"]:
     """P.(V - a1^T - 1b^T)."""
-    return (gradient - a.unsqueeze(-1)).sub_(b.unsqueeze(-2)).mul_(plan)
+    result = torch.empty_like(plan)
+    for out, p, v, x, y in cached_parts(result, plan, gradient, a, b):
+        torch.sub(v, x.unsqueeze(-1), out=out).sub_(y.unsqueeze(-2)).mul_(p)
+    return result
 
 
 class _EntropicPlan(torch.autograd.Function):

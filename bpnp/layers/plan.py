@@ -1,5 +1,6 @@
 """A transport plan as a kernel between two scalings, and its products with vectors."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -7,6 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 SHORT_SUM = 2048  # terms of a sum that are added up in float32
+CACHE = 2**24  # bytes of plans that are worked on together on a CPU: later products then read them from its cache
 CACHED = 128  # rows whose squares are made at a time: they stay in the cache of a core
 LOST = 100.0  # a difference of so many units of rounding has no digits
 
@@ -63,6 +65,13 @@ class Plan:
             degree = torch.where(weak.unsqueeze(-1), exact, degree)
         # A column whose links are below rounding still has an equation, which zero would hide.
         return torch.maximum(degree, torch.finfo(cols.dtype).eps * cols)
+
+
+def cached_parts(*values: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """The values, matrices (b, m, n) first, in groups of samples that fit in a CPU's cache; on a GPU in one group."""
+    matrices = values[0]
+    size = max(1, CACHE // matrices[0].nbytes) if matrices.is_cpu else len(matrices)
+    return zip(*(value.split(size) for value in values), strict=True)
 
 
 def times(matrix: Float[Tensor, "b m n"], b: Float[Tensor, "b n"]) -> Float[Tensor, "b m"]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.layers.laplacian import solve_laplacian
-from bpnp.layers.plan import Plan, divide
+from bpnp.layers.plan import Plan, cached_parts, divide
 from bpnp.types import SolveStats
 
 SWEEPS = 4  # before the first Newton step
@@ -43,28 +43,37 @@ def solve_plan(
     which float32 has too few digits are solved again in float64.
     """
     limit = torch.full((len(cost),), max_iterations, device=cost.device)
-    plan, iterations, residual = _solve(cost, rows, cols, mu, tolerance, limit)
+    plan, iterations, residual = _solve_parts(cost, rows, cols, limit, mu, tolerance)
     left = limit - iterations
     hard = (residual > tolerance) & (left > 0)
     if cost.dtype != torch.float64 and bool(hard.any()):
         some = hard.nonzero().squeeze(-1)
-        exact_plan, more, exact_residual = _solve(
-            cost[some].double(), rows[some].double(), cols[some].double(), mu, tolerance, left[some]
-        )
+        problem = cost[some].double(), rows[some].double(), cols[some].double()
+        exact_plan, more, exact_residual = _solve_parts(*problem, left[some], mu, tolerance)
         plan[some], residual[some] = exact_plan.to(plan.dtype), exact_residual.to(residual.dtype)
         iterations[some] += more
     return plan, SolveStats(iterations, residual, residual <= tolerance)
 
 
+def _solve_parts(
+    cost: Tensor, rows: Tensor, cols: Tensor, limit: Int[Tensor, " b"], mu: Tensor, tolerance: float
+) -> tuple[Tensor, ...]:
+    """Plan, iterations and residuals; a few samples at a time."""
+    plan = cost.new_empty(cost.shape)
+    parts = cached_parts(plan, cost, rows, cols, limit)
+    ends = [_solve(k, m, r, c, most, mu, tolerance) for k, m, r, c, most in parts]
+    return plan, *map(torch.cat, zip(*ends, strict=True))
+
+
 def _solve(
-    cost: Tensor, rows: Tensor, cols: Tensor, mu: Tensor, tolerance: float, limit: Int[Tensor, " b"]
-) -> tuple[Float[Tensor, "b m n"], Int[Tensor, " b"], Float[Tensor, " b"]]:
-    """Plan, iterations and residuals, in the precision of the cost.
+    kernel: Tensor, cost: Tensor, rows: Tensor, cols: Tensor, limit: Int[Tensor, " b"], mu: Tensor, tolerance: float
+) -> tuple[Int[Tensor, " b"], Float[Tensor, " b"]]:
+    """Iterations and residuals, in the precision of the cost; the plan is written to `kernel`.
 
     Samples that are active have all taken the same steps: which others share the batch does not matter to any.
     """
     temperature = mu.to(cost.dtype).expand(len(cost))
-    u, v, plan = _anneal(cost, rows, cols, temperature)
+    u, v, plan = _anneal(kernel, cost, rows, cols, temperature)
     limit = limit.clamp_max(ITERATIONS_IN_FLOAT32) if cost.dtype == torch.float32 else limit
     plan, sums, residual, iterations = sweep(plan, plan.row_sums(), rows, cols, limit.clamp_max(SWEEPS), tolerance)
     radius = torch.full_like(residual, NEWTON_RADIUS)
@@ -83,7 +92,8 @@ def _solve(
             old.index_copy(0, some, new) for old, new in ((plan.alpha, part.alpha), (plan.beta, part.beta))
         ))  # fmt: skip
         sums = sums.index_copy(0, some, part_sums)
-    return plan.kernel.mul_(plan.alpha.unsqueeze(-1)).mul_(plan.beta.unsqueeze(-2)), iterations, residual
+    kernel.mul_(plan.alpha.unsqueeze(-1)).mul_(plan.beta.unsqueeze(-2))
+    return iterations, residual
 
 
 def sweep(
@@ -141,13 +151,14 @@ def _newton(
     return Plan(plan.kernel, alpha, beta), sums, torch.where(accept, 2 * radius, radius / 4), goes_on
 
 
-def _anneal(cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"]) -> tuple[Tensor, Tensor, Plan]:
-    """Potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan.
+def _anneal(
+    kernel: Tensor, cost: Tensor, rows: Tensor, cols: Tensor, mu: Float[Tensor, " b"]
+) -> tuple[Tensor, Tensor, Plan]:
+    """Potentials u, v from which the plan at `mu` neither over- nor underflows, and that plan, in `kernel`.
 
     Sweeps at falling temperatures, each sample from its own range of costs down to mu. Each temperature starts with the
     largest entry of every row at one. A point without mass has the potential -inf.
     """
-    kernel = cost.new_empty(cost.shape)
     warm = torch.maximum(COARSEST * _range(cost, rows, cols), mu)
     v = torch.where(cols > 0, 0.0, -math.inf).to(cost.dtype)
     while bool((cooling := warm > mu).any()):
