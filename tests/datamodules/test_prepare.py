@@ -1,9 +1,11 @@
 """Preparing data sets: every form of the same data gives the same store, and no kill leaves a wrong one."""
 
+import gc
 import multiprocessing
 import os
 import shutil
 import signal
+import threading
 import time
 import zipfile
 import zlib
@@ -19,6 +21,7 @@ from planted_model import plant_model
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.colmap.prepare import prepare_colmap
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.datamodules.meshes.archives import MeshFiles
 from bpnp.datamodules.meshes.prepare import prepare_meshes
 from bpnp.datamodules.meshes.source import POINTS, SURFACES
@@ -299,6 +302,27 @@ def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pyte
         run(meshes, tmp_path / "store")
 
 
+def test_ctrl_c_while_processes_start_is_one_clean_end(meshes: Path, tmp_path: Path) -> None:
+    """No worker is left to find that its parent has gone."""
+    child = os.fork()
+    if child == 0:
+        os.setsid()
+        os.dup2(os.open(tmp_path / "said.txt", os.O_WRONLY | os.O_CREAT), 2)
+        threading.Timer(0.5, os.killpg, (0, signal.SIGINT)).start()
+        status = 0
+        try:
+            run(meshes, tmp_path / "store", processes=2)
+        except KeyboardInterrupt:
+            status = 130
+        gc.collect()  # removes the semaphores, as the end of a process does
+        time.sleep(1)
+        os._exit(status)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
+    assert "Traceback" not in (tmp_path / "said.txt").read_text()
+    run(meshes, tmp_path / "store")
+    check(opened(tmp_path / "store"), meshes)
+
+
 def scenes(root: Path, count: int) -> None:
     for i in range(count):
         plant_model(root / f"{i:04d}" / "sparse" / "manhattan" / "0", seen=30 + i, seed=i)
@@ -332,6 +356,20 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
     assert set(open_store(tmp_path / "store", "pairs").skipped) == {"0003", "0000"}
     with pytest.raises(StoreError, match="clutter.*0.5.*--clutter 0.6"):
         ColmapDataModule(str(tmp_path / "store"), **(options | {"clutter": 0.6})).setup("test")
+
+
+def test_what_was_not_used_of_a_model_is_listed_and_not_logged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:  # fmt: skip
+    """A distortion that folds the border over: keypoints there cannot be undistorted."""
+    folded = ("SIMPLE_RADIAL", [800.0, 400.0, 300.0, -0.9])
+    plant_model(tmp_path / "scenes" / "a" / "sparse" / "0", camera=folded, origin=1e7)
+    model = read_reconstruction(tmp_path / "scenes" / "a" / "sparse" / "0")
+    assert "keypoints that could not be undistorted" in caplog.text
+    caplog.clear()
+    prepared = prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=4, clutter=0.0, processes=1)
+    assert prepared.skipped == {"a/points": model.notable}
+    assert caplog.text == ""
 
 
 def test_outliers_reach_the_batches_of_a_store(tmp_path: Path) -> None:

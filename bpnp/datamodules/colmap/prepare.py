@@ -1,6 +1,9 @@
 """The store of all pairs of COLMAP models: MegaDepth, or scenes of your own."""
 
+import logging
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError
@@ -41,19 +44,35 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
 
 
 def read_part(job: tuple[str, str, Path, int, float], output: Path) -> None:
-    """Write the store of one COLMAP model; an empty one if it cannot be used."""
+    """Write the store of one COLMAP model; an empty one if it cannot be used.
+
+    What was not used of it is listed, not logged: there may be hundreds of models.
+    """
     scene, name, folder, min_points, clutter = job
-    with new_store(output, PAIRS, WIDTHS, durable=False) as writer:
+    with new_store(output, PAIRS, WIDTHS, durable=False) as writer, silent(logging.getLogger(__package__)):
         try:
             reconstruction = read_reconstruction(folder, name=name)
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # the images left out are counted here
-                source = ColmapSource([reconstruction], min_points=min_points, clutter=clutter)
+            source = ColmapSource([reconstruction], min_points=min_points, clutter=clutter)
         except (ColmapError, StoreError) as error:
             writer.skipped[name] = str(error)
             return
         total = len(reconstruction.images)
         if left_out := total - len(source.images):
             writer.skipped[f"{name}/*"] = f"{left_out} of {total} images with fewer than {min_points} points"
+        if reconstruction.notable:
+            writer.skipped[f"{name}/points"] = reconstruction.notable
         for i in range(len(source.images)):
             add_pair(writer, scene, source.pair(i))
+
+
+@contextmanager
+def silent(logger: logging.Logger) -> Iterator[None]:
+    """No messages below errors of a logger and of those under it, and no warnings."""
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

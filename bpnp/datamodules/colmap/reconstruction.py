@@ -51,6 +51,11 @@ class Reconstruction:
     images: tuple[ImagePoints, ...]
     lost: Mapping[str, int]
 
+    @property
+    def notable(self) -> str:
+        """What was lost in words, but for repeated keypoints, which are common."""
+        return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if reason != "repeated keypoints")
+
 
 def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Reconstruction:
     """Read the COLMAP model in `folder`, undistort its keypoints and pair them with their 3D points.
@@ -85,11 +90,10 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
         images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost))
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
-    lost = +lost
-    notable = [f"{count} {reason}" for reason, count in lost.items() if reason != "repeated keypoints"]
-    if notable:
-        logger.warning("not used in %s: %s", path, ", ".join(notable))
-    return Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(lost))
+    found = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost))
+    if found.notable:
+        logger.warning("not used in %s: %s", path, found.notable)
+    return found
 
 
 def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.search.kernels.vectors import F, compiled, cross, direction, rotated, turn
+from bpnp.search.kernels.vectors import F, compiled, cross, direction, rotated, sum_of, turn
 from bpnp.search.kernels.weighted import visible_weights
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
@@ -126,7 +126,7 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
     f, a, odds2d = bearings[0], bearings[1], bearings[2]
     p, odds3d, partners = points[0], points[2], points[4]
     m, n = f.shape[1], p.shape[1]
-    total_a, total_b = F(a.sum()), F(weight.sum()) + F(1e-20)
+    total_a, total_b = sum_of(a), sum_of(weight) + F(1e-20)
     sharp = F(1) / (scale * scale * F(POWER))
     for i in range(m):
         row[i] = outlier * total_b * odds2d[i]
@@ -159,18 +159,18 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
         row[i] = a[i] / row[i]
     for j in range(n):
         b, line = weight[j] / (q[3, j] + outlier * total_a * odds3d[j]), kernel[j]
-        q0, q1, q2, total = F(0), F(0), F(0), F(0)
+        q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
         for block in range(2):
             for i in range(partners[2 * block, j], partners[2 * block + 1, j]):
                 v = line[i] * line[i] * row[i]
                 q0 += v * f[0, i]
                 q1 += v * f[1, i]
                 q2 += v * f[2, i]
-                total += v
-        q[0, j] = (q0 - total * q[0, j]) * b
-        q[1, j] = (q1 - total * q[1, j]) * b
-        q[2, j] = (q2 - total * q[2, j]) * b
-        q[3, j] = total * b
+                q3 += v
+        q[0, j] = (q0 - q3 * q[0, j]) * b
+        q[1, j] = (q1 - q3 * q[1, j]) * b
+        q[2, j] = (q2 - q3 * q[2, j]) * b
+        q[3, j] = q3 * b
     return likelihood / total_a
 
 

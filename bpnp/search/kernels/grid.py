@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.kernels.dense import move
-from bpnp.search.kernels.vectors import F, compiled, direction, rotated
+from bpnp.search.kernels.vectors import F, compiled, direction, rotated, sum_of
 from bpnp.search.kernels.weighted import WeightedBearings, visible_weights
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
@@ -110,8 +110,8 @@ def assign_sparse(grid: Any, points: Any, weight: Any, rotation: Any, translatio
     f, a, odds2d = grid[0], grid[1], grid[2]
     p, odds3d, labels = points[0], points[2], points[3]
     m, n = f.shape[1], p.shape[1]
-    total_a, total_b = F(a.sum()), F(weight.sum()) + F(1e-20)
-    row[:] = F(0)
+    total_a, total_b = sum_of(a), sum_of(weight) + F(1e-20)
+    clear(row)
     sharp = F(-0.5) / (scale * scale)
     for j in range(n):
         x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
@@ -128,11 +128,11 @@ def assign_sparse(grid: Any, points: Any, weight: Any, rotation: Any, translatio
         row[i] = a[i] / math.sqrt(slack * odds2d[i] + row[i])
     for _ in range(SWEEPS):
         for j in range(n):
-            total = F(0)
+            mass = F(0)
             for e in range(count[j]):
-                total += kernel[j, e] * row[index[j, e]]
-            column[j] = weight[j] / (slack * odds3d[j] + total)
-        row[:] = F(0)
+                mass += kernel[j, e] * row[index[j, e]]
+            column[j] = weight[j] / (slack * odds3d[j] + mass)
+        clear(row)
         for j in range(n):
             for e in range(count[j]):
                 row[index[j, e]] += kernel[j, e] * column[j]
@@ -140,17 +140,35 @@ def assign_sparse(grid: Any, points: Any, weight: Any, rotation: Any, translatio
             row[i] = a[i] / (slack * odds2d[i] + row[i])
     matched = F(0)
     for j in range(n):
-        q0, q1, q2, total = F(0), F(0), F(0), F(0)
+        q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
         for e in range(count[j]):
             i = index[j, e]
             mass = kernel[j, e] * row[i] * column[j]
-            total += mass
+            q3 += mass
             q0 += mass * (f[0, i] - q[0, j])
             q1 += mass * (f[1, i] - q[1, j])
             q2 += mass * (f[2, i] - q[2, j])
-        matched += total
-        q[0, j], q[1, j], q[2, j], q[3, j] = q0, q1, q2, total
-    return likelihood / total_a, matched / min(total_a, max(total_b, F(LEAST_SEEN) * F(points[1].sum())))
+        matched += q3
+        q[0, j], q[1, j], q[2, j], q[3, j] = q0, q1, q2, q3
+    return likelihood / total_a, matched / min(total_a, max(total_b, F(LEAST_SEEN) * sum_of(points[1])))
+
+
+@compiled
+def clear(values: Any) -> None:
+    """Zero in all places of values (k,)."""
+    for i in range(len(values)):
+        values[i] = 0
+
+
+@compiled
+def is_finite(rotation: Any, translation: Any) -> bool:
+    """Whether a pose has neither NaN nor infinity."""
+    finite = True
+    for r in range(3):
+        for c in range(3):
+            finite = finite and math.isfinite(rotation[r, c])
+        finite = finite and math.isfinite(translation[r])
+    return finite
 
 
 @compiled
@@ -177,11 +195,12 @@ def descend_sparse(grid: Any, points: Any, rotation: Any, translation: Any, scal
         index, kernel, count = np.empty((n, CAPACITY), np.int32), np.empty((n, CAPACITY), F), np.empty(n, np.int32)
         row, column, weight, q = np.empty(m, F), np.empty(n, F), np.empty(n, F), np.empty((4, n), F)
         hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)
-        best_rotation, best_translation = rotation[k].copy(), translation[k].copy()
+        best_rotation, best_translation = np.empty((3, 3), F), np.empty(3, F)
+        copy_pose(rotation[k], translation[k], best_rotation, best_translation)
         result[k, 0], result[k, 1], result[k, 2] = -np.inf, F(0), F(0)
         since = 0
         for scale in scales:
-            if not (np.isfinite(rotation[k]).all() and np.isfinite(translation[k]).all()):
+            if not is_finite(rotation[k], translation[k]):
                 break
             visible_weights(points, rotation[k], translation[k], weight)
             likelihood, matched = assign_sparse(

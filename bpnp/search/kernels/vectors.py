@@ -16,6 +16,15 @@ LARGEST_TURN = 0.5  # radians in one step
 
 
 @compiled
+def sum_of(values: Any) -> Any:
+    """The sum of float32 values (k,): numba takes longer to compile its own."""
+    total = F(0)
+    for i in range(len(values)):
+        total += values[i]
+    return total
+
+
+@compiled
 def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
     """(x, y, z) x (a, b, c)."""
     return y * c - z * b, z * a - x * c, x * b - y * a
