@@ -171,12 +171,23 @@ def make_parts(folder: Path, recipe: Recipe, *, processes: int) -> list[Path]:
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Hold SIGINT back while workers start: they inherit the mask, so Ctrl-C reaches this process alone."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    """Hold Ctrl-C back while workers start, so that all of them are known and ended; it never reaches the workers.
+
+    They inherit the mask. It is not enough here: a thread of another library may have the signal instead.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if held:
+            raise KeyboardInterrupt
 
 
 def _end_with_parent() -> None:

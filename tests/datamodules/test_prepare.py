@@ -1,12 +1,13 @@
 """Preparing data sets: every form of the same data gives the same store, and no kill leaves a wrong one."""
 
-import gc
 import multiprocessing
 import os
 import shutil
 import signal
-import threading
+import subprocess
+import sys
 import time
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -302,23 +303,30 @@ def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pyte
         run(meshes, tmp_path / "store")
 
 
+PREPARE = """
+import sys
+from pathlib import Path
+from bpnp.datamodules.meshes.prepare import prepare_meshes
+if __name__ == "__main__":
+    print("ready", flush=True)
+    try:
+        prepare_meshes(*map(Path, sys.argv[1:]), points=32, normalisation="none", processes=2)
+    except KeyboardInterrupt:
+        sys.exit(130)
+"""
+
+
 def test_ctrl_c_while_processes_start_is_one_clean_end(meshes: Path, tmp_path: Path) -> None:
     """No worker is left to find that its parent has gone."""
-    child = os.fork()
-    if child == 0:
-        os.setsid()
-        os.dup2(os.open(tmp_path / "said.txt", os.O_WRONLY | os.O_CREAT), 2)
-        threading.Timer(0.5, os.killpg, (0, signal.SIGINT)).start()
-        status = 0
-        try:
-            run(meshes, tmp_path / "store", processes=2)
-        except KeyboardInterrupt:
-            status = 130
-        gc.collect()  # removes the semaphores, as the end of a process does
-        time.sleep(1)
-        os._exit(status)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 130
-    assert "Traceback" not in (tmp_path / "said.txt").read_text()
+    (tmp_path / "script.py").write_text(PREPARE)
+    words = [sys.executable, str(tmp_path / "script.py"), str(meshes), str(tmp_path / "store")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words, text=True, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
+        assert process.stdout.readline() == "ready\n"
+        time.sleep(0.7)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.stderr.read()
+    assert (process.returncode, "Traceback" in said) == (130, False), said
     run(meshes, tmp_path / "store")
     check(opened(tmp_path / "store"), meshes)
 
@@ -444,6 +452,25 @@ def test_meshes_that_were_not_prepared_are_sampled_into_the_cache_once(
             module(meshes, tmp_path / "cache")
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert len(counted.names) == 4 * 19
+
+
+@pytest.mark.parametrize("root", [True, False])
+def test_a_cached_store_is_compared_with_its_checksums_once_a_run(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, root: bool
+) -> None:
+    options = {"num_points": 16, "pool_size": 32, "train_shapes": 3, "val_shapes": 3, "val_fraction": 0.2}
+    options |= {"cache_dir": str(tmp_path / "cache")}
+    source = str(meshes) if root else None
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the seven bad files
+        MeshDataModule(source, **options).setup("fit")
+        read: list[Path] = []
+        whole = Store.verify
+        monkeypatch.setattr(Store, "verify", lambda store: (read.append(store.folder), whole(store))[1])
+        data = MeshDataModule(source, **options)
+        data.prepare_data()
+        data.setup("fit")
+    assert len(set(read)) == len(read) == (1 if root else 2)  # the test shapes are made now
 
 
 def test_the_cache_is_the_users_wherever_the_work_is(

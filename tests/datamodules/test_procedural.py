@@ -9,17 +9,16 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.prepare import open_procedural
-from bpnp.datamodules.meshes.procedural import procedural_shape
+from bpnp.datamodules.meshes.prepare import open_surfaces
+from bpnp.datamodules.meshes.procedural import ProceduralShapes, procedural_shape
 from bpnp.datamodules.meshes.source import POINTS
 from bpnp.datamodules.meshes.surfaces import normalise, sample_surface
 from bpnp.datamodules.store import Store
 
 
 def shapes(folder: Path, split: str, count: int, *, seed: int = 0) -> Store:
-    return open_procedural(
-        split, count, seed=seed, points=64, normalisation="unit_sphere", cache_dir=str(folder)
-    )  # fmt: skip
+    drawn = ProceduralShapes(split, seed, range(count))
+    return open_surfaces(drawn, points=64, normalisation="unit_sphere", cache_dir=str(folder))
 
 
 def test_a_shape_depends_on_seed_split_and_number_alone(tmp_path: Path) -> None:

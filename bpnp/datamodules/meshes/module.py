@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.meshes.prepare import open_procedural, open_surfaces, split_rows
+from bpnp.datamodules.meshes.prepare import open_surfaces, split_rows
+from bpnp.datamodules.meshes.procedural import ProceduralShapes
 from bpnp.datamodules.meshes.source import MeshSource, hold_out
 from bpnp.datamodules.meshes.surfaces import Normalisation
 from bpnp.datamodules.meshes.views import Views
@@ -88,6 +89,7 @@ class MeshDataModule(PairDataModule):
         self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
         self.views = Views(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
+        self._stores: dict[str, Store] = {}
         self.fresh, self.views_on_device, self.val_fraction = fresh_views, views_on_device, val_fraction
 
     def prepare_data(self) -> None:
@@ -130,17 +132,13 @@ class MeshDataModule(PairDataModule):
         return rows[training if split == "train" else held_out]
 
     def _store(self, part: str) -> Store:
-        """The surface samples of a part, made now if they are not there."""
-        if self.root is not None:
-            return open_surfaces(
-                self.root, points=self.pool_size, normalisation=self.normalisation, cache_dir=self.cache_dir
+        """The surface samples of a part, opened once, and made now if they are not there."""
+        split = "all" if self.root is not None else "test" if part == "predict" else part
+        if split not in self._stores:
+            self._stores[split] = open_surfaces(
+                self.root or ProceduralShapes(split, self.seed, range(self.num_shapes[split])),
+                points=self.pool_size,
+                normalisation=self.normalisation,
+                cache_dir=self.cache_dir,
             )
-        split = "test" if part == "predict" else part
-        return open_procedural(
-            split,
-            self.num_shapes[split],
-            seed=self.seed,
-            points=self.pool_size,
-            normalisation=self.normalisation,
-            cache_dir=self.cache_dir,
-        )
+        return self._stores[split]

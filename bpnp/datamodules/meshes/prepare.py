@@ -58,35 +58,26 @@ def sample_part(job: tuple[MeshArchive, int, Normalisation], folder: Path) -> No
 
 
 def open_surfaces(
-    root: Path, *, points: int, normalisation: Normalisation, cache_dir: str | None
-) -> Store:  # fmt: skip
-    """The store `root`, or the cached store of the meshes in it, made if it is not there.
+    source: Path | ProceduralShapes, *, points: int, normalisation: Normalisation, cache_dir: str | None
+) -> Store:
+    """The store `source`, or the cached store of its meshes, made if it is not there.
 
     Raises ValueError as `open_archive`; StoreError for a store of another `normalisation`.
     """
-    if not is_store(root):
-        recipe = surfaces_recipe(open_archive(root), points=points, normalisation=normalisation, label=str(root))
-        return cached(recipe, root.resolve().name, cache_dir)
-    store = open_store(root, SURFACES)
-    if (kept := store.parameters["normalisation"]) != normalisation:
-        raise StoreError(
-            f"expected meshes of `normalisation` {normalisation}, got {kept} in {root}; try {kept}, or preparing again "
-            f"with --normalisation {normalisation}"
-        )
-    return store
-
-
-def open_procedural(
-    split: str, count: int, *, seed: int, points: int, normalisation: Normalisation, cache_dir: str | None
-) -> Store:
-    """The cached store of the `count` procedural shapes of a split, made if it is not there.
-
-    Raises ValueError for fewer than one shape.
-    """
-    if count < 1:
-        raise ValueError(f"expected at least one procedural {split} shape, got {count}")
-    label, shapes = f"procedural-{split}", ProceduralShapes(split, seed, range(count))
-    recipe = surfaces_recipe(shapes, points=points, normalisation=normalisation, label=label)
+    if isinstance(source, ProceduralShapes):
+        archive: MeshArchive = source
+        label = f"procedural-{source.split}"
+    elif not is_store(source):
+        archive, label = open_archive(source), source.resolve().name
+    else:
+        store = open_store(source, SURFACES)
+        if (kept := store.parameters["normalisation"]) != normalisation:
+            raise StoreError(
+                f"expected meshes of `normalisation` {normalisation}, got {kept} in {source}; try {kept}, or preparing "
+                f"again with --normalisation {normalisation}"
+            )
+        return store
+    recipe = surfaces_recipe(archive, points=points, normalisation=normalisation, label=label)
     return cached(recipe, label, cache_dir)
 
 

@@ -44,12 +44,16 @@ def _part(rng: np.random.Generator, size: float) -> Mesh:
 class ProceduralShapes:
     """The shapes of a split, as a `MeshArchive`. No shape belongs to two splits or two seeds.
 
-    Shape i does not depend on their number.
+    Shape i does not depend on their number. Raises ValueError for none.
     """
 
     split: str
     seed: int
     numbers: range
+
+    def __post_init__(self) -> None:
+        if not self.numbers:
+            raise ValueError(f"expected at least one procedural {self.split} shape, got {len(self.numbers)}")
 
     @property
     def names(self) -> Sequence[str]:

@@ -48,6 +48,7 @@ class PreprocessedDataModule(PairDataModule):
         super().__init__(**loading)
         check_limits(min_points, max_points, eval_max_points)
         self.root, self.dataset, self.cache_dir = Path(root), dataset, cache_dir
+        self._pairs: Store | None = None
         self.val_fraction, self.min_points, self.fresh = val_fraction, min_points, fresh_subsets
         self.max_points, self.eval_max_points, self.rotate = max_points, eval_max_points, rotate
 
@@ -73,7 +74,10 @@ class PreprocessedDataModule(PairDataModule):
         return StoredPairs(store, rows[training if part == "train" else held_out], min_points=self.min_points)
 
     def _store(self) -> Store:
-        if is_store(self.root):
-            return open_store(self.root, PAIRS)
-        recipe = released_recipe(self.root, self.dataset)
-        return cached(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
+        """The pairs, opened once, and converted now if they are not."""
+        if self._pairs is None and is_store(self.root):
+            self._pairs = open_store(self.root, PAIRS)
+        elif self._pairs is None:
+            recipe = released_recipe(self.root, self.dataset)
+            self._pairs = cached(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
+        return self._pairs
