@@ -26,7 +26,7 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     momentum: float
 
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
-        if not self.training or (x.device.type == "cpu" and not dist.is_initialized()):
+        if not self.training or (x.is_cpu and not dist.is_initialized() and not torch.compiler.is_compiling()):
             return self._of_real_points(x, mask)
         weight = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
         mean, variance = self._statistics(x, weight)
