@@ -15,6 +15,7 @@ from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.composition import AnyModule, chosen
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
+from bpnp.models.nets.frames import principal_axes, robust_frame
 from bpnp.models.nets.normalisation import centred
 from bpnp.models.nets.pointwise import Pointwise
 from bpnp.models.pose_head import pnp_pose, ransac_pose
@@ -37,6 +38,8 @@ class Matcher(TrainedNet):
         depth: attention blocks.
         heads: of each attention.
         neighbours: nearest neighbours that a point is described by; 0 for none.
+        principal: describe 3D points along the principal axes of their set, so that the scene's rotation does not
+            matter; false for the axes that they are given in.
         mu: entropy weight of the transport at the start of a training; it is learned.
         tolerance: L1 error of the marginals at which the transport stops.
         ransac, pnp, refinement: as in `BPnPNet`.
@@ -55,6 +58,7 @@ class Matcher(TrainedNet):
         depth: int = 6,
         heads: int = 4,
         neighbours: int = 8,
+        principal: bool = False,
         mu: float = 0.1,
         tolerance: float = 1e-6,
         ransac: RansacPnP | AnyModule | None = None,
@@ -65,7 +69,7 @@ class Matcher(TrainedNet):
         if not mu > 0:
             raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
-        self.mu, self.tolerance = mu, tolerance
+        self.principal, self.mu, self.tolerance = principal, mu, tolerance
         self.backward_stats = BackwardStats()
         self.enter2d = Pointwise(2 * (1 + 2 * FREQUENCIES) + 3, channels)
         self.enter3d = Pointwise(3 * (1 + 2 * FREQUENCIES), channels)
@@ -116,9 +120,12 @@ class Matcher(TrainedNet):
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
         """Features of both sides after the last block, normalised by layer, not to unit length."""
+        points3d = batch.points3d
+        if self.principal:
+            points3d = points3d @ principal_axes(points3d, batch.mask3d)
         centre2d, radius2d = robust_frame(batch.points2d, batch.mask2d)
-        centre3d, radius3d = robust_frame(batch.points3d, batch.mask3d)
-        local2d, local3d = (batch.points2d - centre2d) / radius2d, (batch.points3d - centre3d) / radius3d
+        centre3d, radius3d = robust_frame(points3d, batch.mask3d)
+        local2d, local3d = (batch.points2d - centre2d) / radius2d, (points3d - centre3d) / radius3d
         where = torch.cat([centre2d, radius2d.log()], -1).expand(-1, local2d.shape[1], -1)
         x2d, x3d = self.enter2d(torch.cat([encode(local2d), where], -1)), self.enter3d(encode(local3d))
         if self.around2d is not None and self.around3d is not None:
@@ -130,19 +137,6 @@ class Matcher(TrainedNet):
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
         return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
-
-
-def robust_frame(
-    points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]
-) -> tuple[Float[Tensor, "b 1 d"], Float[Tensor, "b 1 1"]]:
-    """Median of each coordinate and median distance from it: half of the points may be clutter. Padding is not seen.
-
-    A set whose points coincide has radius one.
-    """
-    hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
-    centre = hidden.nanmedian(1, keepdim=True).values
-    radius = torch.linalg.vector_norm(hidden - centre, dim=-1).nanmedian(1).values[:, None, None]
-    return centre, torch.where(radius > 0, radius, 1)
 
 
 def encode(points: Float[Tensor, "b k d"]) -> Float[Tensor, "b k e"]:

@@ -4,13 +4,13 @@ from pathlib import Path
 import pytest
 import torch
 from planted import padded, plant
+from scipy.spatial.transform import Rotation
 from small_data import small_net
 from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.models import Matcher, TrainedNet
 from bpnp.models.composition import described
-from bpnp.models.matcher import robust_frame
 from bpnp.models.nets.attention import Attention, Neighbourhood
 from bpnp.training.losses import matching_likelihood_loss
 
@@ -70,15 +70,14 @@ def test_each_side_hears_of_the_other() -> None:
     assert (net.features(other)[0] - net.features(batch)[0]).abs().max() > 1e-3
 
 
-def test_half_of_the_points_may_lie_anywhere_without_moving_the_frame() -> None:
-    batch = cluttered(30)
-    far = batch.points3d.clone()
-    far[:, ::3] = 1e6
-    before, radius = robust_frame(batch.points3d, batch.mask3d)
-    after, far_radius = robust_frame(far, batch.mask3d)
-    spread = batch.points3d.std()
-    assert (after - before).abs().max() < 2 * spread
-    assert float(far_radius / radius) < 4
+def test_along_principal_axes_the_rotation_of_the_scene_does_not_matter() -> None:
+    given, batch = small(), cluttered(12, 20)
+    turn = Rotation.random(random_state=0).as_matrix()
+    turned = replace(batch, points3d=batch.points3d @ torch.from_numpy(turn).T)
+    assert (plan(given, turned) - plan(given, batch)).abs().max() > 1e-6
+    net = Matcher(channels=16, depth=2, heads=2, neighbours=3, principal=True).double().eval()
+    net.load_state_dict(given.state_dict())
+    torch.testing.assert_close(plan(net, turned), plan(net, batch), rtol=1e-4, atol=1e-8)
 
 
 def test_neighbourhoods_look_alike_at_every_scale_and_ignore_padding() -> None:
