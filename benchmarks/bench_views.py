@@ -2,7 +2,8 @@
 
 python benchmarks/bench_views.py --data ../shared/data --methods solve view-prior --outliers 0.5 0.75 1 castle-P30
 Methods: solve; view-prior (the first view's pose as `PosePrior`); rough-prior (4 degrees and 4 % of the distance off,
-2 s); bpnpnet and learned (the packaged networks); oracle (RANSAC on the true pairs). Photos are left out of their map.
+2 s); bpnpnet, matcher and learned (the packaged networks); oracle (RANSAC on the true pairs). Photos are left out of
+their map.
 """
 
 import argparse
@@ -62,7 +63,16 @@ def learned(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 def bpnpnet(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
     del time_limit
-    found = solve(pair.points2d, pair.points3d, solver=TrainedNet.from_pretrained("procedural-so3"), seed=seed)
+    return by_network(pair, "procedural-so3", seed)
+
+
+def matcher(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    del time_limit
+    return by_network(pair, "matcher-sfm", seed)
+
+
+def by_network(pair: ViewPair, weights: str, seed: int) -> Answer:
+    found = solve(pair.points2d, pair.points3d, solver=TrainedNet.from_pretrained(weights), seed=seed)
     return found.rotation, found.translation, found.verdict
 
 
@@ -78,7 +88,7 @@ def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 METHODS: dict[str, Callable[[ViewPair, int, float | None], Answer]] = {
     "solve": plain, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned, "bpnpnet": bpnpnet,
-    "oracle": oracle,
+    "matcher": matcher, "oracle": oracle,
 }  # fmt: skip
 
 
