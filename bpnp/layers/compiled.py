@@ -45,50 +45,36 @@ def conjugate_gradients(
 
 @compiled
 def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, total: Any) -> None:
-    """y = before . (K x) and total = K^T (after . y), four rows at a time.
+    """y = before . (K x) and total = K^T (after . y).
 
     kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; part (n,) is scratch memory. Sums of
     thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are made in the
     data's precision and added up in float64.
     """
-    m, n = kernel.shape
-    zero = part.dtype.type(0)
     total[:] = 0
     part[:] = 0
-    whole = m - m % 4
-    for i in range(0, whole, 4):
-        row0, row1, row2, row3 = kernel[i], kernel[i + 1], kernel[i + 2], kernel[i + 3]
-        dot0 = dot1 = dot2 = dot3 = 0.0
-        for start in range(0, n, SHORT_SUM):
-            sum0 = sum1 = sum2 = sum3 = zero
-            for j in range(start, min(start + SHORT_SUM, n)):
-                sum0 += row0[j] * x[j]
-                sum1 += row1[j] * x[j]
-                sum2 += row2[j] * x[j]
-                sum3 += row3[j] * x[j]
-            dot0 += sum0
-            dot1 += sum1
-            dot2 += sum2
-            dot3 += sum3
-        y[i], y[i + 1], y[i + 2], y[i + 3] = dot0, dot1, dot2, dot3
-        for k in range(i, i + 4):
-            y[k] *= before[k]
-        mean0, mean1 = after[i] * y[i], after[i + 1] * y[i + 1]
-        mean2, mean3 = after[i + 2] * y[i + 2], after[i + 3] * y[i + 3]
-        for j in range(n):
-            part[j] += (mean0 * row0[j] + mean1 * row1[j]) + (mean2 * row2[j] + mean3 * row3[j])
-        if i % SHORT_COLUMN == SHORT_COLUMN - 4:
-            _flush(part, total)
-    for i in range(whole, m):
+    for i in range(len(kernel)):
         row = kernel[i]
-        dot0 = 0.0
-        for j in range(n):
-            dot0 += row[j] * x[j]
-        y[i] = before[i] * dot0
-        mean0 = after[i] * y[i]
-        for j in range(n):
-            part[j] += mean0 * row[j]
+        y[i] = before[i] * _dot(row, x)
+        mean = after[i] * y[i]
+        for j in range(len(part)):
+            part[j] += mean * row[j]
+        if i % SHORT_COLUMN == SHORT_COLUMN - 1:
+            _flush(part, total)
     _flush(part, total)
+
+
+@compiled
+def _dot(row: Any, x: Any) -> float:
+    """row . x, both (n,). The loop is over slices: an index that might be negative is not made a vector instruction."""
+    total = 0.0
+    for start in range(0, len(x), SHORT_SUM):
+        some, factors = row[start : start + SHORT_SUM], x[start : start + SHORT_SUM]
+        short = x.dtype.type(0)
+        for j in range(len(some)):
+            short += some[j] * factors[j]
+        total += short
+    return total
 
 
 @compiled
