@@ -75,6 +75,7 @@ def anneal_on_points(
     ends = replace(
         starts, rotation=rotation, translation=translation, score=score, matched=result[:, 1], scale=result[:, 2],
         log10_false_alarms=np.full(len(starts), math.nan),
+        log10_rough=np.full(len(starts), math.nan),
     )  # fmt: skip
     return best_distinct(ends[:done], scene, done)
 

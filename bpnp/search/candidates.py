@@ -22,6 +22,7 @@ class Candidates:
     scale: (c,) standard deviation of the residuals per axis, radians, at which score and matched were taken.
     hits: (c,) batches whose own starts ended at this pose.
     log10_false_alarms: (c,) how likely chance fits as well (`bpnp.search.false_alarms`); NaN before it is weighed.
+    log10_rough: (c,) the same at scales far beyond that of the residuals.
     """
 
     rotation: NDArray[Any]
@@ -31,6 +32,7 @@ class Candidates:
     scale: NDArray[Any]
     hits: NDArray[np.int64]
     log10_false_alarms: NDArray[np.float64]
+    log10_rough: NDArray[np.float64]
 
     @classmethod
     def unscored(cls, rotation: NDArray[Any], translation: NDArray[Any], *, hits: int = 0) -> "Candidates":
@@ -44,6 +46,7 @@ class Candidates:
             zero,
             zero,
             np.full(c, hits, np.int64),
+            np.full(c, math.nan),
             np.full(c, math.nan),
         )
 

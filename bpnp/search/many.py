@@ -10,7 +10,7 @@ import numpy as np
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
-from bpnp.search.few.search import is_few, judged_few, search_few
+from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
@@ -62,7 +62,7 @@ def search_poses(
     start, rule, few = time.monotonic(), settings.evidence, Candidates.none()
     if is_few(sets) and not deadline.passed():
         few, exhausted = search_few(sets, deadline, settings)
-        result = judged_few(sets, few, settings)
+        result = judged(few, sets, batches=0, exhaustive=True, rule=rule)
         if progress is not None:
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
@@ -132,5 +132,8 @@ def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> t
     """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
     count = scene.settings.finished
     leaders = with_false_alarms(in_user_frame(candidates[:count], scene), sets)
-    alarms = np.concatenate([leaders.log10_false_alarms, candidates.log10_false_alarms[count:]])
-    return replace(candidates, log10_false_alarms=alarms), weighed(leaders, sets, scene.settings.evidence)
+    known = {
+        name: np.concatenate([getattr(leaders, name), getattr(candidates, name)[count:]])
+        for name in ("log10_false_alarms", "log10_rough")
+    }
+    return replace(candidates, **known), weighed(leaders, sets, scene.settings.evidence)

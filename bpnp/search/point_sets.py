@@ -2,15 +2,18 @@
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import turned_by
-from bpnp.search.starts import GravityPrior, Prior
+from bpnp.search.image_statistics import ImageStatistics
+from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two pairs fix a pose
 SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
 LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
 
@@ -46,6 +49,17 @@ class PointSets:
         cosines = np.zeros(len(self.normals3d)) if self.cosines3d is None else self.cosines3d
         return np.column_stack([self.normals3d, cosines])
 
+    @cached_property
+    def image(self) -> ImageStatistics:
+        """What depends on the image alone, computed when it is first asked for."""
+        return ImageStatistics(self.bearings, self.floor)
+
+    @property
+    def pairs_that_fix(self) -> int:
+        """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
+        turned = isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
+        return 2 if turned or isinstance(self.prior, GravityPrior) else 3
+
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
 
@@ -67,7 +81,7 @@ class PointSets:
             distance = max(float(np.linalg.norm(expected)), 1e-12)
             shift = float(np.linalg.norm(rotation @ middle + translation - expected))
             relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
-            share *= min(1.0, math.pi * relative**2 / solid_angle(self.bearings)) * min(1.0, 2 * relative / LOG_DEPTHS)
+            share *= min(1.0, math.pi * relative**2 / self.image.solid_angle) * min(1.0, 2 * relative / LOG_DEPTHS)
         return math.log10(share)
 
 
@@ -77,16 +91,6 @@ def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Ar
     if cosines3d is None:
         return np.asarray(towards > 0)
     return np.asarray(towards > cosines3d * np.linalg.norm(camera, axis=-1))
-
-
-def solid_angle(bearings: Array, *, ddof: int = 1) -> float:
-    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most.
-
-    ddof: 1 for the variances of what few bearings are a sample of, 0 for those of the bearings themselves.
-    """
-    centred = bearings - bearings.mean(0)
-    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - ddof, 1))[1:]
-    return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
 
 
 def _angle(a: Array, b: Array) -> float:

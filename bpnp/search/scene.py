@@ -8,9 +8,10 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
+from bpnp.search.image_statistics import solid_angle
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
-from bpnp.search.point_sets import PointSets, solid_angle
+from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread
 

@@ -117,8 +117,7 @@ class Evidence:
     exhaustive search stayed above 1 in 999 of 1000 cases, and never came below 0.1.
     lead: by which every different pose must have more. other_deg, other_shift: poses with rotations farther apart, or
     translations by this share of their length, are different.
-    loose_deg: standard deviation of the rotation about its least certain axis; few points that fix it less well than
-        this leave the verdict ambiguous.
+    loose_deg: error of the rotation about its least certain axis that is exceeded once in a thousand, at most.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
     first four have 720 starts, of which 5 are within 30 degrees of any rotation. Of so many batches well_matched_hits
     are enough where the share well_matched is matched: it leaves a better pose little to explain. Or
@@ -130,9 +129,9 @@ class Evidence:
 
     false_alarms: float = -2.0
     lead: float = 2.0
-    other_deg: float = 5.0
-    other_shift: float = 0.1
-    loose_deg: float = 0.8
+    other_deg: float = 2.0
+    other_shift: float = 0.05
+    loose_deg: float = 3.0
     hits: int = 4
     well_matched: float = 0.6
     well_matched_hits: int = 2

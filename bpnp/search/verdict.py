@@ -1,9 +1,10 @@
 """When a search stops, and what it says about its best pose: all of it is here.
 
 The currency is the number of false alarms (`bpnp.search.false_alarms`): how many poses would fit as well if the image
-had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`, every different pose has at least
-1 / `Evidence.lead` times as many, and no search elsewhere is missing. "ambiguous": better than chance, but one of the
-conditions is not met. "failed": no pose, or none better than chance.
+had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`; every different pose has at least
+1 / `Evidence.lead` times as many, and the same one taken roughly no fewer; no search elsewhere is missing; and the
+matches fix the rotation. "ambiguous": better than chance, but one of the conditions is not met. "failed": no pose, or
+none better than chance.
 """
 
 import math
@@ -15,10 +16,12 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.search.candidates import Candidates
-from bpnp.search.false_alarms import log10_false_alarms_of
-from bpnp.search.point_sets import PointSets, solid_angle
+from bpnp.search.false_alarms import alarms_of
+from bpnp.search.image_statistics import solid_angle
+from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
+from bpnp.search.uncertainty import rotation_bound
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 
@@ -56,10 +59,11 @@ class SearchResult:
 
 def with_false_alarms(candidates: Candidates, sets: PointSets) -> Candidates:
     """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
-    alarms = candidates.log10_false_alarms.copy()
+    alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
-    alarms[new] = log10_false_alarms_of(sets, candidates.rotation[new], candidates.translation[new])
-    return replace(candidates, log10_false_alarms=alarms)
+    unknown = candidates[new]
+    alarms[new], rough[new] = alarms_of(sets, unknown.rotation, unknown.translation, unknown.scale)
+    return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
 
 
 def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> Candidates:
@@ -111,7 +115,13 @@ def is_certain(
     repeated = int(candidates.hits[0]) >= (rule.well_matched_hits if well_matched else rule.hits)
     found = exhaustive or repeated or is_unique(candidates, sets, rule)
     chance = float(candidates.log10_false_alarms[0]) <= rule.false_alarms
-    return chance and found and lead(candidates, sets, rule)[0] >= rule.lead
+    return chance and found and not is_rough(candidates) and lead(candidates, sets, rule)[0] >= rule.lead
+
+
+def is_rough(candidates: Candidates) -> bool:
+    """Whether the points agree with the best pose better at scales far beyond that of its residuals: what its matches
+    say of it beyond a rough alignment is then no more than chance."""
+    return bool(candidates.log10_rough[0] < candidates.log10_false_alarms[0])
 
 
 def is_unique(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> bool:
@@ -146,7 +156,11 @@ def judged(
     candidates = weighed(candidates, sets, rule)
     alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
     chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
-    if is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches):
+    count = float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
+    pose = candidates.rotation[0], candidates.translation[0]
+    off = math.degrees(rotation_bound(sets, *pose, float(candidates.scale[0]), count))
+    certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches)
+    if certain and off <= rule.loose_deg:
         return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
@@ -155,6 +169,10 @@ def judged(
         reason = f"{chance}, but a pose {degrees:.0f} deg away fits about as well ({_number(ahead)} times the number)"
     elif alarms > rule.false_alarms:
         reason = f"{chance}: too many to be sure"
+    elif is_rough(candidates):
+        reason = f"{chance}, but the points agree with it better at residuals far larger than those of its matches"
+    elif certain:
+        reason = f"{chance}, but so few and near matches leave its rotation loose: it may be {off:.1f} deg off"
     else:
         reason = f"{chance}, but too few batches of starts came upon this pose to be sure that no better one was missed"
     return SearchResult(candidates, "ambiguous", reason, batches)

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.false_alarms import log10_false_alarms, log10_false_alarms_of
+from bpnp.search.false_alarms import alarms_of, log10_false_alarms
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -70,9 +70,9 @@ def test_poses_together_have_the_evidence_of_each_alone() -> None:
     sets = PointSets(rays, points)
     turns, shifts = np.stack([rotation, np.eye(3), rotation]), np.stack([SHIFT, SHIFT, -SHIFT])
     alone = [log10_false_alarms(sets, r, t) for r, t in zip(turns, shifts, strict=True)]
-    assert log10_false_alarms_of(sets, turns, shifts).tolist() == alone
+    assert alarms_of(sets, turns, shifts).own.tolist() == alone
     assert alone[0] < -10 < 0 < alone[1]
-    assert log10_false_alarms_of(sets, turns[:0], shifts[:0]).shape == (0,)
+    assert alarms_of(sets, turns[:0], shifts[:0]).own.shape == (0,)
 
 
 def test_it_does_not_depend_on_the_frame_or_unit_of_the_scene() -> None:

@@ -14,7 +14,7 @@ from bpnp.search.few.adjustment import refine
 from bpnp.search.few.matching import evidence, match
 
 compiled = compiler(error_model="numpy", boundscheck=False)
-SAME = 1 + 2 * math.cos(math.radians(3.0))  # trace of the turn between two poses that are the same
+SAME = 1 + 2 * math.cos(math.radians(2.0))  # trace of the turn between two poses that are the same
 SAME_SHIFT, SAME_DEPTH = 0.1, 0.05  # of the scene's extent and of its distance
 TIGHTER, FINAL = 0.55, 3  # factor of the radius from one step of a refinement to the next, and steps at the last
 BEHIND = 1.0  # matches that a hypothesis may have less than any other had, to be refined
@@ -40,9 +40,16 @@ def try_pose(
 ) -> None:
     """Refine the pose in `work`, on matches within a radius that shrinks to the one that exceeds chance most, and keep
     it."""
+    if tightened(work[2], rays, scene, image, reach, 1.0, prior, work):
+        settle(rays, scene, image, used, density, prior, found, work)
+
+
+@compiled
+def settle(
+    rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any
+) -> None:  # fmt: skip
+    """Keep the pose in `work`, and what becomes of it on matches within the radius that exceeds chance most."""
     pose, matched, distance2 = work[2], work[3], work[4]
-    if not tightened(pose, rays, scene, image, reach, 1.0, prior, work):
-        return
     for turn in range(2):
         count, visible, expected = match(pose, 1.0, scene, image, matched, distance2)
         if count <= used:

@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays, onto_z
+from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
 SIGMAS = 4.0  # of a prior, beyond which no pose is looked for
 WEIGHT = 0.1  # radii that one standard deviation of a prior weighs as much as: noise is a tenth to a third of a radius
-TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two pairs fix a pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,12 +34,6 @@ class Knowledge:
     log_share: float
 
 
-def pairs_that_fix(prior: Prior | None) -> int:
-    """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
-    turned = isinstance(prior, PosePrior) and prior.rotation_sigma_deg <= TURNED_DEG
-    return 2 if turned or isinstance(prior, GravityPrior) else 3
-
-
 def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
     """Rotation and translation, if the prior tells both."""
     if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
@@ -47,8 +41,9 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
     return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
 
 
-def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) -> Knowledge:
+def knowledge_of(sets: PointSets, scene: SceneArrays, image: ImageArrays) -> Knowledge:
     """The prior, around the centre of the scene and in its unit, and in the frame of the image's rays."""
+    prior = sets.prior
     directions, place, turned = np.empty((0, 8)), np.array([0, 0, 0, math.inf]), np.zeros(11)
     upright = np.empty((0, 3)), np.empty((0, 3)), np.eye(3), np.eye(3)
     if isinstance(prior, GravityPrior):
@@ -72,7 +67,7 @@ def knowledge_of(prior: Prior | None, scene: SceneArrays, image: ImageArrays) ->
     allowed = min(SIGMAS * sigma, math.pi)
     log_share = math.log((allowed - math.sin(allowed)) / math.pi)
     return Knowledge(
-        directions, place, turned, upright, pairs_that_fix(prior), log_share
+        directions, place, turned, upright, sets.pairs_that_fix, log_share
     )  # fmt: skip
 
 

@@ -111,7 +111,7 @@ def enumerate_poses(
     lookup = _lookup(prior, scene, radius, settings)
     image = ImageArrays(sets.bearings, radius, sets.labels2d, lookup)
     symmetries = near_symmetries(sets.points3d)
-    run = Enumeration(scene, image, knowledge_of(prior, scene, image), settings.kept, lookup)
+    run = Enumeration(scene, image, knowledge_of(sets, scene, image), settings.kept, lookup)
 
     def vary() -> None:
         run.vary_best()

@@ -8,26 +8,25 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.knowledge import pairs_that_fix, predicted_pose
+from bpnp.search.few.knowledge import predicted_pose
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
-from bpnp.search.point_sets import PointSets, solid_angle
+from bpnp.search.image_statistics import solid_angle
+from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
-from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.search.verdict import SearchResult, is_certain, judged, weighed
+from bpnp.search.verdict import is_certain, weighed
 
 Array = NDArray[np.float64]
 FEW_PAIRS = 4000  # pairs of an image point and a scene point up to which near triples are enumerated: 60 x 60
 KNOWN_PAIRS = 250_000  # the same where a prior lets two pairs fix a pose
 FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels where that is a tenth of one
 RADIUS = 3e-3  # radians, where no scale is known
-MATCHED_SCALES = 3.0  # distance of a matched point, in scales of the residuals
 NEAR_NATS = 25.0  # of evidence: a pose that has so much less than the best is no rival
 
 
 def is_few(sets: PointSets) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
     pairs = len(sets.bearings) * len(sets.points3d)
-    return pairs <= (FEW_PAIRS if pairs_that_fix(sets.prior) == 3 else KNOWN_PAIRS)
+    return pairs <= (FEW_PAIRS if sets.pairs_that_fix == 3 else KNOWN_PAIRS)
 
 
 def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
@@ -47,7 +46,7 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
 
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
     tracked = predicted_pose(sets.prior) is not None
-    near = tracked and pairs_that_fix(sets.prior) == 2
+    near = tracked and sets.pairs_that_fix == 2
     chosen = SETTINGS._replace(stages=()) if near else SETTINGS
     found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
     candidates = _candidates(found, sets, settings)
@@ -56,56 +55,6 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
     free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
     candidates = Candidates.concatenated([candidates, _candidates(free, sets, settings)])
     return candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]], free.exhausted
-
-
-def judged_few(sets: PointSets, few: Candidates, settings: SearchSettings) -> SearchResult:
-    """The verdict on enumerated poses; one that its matches leave loose is ambiguous: its neighbours fit as well."""
-    result = judged(few, sets, batches=0, exhaustive=True, rule=settings.evidence)
-    if result.verdict != "confident":
-        return result
-    # The scale itself is uncertain: of so few residuals it may be half of what it should be.
-    count = float(result.candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
-    measured = max(2 * count - 2 * pairs_that_fix(sets.prior), 1.0)
-    scale = result.residual * (1 + 1 / math.sqrt(measured))
-    sigma = math.degrees(rotation_sigma(sets, *result.best, scale))
-    if sigma <= settings.evidence.loose_deg:
-        return result
-    reason = f"the pose fits, but so few and near matches leave its rotation loose: {sigma:.1f} deg, one sigma"
-    return replace(result, verdict="ambiguous", reason=reason)
-
-
-def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: float) -> float:
-    """Standard deviation of the rotation about its least certain axis, radians, from noise of `scale` radians.
-
-    (J^T J)^-1 scale^2 of the directions of the matched points, J by the turn and the shift of the points' middle, with
-    what the prior adds; infinite if the matches do not fix the pose.
-    """
-    turned = sets.points3d @ rotation.T
-    camera = turned + translation
-    depth = np.linalg.norm(camera, axis=-1)
-    seen = camera / depth[:, None]
-    if sets.normals3d is not None:
-        seen[(seen * (sets.normals3d @ rotation.T)).sum(-1) >= 0] = np.inf
-    near = np.linalg.norm(sets.bearings[:, None] - seen, axis=-1)
-    partner = near.argmin(1)
-    partner = np.unique(partner[near.min(1) < MATCHED_SCALES * scale])
-    if not len(partner):
-        return math.inf
-    u, p = seen[partner], turned[partner] - turned[partner].mean(0)
-    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[partner, None, None]
-    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1).reshape(-1, 6)
-    information = jacobian.T @ jacobian / scale**2
-    prior = sets.prior
-    if isinstance(prior, GravityPrior):
-        up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
-        information[:3, :3] += (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
-    elif isinstance(prior, PosePrior):
-        information[:3, :3] += np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
-    # The shift is eliminated; what is left of the rotation's information has the least certain axis' eigenvalue.
-    shift = information[3:, 3:] + 1e-12 * np.trace(information[3:, 3:]) * np.eye(3)
-    rest = information[:3, :3] - information[:3, 3:] @ np.linalg.solve(shift, information[3:, :3])
-    least = float(np.linalg.eigvalsh(rest)[0])
-    return 1 / math.sqrt(least) if least > 0 else math.inf
 
 
 def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
@@ -125,6 +74,7 @@ def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> C
         scale=scale,
         hits=np.zeros(len(rotation), np.int64),
         log10_false_alarms=np.full(len(rotation), math.nan),
+        log10_rough=np.full(len(rotation), math.nan),
     )
 
 

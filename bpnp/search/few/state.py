@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays
 from bpnp.search.few.enumeration import sweep
+from bpnp.search.few.exchange import exchange
 from bpnp.search.few.kept import try_pose
 from bpnp.search.few.knowledge import Knowledge
 from bpnp.search.few.matching import RADII
@@ -91,12 +92,17 @@ class Enumeration:
         return int(place)
 
     def vary_best(self) -> None:
-        """Refine the best pose again on other matches, and its mirror twin: its nearly flat matched points seen at the
-        opposite tilt."""
+        """Refine the best pose again on wider and on other matches, and its mirror twin: its nearly flat matched points
+        seen at the opposite tilt."""
         if not math.isfinite(self.best):
             return
         for reach in (0.5 * self.widest, self.widest):
             self.refine(self.found[0][int(self.found[1].argmax())], reach)
+        best = int(self.found[1].argmax())
+        exchange(
+            self.found[0][best].copy(), self.found[3][best].copy(), self.image.rays, self.scene.arrays,
+            self.image.arrays, self.used, self.image.density, self.known.directions, self.found, self.work,
+        )  # fmt: skip
         best = int(self.found[1].argmax())
         matched = self.found[3][best]
         seen = self.scene.arrays[0][matched[matched >= 0]]

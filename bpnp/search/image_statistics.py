@@ -1,0 +1,76 @@
+"""What depends on the image points alone and not on a pose: their view, their scales, and how many lie together."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+
+SCALE_STEP = 2.0  # from one scale of the residuals to the next
+COARSEST = 0.5  # largest scale, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
+FLOOR = 2e-4  # smallest scale in spreads of the bearings: some hundredths of a pixel of an ordinary camera
+TOGETHER = 2.0  # distance in scales below which image points are one observation
+MOST_NEIGHBOURS = 64  # that are looked up around one point
+MOST_POINTS = 2000  # image points that are looked at, evenly spread over the given ones
+
+
+class ImageStatistics:
+    """Of bearings (m, 3).
+
+    centre: their mean (3,). spread: root mean square distance from it. axes: (3, 2) principal axes on the tangent
+    plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians.
+    scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
+    chosen: (k,) places of the image points that are looked at. together: (k, S) how many lie within `TOGETHER` scales.
+    """
+
+    def __init__(self, bearings: Array, floor: float | None) -> None:
+        m = len(bearings)
+        self.centre = bearings.mean(0)
+        centred = bearings - self.centre
+        self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
+        variance, axes = np.linalg.eigh(centred.T @ centred / max(m - 1, 1))
+        self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
+        self.solid_angle = solid_angle(bearings)
+        smallest = max(floor or 0.0, FLOOR * self.spread)
+        largest = max(COARSEST * math.sqrt(self.solid_angle / m), 2 * smallest)
+        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
+        self.scales = np.geomspace(smallest, largest, steps)
+        self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
+        crowd = nearest(bearings, bearings[self.chosen], TOGETHER * largest)
+        self.together = (crowd[:, None] <= TOGETHER * self.scales[:, None]).sum(-1)
+
+
+def solid_angle(bearings: Array, *, ddof: int = 1) -> float:
+    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most.
+
+    ddof: 1 for the variances of what few bearings are a sample of, 0 for those of the bearings themselves.
+    """
+    centred = bearings - bearings.mean(0)
+    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - ddof, 1))[1:]
+    return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
+
+
+def nearest(directions: Array, bearings: Array, radius: float) -> Array:
+    """Chords (k, l) from each bearing to its nearest directions, ascending; infinite beyond `radius`."""
+    if not len(directions):
+        return np.full((len(bearings), 1), np.inf)
+    count = min(len(directions), MOST_NEIGHBOURS)
+    # The bound excludes what lies at it.
+    chords = cKDTree(directions).query(bearings, count, distance_upper_bound=radius * (1 + 1e-9))[0]
+    return np.asarray(chords).reshape(len(bearings), -1)
+
+
+def label_groups(
+    chosen: Labels, labels2d: Labels | None, labels3d: Labels | None, n: int
+) -> list[tuple[Labels, Labels]]:
+    """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
+    if labels2d is None or labels3d is None:
+        return [(np.arange(len(chosen)), np.arange(n))]
+    own = labels2d[chosen]
+    return [
+        (np.flatnonzero(own == label), np.flatnonzero((labels3d == label) | (labels3d == -1) | (label == -1)))
+        for label in np.unique(own).tolist()
+    ]

@@ -1,0 +1,113 @@
+"""How well points fix a pose: the standard deviation of its rotation, and a bound that allows for few residuals."""
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import stdtrit
+
+from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.starts import GravityPrior, PosePrior
+
+Array = NDArray[np.float64]
+FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
+NEIGHBOURS = 16  # of an image point that may be
+OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
+EXCEEDED = 1e-3  # probability that the rotation is farther off than its bound, to either side
+
+
+def rotation_bound(sets: PointSets, rotation: Array, translation: Array, scale: float, count: float) -> float:
+    """Angle, radians, that the error about the least certain axis exceeds once in a thousand.
+
+    scale: standard deviation of the residuals, radians, estimated from `count` matches. The bound is sigma times the
+    quantile of Student's t with the degrees of freedom that the estimate had: 2 count, less those that were fitted.
+
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform(-1, 1, (12, 3))
+    >>> seen = points + [0, 0, 6]
+    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> bounds = [rotation_bound(sets, np.eye(3), np.array([0.0, 0, 6]), 1e-3, count) for count in (4.0, 12.0)]
+    >>> [round(math.degrees(bound), 1) for bound in bounds]
+    [5.1, 0.6]
+    """
+    free = 2 * count - 2 * sets.pairs_that_fix
+    if free <= 0:
+        return math.inf
+    return rotation_sigma(sets, rotation, translation, scale) * float(stdtrit(free, 1 - EXCEEDED / 2))
+
+
+def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: float) -> float:
+    """Standard deviation of the rotation about its least certain axis, radians, from noise of `scale` radians.
+
+    Image point i has scene point j as its partner with the probability p_ij. With J_ij the derivative of the direction
+    u_j by the turn and the shift, and the scores g_ij = J_ij^T (f_i - u_j) / s^2, g_i = sum_j p_ij g_ij, the observed
+    information is (Louis 1982)
+
+        H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
+
+    where scene points lie as close as the residuals, what their partners leave open is subtracted. The larger of H^-1
+    and the sandwich H^-1 (sum_i g_i g_i^T) H^-1 (White 1982) counts, which allows for residuals that are not as the
+    model says. Infinite if the points do not fix the pose.
+
+    Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
+    H. White, Maximum likelihood estimation of misspecified models, Econometrica 1982.
+    """
+    turned = sets.points3d @ rotation.T
+    camera = turned + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    used = depth > 0
+    if sets.normals3d is not None:
+        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
+    places = np.flatnonzero(used)
+    if not len(places):
+        return math.inf
+    turned, depth, seen = turned[places], depth[places], camera[places] / depth[places, None]
+    chosen = sets.image.chosen
+    i, j, probability = _partners(sets, seen, scale)
+    if not len(i):
+        return math.inf
+    p, u = turned[j] - np.median(turned, 0), seen[j]
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
+    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
+    score = np.einsum("kab,ka->kb", jacobian, (sets.bearings[chosen[i]] - u) / scale)
+    weighed = probability[:, None, None] * jacobian
+    complete = np.einsum("kab,kac->bc", weighed, jacobian)
+    expected = np.zeros((len(chosen), 6))
+    np.add.at(expected, i, probability[:, None] * score)
+    between = expected.T @ expected
+    share = len(sets.bearings) / len(chosen)
+    known = _known(sets)
+    observed = share * (complete - (probability[:, None] * score).T @ score + between) + known
+    # In units in which the complete information is one, so that its rank can be told.
+    unit = 1 / np.sqrt(np.maximum(np.diag(share * complete + known), 1e-300))
+    values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
+    if values[0] <= 1e-9:
+        return math.inf
+    inverse = unit[:, None] * ((vectors / values) @ vectors.T) * unit
+    sandwich = inverse @ (share * between + known) @ inverse
+    return math.sqrt(max(float(np.linalg.eigvalsh(v[:3, :3])[-1]) for v in (inverse, sandwich)))
+
+
+def _partners(sets: PointSets, seen: Array, scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+    """Pairs (k,) of a chosen image point and a seen scene point (n, 3) near it, and the probability of each."""
+    bearings = sets.bearings[sets.image.chosen]
+    count = min(NEIGHBOURS, len(seen))
+    distance, nearest = cKDTree(seen).query(bearings, count, distance_upper_bound=FARTHEST * scale)
+    distance, nearest = distance.reshape(len(bearings), -1), nearest.reshape(len(bearings), -1)
+    density = np.exp(-0.5 * (distance / scale) ** 2) * (1 - OUTLIERS) / (len(seen) * 2 * math.pi * scale**2)
+    probability = density / (density.sum(1, keepdims=True) + OUTLIERS / sets.image.solid_angle)
+    i, nth = np.nonzero(np.isfinite(distance))
+    return i, nearest[i, nth].astype(np.int64), probability[i, nth]
+
+
+def _known(sets: PointSets) -> Array:
+    """The information (6, 6) that a prior has about turn and shift; what it knows of the translation is left out."""
+    information, prior = np.zeros((6, 6)), sets.prior
+    if isinstance(prior, GravityPrior):
+        up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
+        information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
+    elif isinstance(prior, PosePrior):
+        information[:3, :3] = np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
+    return information
