@@ -12,7 +12,7 @@ from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
-NEIGHBOURS = 16  # of an image point that may be
+NEIGHBOURS = 64  # of an image point that may be
 OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
 EXCEEDED = 1e-3  # probability that the rotation is farther off than its bound, to either side
 
