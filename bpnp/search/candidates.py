@@ -21,8 +21,8 @@ class Candidates:
     matched: (c,) expected share of min(m, n) points that have a partner.
     scale: (c,) standard deviation of the residuals per axis, radians, at which score and matched were taken.
     hits: (c,) batches whose own starts ended at this pose.
-    log10_false_alarms: (c,) how likely chance fits as well (`bpnp.search.false_alarms`); NaN before it is weighed.
-    log10_rough: (c,) the same at scales far beyond that of the residuals.
+    log10_false_alarms: (c,) how likely chance fits as well (`bpnp.search.evidence.false_alarms`), log10_rough: the same
+        at scales far beyond that of the residuals; NaN before they are weighed.
     """
 
     rotation: NDArray[Any]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import turned_by
-from bpnp.search.image_statistics import ImageStatistics
+from bpnp.search.evidence.image_statistics import ImageStatistics
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.image_statistics import solid_angle
+from bpnp.search.evidence.image_statistics import solid_angle
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets

@@ -1,10 +1,10 @@
 """When a search stops, and what it says about its best pose: all of it is here.
 
-The currency is the number of false alarms (`bpnp.search.false_alarms`): how many poses would fit as well if the image
-had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`; every different pose has at least
-1 / `Evidence.lead` times as many, and the same one taken roughly no fewer; no search elsewhere is missing; and the
-matches fix the rotation. "ambiguous": better than chance, but one of the conditions is not met. "failed": no pose, or
-none better than chance.
+The currency is the number of false alarms (`bpnp.search.evidence.false_alarms`): how many poses would fit as well if
+the image had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`; every different pose has at
+least 1 / `Evidence.lead` times as many, and the same one taken roughly no fewer; no search elsewhere is missing; and
+the matches fix the rotation. "ambiguous": better than chance, but one of the conditions is not met. "failed": no pose,
+or none better than chance.
 """
 
 import math
@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.search.candidates import Candidates
-from bpnp.search.false_alarms import alarms_of
-from bpnp.search.image_statistics import solid_angle
+from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.image_statistics import solid_angle
+from bpnp.search.evidence.uncertainty import rotation_bound
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
-from bpnp.search.uncertainty import rotation_bound
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.false_alarms import alarms_of, log10_false_alarms
+from bpnp.search.evidence.false_alarms import alarms_of, log10_false_alarms
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 

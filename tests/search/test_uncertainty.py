@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
+from bpnp.search.evidence.uncertainty import OUTLIERS, rotation_bound, rotation_sigma
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.search.uncertainty import OUTLIERS, rotation_bound, rotation_sigma
 from bpnp.solving.matches import fit_pose
 
 Array = NDArray[np.float64]

@@ -8,9 +8,9 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.image_statistics import solid_angle
 from bpnp.search.few.knowledge import predicted_pose
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
-from bpnp.search.image_statistics import solid_angle
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.verdict import is_certain, weighed

@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays
 from bpnp.search.few.enumeration import sweep
-from bpnp.search.few.exchange import exchange
-from bpnp.search.few.kept import try_pose
+from bpnp.search.few.kept import exchange, try_pose
 from bpnp.search.few.knowledge import Knowledge
 from bpnp.search.few.matching import RADII
 from bpnp.search.few.pairs import sweep_pairs

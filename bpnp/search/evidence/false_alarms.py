@@ -34,7 +34,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.compilation import compiler
-from bpnp.search.image_statistics import ImageStatistics, label_groups, nearest
+from bpnp.search.evidence.image_statistics import ImageStatistics, label_groups, nearest
 from bpnp.search.point_sets import PointSets, faces
 
 Array = NDArray[np.float64]
