@@ -21,6 +21,10 @@ def main(args: Sequence[str] | None = None) -> None:
     _quieten()
     try:
         _run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:  # the reader of a pipe, such as head, has what it wants
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(0) from None
     except (ValueError, OSError) as error:
         if os.environ.get("BPNP_TRACEBACK"):
             raise

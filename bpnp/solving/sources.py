@@ -1,6 +1,7 @@
 """Where the candidate poses of a solution come from: the search, a trained module, or one after the other."""
 
 import copy
+import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
@@ -18,12 +19,15 @@ from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
 from bpnp.solving.problem import Array, Problem
+from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
 from bpnp.types import Batch
 
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
 GPU_PAIRS, GPU_CELLS = 64, 2**26  # solved together by a module: pairs, and pairs x 2D points x 3D points
+
+WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
 
 Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, seconds
 
@@ -52,9 +56,34 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
         if problem.degenerate is not None
     }
     rest = {i: problem for i, problem in problems.items() if i not in solutions}
+    if options.solver is None and not any(isinstance(problem.prior, nn.Module) for problem in rest.values()):
+        return solutions | dict(_shared(rest, options))
     for i, result, seconds in (_searched if options.solver is None else _predicted)(rest, options):
         solutions[i] = finished(problems[i], result, seconds, options.inlier_threshold)
     return solutions
+
+
+def _shared(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
+    """Number and solution of each problem, of the search: in as many processes as torch has threads, where that pays.
+
+    The first one is solved here: it compiles what all need, and tells how long one takes.
+    """
+
+    def solved(i: int, tell: Progress) -> Solution:
+        ((_, result, seconds),) = _searched({i: problems[i]}, options._replace(progress=tell if listening else None))
+        return finished(problems[i], result, seconds, options.inlier_threshold)
+
+    listening, tell = options.progress is not None, options.progress or (lambda *_: None)
+    first, *others = problems or (None,)
+    if first is None:
+        return
+    solution = solved(first, tell)
+    yield first, solution
+    workers = 1 if multiprocessing.current_process().daemon else torch.get_num_threads()  # which may have no children
+    if workers > 1 and len(others) > 1 and solution.seconds * len(others) > WORTH_FORKING:
+        yield from in_processes(solved, others, workers, tell)
+    else:
+        yield from ((i, solved(i, tell)) for i in others)
 
 
 def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:

@@ -1,5 +1,7 @@
 import contextlib
 import inspect
+import subprocess
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -83,6 +85,18 @@ def test_a_users_mistake_is_one_clear_error(
     if arguments[:1] in (["fit"], ["test"]) and len(arguments) > 1:
         arguments = [*arguments, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     assert message in fails(arguments, capsys)
+
+
+def test_a_reader_that_leaves_is_no_error() -> None:
+    """As `bpnp --help | head -1` does."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "bpnp", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    process.stdout.close()
+    _, error = process.communicate(timeout=60)
+    assert error == ""
+    assert process.returncode == 0
 
 
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:

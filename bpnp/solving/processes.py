@@ -1,0 +1,86 @@
+"""Pairs shared among processes: much of a search is Python, which threads would run one after the other."""
+
+import multiprocessing
+import multiprocessing.process
+import signal
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any, TypeVar
+
+import torch
+
+Result = TypeVar("Result")
+
+
+def in_processes(
+    work: Callable[[int, Callable[..., None]], Result], items: Sequence[int], count: int, tell: Callable[..., None]
+) -> Iterator[tuple[int, Result]]:
+    """work(item, tell) of all items in `count` forks of this process, each with one thread; in the order they end.
+
+    Each takes the next item when it is done with one. tell: called in this process with the arguments of each call in
+    a worker. Raises what a worker raises, and RuntimeError if one is killed; all of them end with the iteration.
+    """
+    context = multiprocessing.get_context("fork")
+    ticket = context.Value("q", 0)
+    workers: dict[Any, multiprocessing.process.BaseProcess] = {}
+    try:
+        for _ in range(min(count, len(items))):
+            here, there = context.Pipe(duplex=False)
+            worker = context.Process(target=_run, args=(work, items, ticket, there), daemon=True)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # other threads: none has a lock that workers take
+                worker.start()
+            there.close()  # else its end would not be seen
+            workers[here] = worker
+        left = len(items)
+        while left:
+            for connection in wait(list(workers)):
+                kind, content = _received(connection)
+                if kind == "told":
+                    tell(*content)
+                elif kind == "failed":
+                    raise content
+                elif kind == "done":
+                    left -= 1
+                    yield content
+                    if not left:
+                        return
+                else:
+                    ended = workers.pop(connection)
+                    ended.join()
+                    if ended.exitcode or not workers:
+                        raise RuntimeError(
+                            f"a process that solved pairs ended with status {ended.exitcode}, possibly out of memory; "
+                            "try fewer threads (torch.set_num_threads, OMP_NUM_THREADS)"
+                        )
+    finally:
+        for each in workers.values():
+            each.kill()  # a library may have replaced the handler of SIGTERM
+            each.join()
+
+
+def _received(connection: Any) -> tuple[str, Any]:
+    try:
+        received: tuple[str, Any] = connection.recv()
+    except EOFError:
+        return "ended", None
+    return received
+
+
+def _run(work: Callable[..., Any], items: Sequence[int], ticket: Any, results: Connection) -> None:
+    """Work on the next item until there is none."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    torch.set_num_threads(1)
+    try:
+        while True:
+            with ticket.get_lock():
+                place, ticket.value = ticket.value, ticket.value + 1
+            if place >= len(items):
+                return
+            result = work(items[place], lambda *content: results.send(("told", content)))
+            results.send(("done", (items[place], result)))
+    except BrokenPipeError:  # the parent is gone
+        return
+    except Exception as error:  # noqa: BLE001, raised again by the parent
+        results.send(("failed", error))

@@ -1,0 +1,88 @@
+"""Many pairs in several processes: the same solutions, nothing lost, no process left."""
+
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+import bpnp
+from bpnp.examples import load
+from bpnp.solving import sources
+from bpnp.solving.processes import in_processes
+
+EXAMPLES = [load("photo", seed=seed) for seed in range(6)]
+SETS = [e.points2d for e in EXAMPLES], [e.points3d for e in EXAMPLES], [e.camera for e in EXAMPLES]
+
+
+@pytest.fixture
+def threads(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Two threads, and processes however little there is to do."""
+    monkeypatch.setattr(sources, "WORTH_FORKING", 0.0)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(before)
+
+
+def alike(one: bpnp.Solution, other: bpnp.Solution) -> bool:
+    same = np.array_equal(one.rotation, other.rotation) and np.array_equal(one.translation, other.translation)
+    return same and np.array_equal(one.matches, other.matches) and one.reason == other.reason
+
+
+def test_solutions_are_those_of_single_calls_whatever_the_number_of_threads(threads: None) -> None:
+    shared = bpnp.solve_many(*SETS)
+    torch.set_num_threads(1)
+    single = [bpnp.solve(*pair) for pair in zip(*SETS, strict=True)]
+    assert all(map(alike, shared, single))
+    for example, solution in zip(EXAMPLES, shared, strict=True):
+        assert example.rotation_error_deg(solution.rotation) < 0.5
+
+
+def test_progress_is_told_of_every_pair_in_the_process_that_asks(threads: None) -> None:
+    told: list[tuple[int, int]] = []
+    bpnp.solve_many(*SETS, progress=lambda pair, _batch, _seconds: told.append((os.getpid(), pair)))
+    assert {pair for _, pair in told} == set(range(6))
+    assert {process for process, _ in told} == {os.getpid()}
+
+
+def test_every_item_is_worked_on_once_by_other_processes() -> None:
+    done = list(in_processes(lambda item, _tell: (item * item, os.getpid()), range(5, 25), 3, print))
+    assert sorted((item, value) for item, (value, _) in done) == [(item, item * item) for item in range(5, 25)]
+    processes = {process for _, (_, process) in done}
+    assert os.getpid() not in processes
+    assert 1 <= len(processes) <= 3
+
+
+def test_an_error_in_a_worker_is_raised_and_ends_the_others() -> None:
+    def work(item: int, _tell: object) -> int:
+        if item == 3:
+            raise ValueError("item 3")
+        time.sleep(0.01)
+        return item
+
+    with pytest.raises(ValueError, match="item 3"):
+        list(in_processes(work, range(1000), 2, print))
+    assert multiprocessing.active_children() == []
+
+
+def test_a_worker_that_is_killed_is_an_error_and_no_hang() -> None:
+    def work(item: int, _tell: object) -> int:
+        if item == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return item
+
+    with pytest.raises(RuntimeError, match="ended with status -9, possibly out of memory"):
+        list(in_processes(work, range(1000), 2, print))
+    assert multiprocessing.active_children() == []
+
+
+def test_an_iteration_that_is_left_leaves_no_process() -> None:
+    some = in_processes(lambda item, _tell: item, range(1000), 2, print)
+    next(some)
+    some.close()  # type: ignore[attr-defined]
+    assert multiprocessing.active_children() == []
