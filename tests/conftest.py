@@ -1,6 +1,7 @@
 import os
 from pathlib import Path
 
+import lightning  # noqa: F401, its log handler keeps the stderr of its first import, which a test would close
 import pytest
 import torch
 
