@@ -54,6 +54,11 @@ class PointSets:
         """What depends on the image alone, computed when it is first asked for."""
         return ImageStatistics(self.bearings, self.floor)
 
+    @cached_property
+    def middle(self) -> Array:
+        """The median of the scene points (3,)."""
+        return np.median(self.points3d, 0)
+
     @property
     def pairs_that_fix(self) -> int:
         """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
@@ -76,10 +81,9 @@ class PointSets:
         off = max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg))
         share = _ball(off)
         if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
-            middle = np.median(self.points3d, 0)
-            expected = known @ middle + np.asarray(self.prior.translation)
+            expected = known @ self.middle + np.asarray(self.prior.translation)
             distance = max(float(np.linalg.norm(expected)), 1e-12)
-            shift = float(np.linalg.norm(rotation @ middle + translation - expected))
+            shift = float(np.linalg.norm(rotation @ self.middle + translation - expected))
             relative = max(shift, SIGMAS * self.prior.translation_sigma) / distance
             share *= min(1.0, math.pi * relative**2 / self.image.solid_angle) * min(1.0, 2 * relative / LOG_DEPTHS)
         return math.log10(share)

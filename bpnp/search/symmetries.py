@@ -1,7 +1,6 @@
 """Rigid motions that take a constellation nearly onto itself: from one pose they give its twins."""
 
 import functools
-import itertools
 import math
 
 import numpy as np
@@ -59,16 +58,15 @@ def _remembered(packed: bytes) -> list[Motion]:
 
 
 def _wide_triples(points: Array) -> list[tuple[int, int, int]]:
-    """Triples of large area, each of other points than those before it."""
-    free = list(range(len(points)))
+    """The farthest pair and the point that spans the largest triangle with it, each time of other points."""
+    distance = np.linalg.norm(points[:, None] - points, axis=-1)
     triples: list[tuple[int, int, int]] = []
+    free = np.arange(len(points))
     while len(free) >= 3 and len(triples) < REFERENCES:
-        choices = np.array(list(itertools.islice(itertools.combinations(free, 3), 50_000)))
-        a, b, c = (points[choices[:, k]] for k in range(3))
-        area = np.linalg.norm(np.cross(b - a, c - a), axis=-1)
-        i, j, k = choices[int(area.argmax())].tolist()
-        triples.append((i, j, k))
-        free = [point for point in free if point not in (i, j, k)]
+        first, second = free[list(np.unravel_index(distance[np.ix_(free, free)].argmax(), (len(free), len(free))))]
+        area = np.linalg.norm(np.cross(points[free] - points[first], points[second] - points[first]), axis=-1)
+        triples.append((int(first), int(second), int(free[area.argmax()])))
+        free = np.setdiff1d(free, triples[-1])
     return triples
 
 

@@ -87,7 +87,7 @@ def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evide
     Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
     distance. Infinite and -1 if there is none.
     """
-    middle = candidates.rotation @ np.median(sets.points3d, 0) + candidates.translation
+    middle = candidates.rotation @ sets.middle + candidates.translation
     shift = rule.other_shift * float(np.linalg.norm(middle[0]))
     others = np.flatnonzero(~same_pose(candidates.rotation, middle, 0, rule.other_deg, shift))
     if not len(others):

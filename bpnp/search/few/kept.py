@@ -18,6 +18,7 @@ SAME = 1 + 2 * math.cos(math.radians(2.0))  # trace of the turn between two pose
 SAME_SHIFT, SAME_DEPTH = 0.1, 0.05  # of the scene's extent and of its distance
 TIGHTER, FINAL = 0.55, 3  # factor of the radius from one step of a refinement to the next, and steps at the last
 BEHIND = 1.0  # matches that a hypothesis may have less than any other had, to be refined
+MOVED = 1 + 2 * math.cos(math.radians(0.3))  # trace of the turn beyond which a pose without a match is looked at
 EXCHANGED = 3  # Gauss-Newton steps on the matches that are left when one is taken away
 FARTHEST = 4.0  # radii from an image point within which another partner is looked for
 LACKING = 0.25  # matches that an expected but missing point takes away
@@ -127,14 +128,21 @@ def keep(pose: Any, value: float, count: int, visible: int, expected: int, found
 
 
 @compiled
-def _same(one: Any, other: Any) -> bool:
-    trace = shift2 = depth2 = 0.0
+def _trace(one: Any, other: Any) -> float:
+    """Of the turn between two poses: 1 + 2 cos."""
+    trace = 0.0
     for k in range(9):
         trace += one[k] * other[k]
+    return trace
+
+
+@compiled
+def _same(one: Any, other: Any) -> bool:
+    shift2 = depth2 = 0.0
     for k in range(9, 12):
         shift2 += (one[k] - other[k]) ** 2
         depth2 += other[k] ** 2
-    return trace > SAME and shift2 < (SAME_SHIFT + SAME_DEPTH * math.sqrt(depth2)) ** 2
+    return _trace(one, other) > SAME and shift2 < (SAME_SHIFT + SAME_DEPTH * math.sqrt(depth2)) ** 2
 
 
 @compiled
@@ -159,7 +167,7 @@ def exchange(
         if not _stepped(pose, rays, scene, prior, work):
             continue
         other = _nearest_other(pose, i, own[i], scene, image)
-        if allowed(pose, prior, work[9]):
+        if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
             settle(rays, scene, image, used, density, prior, found, work)
         if other < 0:
             continue
@@ -168,7 +176,9 @@ def exchange(
             if own[k] == other:
                 matched[k] = -1
         matched[i] = other
-        if _stepped(pose, rays, scene, prior, work) and allowed(pose, prior, work[9]):
+        if not _stepped(pose, rays, scene, prior, work):
+            continue
+        if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
             settle(rays, scene, image, used, density, prior, found, work)
 
 
