@@ -235,9 +235,16 @@ def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:
     assert "MegaDepth: another data set" in as_markdown([line], "megadepth")
 
 
-def test_every_short_name_can_be_built() -> None:
-    for name in ("softposit", "ransac", "gosma", "gopac", "constellation", "hungarian", "bpnpnet"):
-        (method,) = parse_methods([name], time_limit=2.0)
-        solver = method.build()
-        assert solver.estimates
-        assert getattr(solver, "time_limit", 2.0) == 2.0
+@pytest.mark.parametrize(
+    ("name", "limited"),
+    [
+        *((name, True) for name in ("softposit", "ransac", "gosma", "gopac", "constellation", "search")),
+        *((name, False) for name in ("hungarian", "bpnpnet", "matcher")),
+    ],
+)
+def test_every_short_name_can_be_built(name: str, limited: bool) -> None:
+    (method,) = parse_methods([name], time_limit=2.5)
+    solver = method.build()
+    assert not solver.training
+    assert len(solver.estimates) >= 1
+    assert getattr(solver, "time_limit", None) == (2.5 if limited else None)

@@ -165,8 +165,10 @@ def _estimates(runs: Mapping[str, Results]) -> dict[str, list[str]]:
 def _figure(title: str, x: str, y: str, runs: Mapping[str, Results], *, log: bool = False) -> "Figure":
     from plotly.graph_objects import Figure
 
-    figure = Figure(layout={"title": {"text": title}, "hovermode": "x", "template": "none"})
-    figure.update_xaxes(title={"text": x}, type="log" if log else "linear", **({"tickformat": "~g"} if log else {}))
+    figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
+    figure.update_xaxes(
+        title={"text": x}, type="log" if log else "linear", hoverformat=".3~g", **({"tickformat": "~g"} if log else {})
+    )
     figure.update_yaxes(title={"text": y})
     return figure
 

@@ -22,7 +22,8 @@ def look() -> dict[str, Any]:
     }  # fmt: skip
     layout = {
         "margin": {"l": 50, "r": 12, "t": 44, "b": 40}, "showlegend": False, "paper_bgcolor": CLEAR,
-        "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11}, "hoverlabel": {"namelength": 60},
+        "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11},
+        "hoverlabel": {"namelength": 60, "bgcolor": INK["panel"], "font": {"color": INK["text"]}},
         "modebar": {"bgcolor": CLEAR, "color": INK["quiet"], "activecolor": INK["focus"]},
         "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": AXIS, "yaxis": AXIS,
         "scene": {"xaxis": axis3d, "yaxis": axis3d, "zaxis": axis3d},
@@ -46,9 +47,7 @@ def figures() -> dict[str, dict[str, Any]]:
             "title": {"text": "Rotation error of each pair"}, "hovermode": "closest", "xaxis": degrees, "yaxis": degrees
         },
     }  # fmt: skip
-    axes = {
-        f"{name}axis": {"title": {"text": text}} for name, text in zip("xyz", ("right", "forward", "up"), strict=True)
-    }
+    axes = {axis: {"title": {"text": direction}} for axis, direction in AXES_3D.items()}
     scene = {
         "data": [
             _marks(size=3.5, line={"width": 0}) | {"type": "scatter3d"},
