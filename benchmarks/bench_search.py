@@ -1,6 +1,10 @@
 """The training-free search on real meshes and photos: errors, failures, verdicts and seconds a pair.
 
 python benchmarks/bench_search.py --data ../shared/data psb psb-so3 psb-0.5 castle-P30 castle-P30-0.25
+python benchmarks/bench_search.py --data ../shared/data --output benchmarks/results/search-cpu-2core.json \
+    --document docs/search.md
+The second one runs every set and writes its table into the guide.
+
 A set is psb, psb-so3, psb-RHO (uniform outliers on both sides), SCENE, SCENE-CLUTTER (natural, ratio to the true
 pairs) or SCENE-all (all keypoints, all scene points).
 """
@@ -26,6 +30,13 @@ from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 
 EVERYTHING = 1e6
+SCENES = ("castle-P30", "fountain-P11", "sceaux_castle_txt", "south_building", "statue_of_liberty", "walkthrough")
+SETS = (
+    "psb", "psb-so3", "psb-0.25", "psb-0.50", "psb-1.0",
+    *(scene + clutter for clutter in ("", "-0.10", "-0.25", "-0.50", "-all") for scene in SCENES),
+)  # fmt: skip
+ALL_LIMIT, ALL_SECONDS = 10, 30.0  # images of a SCENE-all, and seconds a pair, where nothing else is asked for
+START, END = "<!-- table of bench_search.py -->", "<!-- end of the table -->"
 
 
 def source(name: str, data: Path, limit: int) -> PairDataset:
@@ -112,13 +123,14 @@ def summary(name: str, rows: list[dict]) -> dict:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("sets", nargs="+")
+    parser.add_argument("sets", nargs="*", default=SETS)
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--limit", type=int, default=100)
+    parser.add_argument("--limit", type=int, help=f"pairs a set (100; {ALL_LIMIT} of a SCENE-all)")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--time-limit", type=float)
+    parser.add_argument("--time-limit", type=float, help=f"seconds a pair (none; {ALL_SECONDS:.0f} of a SCENE-all)")
     parser.add_argument("--max-batches", type=int, default=32)
     parser.add_argument("--output", type=Path, help="JSON to add the results to")
+    parser.add_argument("--document", type=Path, help="Markdown file whose table is replaced by these results")
     parser.add_argument("--pairs", type=Path, help="folder for a CSV of each set's pairs")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -126,7 +138,10 @@ def main() -> None:
     run("psb", options.data, 1, 0, SearchSettings(max_batches=1))  # compiles
     results = json.loads(options.output.read_text()) if options.output and options.output.exists() else {}
     for name in options.sets:
-        rows = run(name, options.data, options.limit, options.seed, settings, options.time_limit)
+        every = name.endswith("-all")
+        limit = options.limit or (ALL_LIMIT if every else 100)
+        time_limit = options.time_limit or (ALL_SECONDS if every else None)
+        rows = run(name, options.data, limit, options.seed, settings, time_limit)
         row = summary(name, rows)
         q = " / ".join(f"{value:.2f}" for value in row["rotation_q_deg"])
         print(
@@ -139,7 +154,7 @@ def main() -> None:
         )
         results[name] = row | {
             "seed": options.seed,
-            "time_limit": options.time_limit,
+            "time_limit": time_limit,
             "max_batches": options.max_batches,
             "threads": torch.get_num_threads(),
         }
@@ -148,6 +163,32 @@ def main() -> None:
         if options.pairs:
             options.pairs.mkdir(parents=True, exist_ok=True)
             pd.DataFrame(rows).to_csv(options.pairs / f"{name}.csv", index=False)
+    if options.document:
+        text = options.document.read_text()
+        before, after = text[: text.index(START) + len(START)], text[text.index(END) :]
+        options.document.write_text(f"{before}\n{table(results)}\n{after}")
+
+
+def table(results: dict[str, dict]) -> str:
+    """The results of sets as Markdown."""
+    names = ("set", "pairs", "rotation Q1 / Q2 / Q3", "under 1 / 2 deg", "(15 deg, 0.5)", "confident",
+             "over 2 / 5 deg", "failed", "CPU s", "batches")  # fmt: skip
+    lines = [names, ("---",) * len(names)]
+    for name, row in results.items():
+        digits = 3 if row["rotation_q_deg"][1] < 0.1 else 2
+        lines.append((
+            name,
+            str(row["pairs"]),
+            " / ".join(f"{value:.{digits}f}" if value < 10 else f"{value:.0f}" for value in row["rotation_q_deg"]),
+            f"{row['under_1_deg']:.0%} / {row['under_2_deg']:.0%}",
+            f"{row['recall_15_deg_0.5']:.0%}",
+            f"{row['confident']:.0%}",
+            f"{row['confident_over_2_deg']} / {row['confident_over_5_deg']}",
+            str(row["failed"]),
+            f"{row['cpu_seconds_mean']:.2f}",
+            f"{row['batches_mean']:.1f}",
+        ))  # fmt: skip
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def write_json(path: Path, results: dict) -> None:

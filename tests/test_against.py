@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "benchmarks"))
+import bench_search  # noqa: E402
 from against import Row, checked_out, in_turns  # noqa: E402
 
 sys.path.pop(0)
@@ -55,3 +56,33 @@ def test_both_trees_run_their_own_benchmark_in_turns(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("new", "worse"), [(1.0, False), (1.09, False), (1.2, True)])
 def test_a_tenth_more_time_is_worse(new: float, worse: bool) -> None:
     assert Row("seconds", 1.0, new, True).is_worse == worse
+
+
+def test_the_table_of_the_search_takes_the_place_of_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = [
+        {
+            "rotation_deg": error,
+            "translation": 0.1,
+            "verdict": verdict,
+            "seconds": 2.0,
+            "cpu_seconds": 1.0,
+            "batches": 4,
+        }
+        for error, verdict in ((0.01, "confident"), (0.03, "confident"), (30.0, "failed"))
+    ]
+    monkeypatch.setattr(bench_search, "run", lambda *_: rows)
+    guide = tmp_path / "guide.md"
+    guide.write_text(f"before\n{bench_search.START}\nold\n{bench_search.END}\nafter\n")
+    monkeypatch.setattr("sys.argv", ["bench_search.py", "psb", "--document", str(guide)])
+    bench_search.main()
+    before, _, head, _, row, _, after = guide.read_text().splitlines()
+    assert (before, after) == ("before", "after")
+    values = dict(zip(*([cell.strip() for cell in line.strip("|").split("|")] for line in (head, row)), strict=True))
+    assert values["pairs"] == "3"
+    assert values["rotation Q1 / Q2 / Q3"] == "0.020 / 0.030 / 15"
+    assert values["under 1 / 2 deg"] == "67% / 67%"
+    assert values["confident"] == "67%"
+    assert values["over 2 / 5 deg"] == "0 / 0"
+    assert (values["failed"], values["CPU s"], values["batches"]) == ("1", "1.00", "4.0")

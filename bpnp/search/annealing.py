@@ -12,28 +12,31 @@ from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.grid import build_grid, descend_sparse
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Batch, ClusterStage, Recipe
+from bpnp.search.settings import ClusterStage, Recipe, Stages
 from bpnp.search.starts import Prior, draw_poses
 
 
-def run_batch(scene: Scene, size: Batch, recipe: Recipe, prior: Prior | None, best: Candidates) -> Candidates:
+def run_batch(
+    scene: Scene, starts: int, coarse: Stages, recipe: Recipe, prior: Prior | None, best: Candidates
+) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    rotation, translation = draw_poses(scene.spread, scene.bulk3d, size.starts, recipe, prior, scene.rng)
+    rotation, translation = draw_poses(scene.spread, scene.bulk3d, starts, recipe, prior, scene.rng)
     poses = Candidates.unscored(rotation, translation, hits=1)
-    for stage in size.coarse:
-        poses = anneal_on_clusters(scene, poses, stage)
-    return anneal_further(scene, Candidates.concatenated([poses, shaken(scene, best)]), size.middle)
+    for stage in coarse:
+        poses = anneal_on_clusters(scene, poses, stage, scene.settings.kept_by(stage, starts))
+    return anneal_further(scene, Candidates.concatenated([poses, shaken(scene, best)]), starts)
 
 
-def anneal_further(scene: Scene, poses: Candidates, stages: tuple[ClusterStage, ...]) -> Candidates:
-    """From coarse poses through the finer clusters to all points."""
-    for stage in stages:
-        poses = anneal_on_clusters(scene, poses, stage)
-    return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
+def anneal_further(scene: Scene, poses: Candidates, starts: int) -> Candidates:
+    """From coarse poses of a batch of so many starts through the finer clusters to all points."""
+    settings = scene.settings
+    for stage in settings.middle:
+        poses = anneal_on_clusters(scene, poses, stage, settings.kept_by(stage, starts))
+    return anneal_on_points(scene, poses, settings.middle[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage) -> Candidates:
-    """The likeliest poses that `starts` reach on the clusters, best first, of different rotations."""
+def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage, kept: int) -> Candidates:
+    """The `kept` likeliest poses that `starts` reach on the clusters, best first, of different rotations."""
     bearings, points = scene.clusters(stage.clusters)
     sides, outlier = (tuple(bearings), tuple(points)), scene.outlier_density(scene.settings.outliers)
     scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
@@ -44,9 +47,7 @@ def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage) ->
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
-    if not stage.apart_deg:
-        return ends[np.argsort(-ends.score, kind="stable")[: stage.kept]]
-    return best_distinct(ends, scene, stage.kept, degrees=stage.apart_deg, shift=math.inf)
+    return best_distinct(ends, scene, kept, degrees=stage.apart_deg, shift=math.inf)
 
 
 def anneal_on_points(

@@ -14,7 +14,7 @@ from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, Batch, SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict import (
     SearchResult,
@@ -119,13 +119,13 @@ def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> 
     Of a rough pose all batches are full, and every other one is looked up in a raster, which finds other poses.
     """
     settings = scene.settings
-    size, recipe = settings.batch(number), settings.recipes[number % len(settings.recipes)]
+    starts, coarse, turn = settings.batch(number), settings.coarse, number
     if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
         if number % 2 == 0:
             return nearby_batch(scene, prior), 1.0
-        size = Batch(settings.starts, cooled(settings.coarse, prior, scene), settings.middle)
-        recipe = settings.recipes[number // 2 % len(settings.recipes)]
-    return run_batch(scene, size, recipe, prior, best), size.starts / settings.starts
+        starts, coarse, turn = settings.starts, cooled(coarse, prior, scene), number // 2
+    recipe = settings.recipes[turn % len(settings.recipes)]
+    return run_batch(scene, starts, coarse, recipe, prior, best), starts / settings.starts
 
 
 def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:

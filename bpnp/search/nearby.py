@@ -26,7 +26,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
-from bpnp.search.settings import ClusterStage
+from bpnp.search.settings import Stages
 from bpnp.search.starts import Array, PosePrior
 
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
@@ -103,7 +103,7 @@ def raster_of(scene: Scene) -> Raster:
     return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
-def cooled(stages: tuple[ClusterStage, ...], prior: PosePrior, scene: Scene) -> tuple[ClusterStage, ...]:
+def cooled(stages: Stages, prior: PosePrior, scene: Scene) -> Stages:
     """The stages at scales no wider than the prior: from hotter ones the starts leave what is known."""
     depth = _distance(scene, prior)
     turned = math.radians(prior.rotation_sigma_deg) * float(np.sqrt(scene.bulk3d.var(0).sum())) / depth

@@ -40,9 +40,9 @@ def refine_poses(
     crowd = len(starts)
     if crowd > settings.refined_directly:
         for stage in (*settings.coarse, *settings.middle):
-            starts = anneal_on_clusters(scene, starts, stage)
+            starts = anneal_on_clusters(scene, starts, stage, stage.kept)
     around = Candidates.concatenated([starts, shaken(scene, starts)])
-    clustered = anneal_further(scene, around, settings.middle)
+    clustered = anneal_further(scene, around, settings.starts)
     # A start that is right already needs no clusters, which would only shake it.
     direct = anneal_on_points(scene, starts, settings.middle[-1].last_scale * scene.spread)
     poses = finish(scene, merged([clustered, direct], scene))

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 
 @dataclass(frozen=True)
@@ -34,6 +33,9 @@ class ClusterStage:
     iterations: int
     kept: int
     apart_deg: float
+
+
+Stages = tuple[ClusterStage, ...]
 
 
 @dataclass(frozen=True)
@@ -173,8 +175,8 @@ class SearchSettings:
     first_starts: int = 48
     least_kept: int = 3
     recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
-    coarse: tuple[ClusterStage, ...] = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0),)
-    middle: tuple[ClusterStage, ...] = (
+    coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0),)
+    middle: Stages = (
         ClusterStage(128, 0.1, 0.065, iterations=7, kept=24, apart_deg=1.0),
         ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
     )
@@ -219,26 +221,14 @@ class SearchSettings:
         evidence = replace(self.evidence, well_matched=self.evidence.well_matched * (1 - clutter))
         return replace(self, outliers=max(clutter, self.least_outliers), end_outliers=(), evidence=evidence)
 
-    def batch(self, number: int) -> "Batch":
-        """The size of a batch, counted from 0."""
-        starts = min(self.starts, self.first_starts * 2 ** min(number, 60))
+    def batch(self, number: int) -> int:
+        """Starts of a batch, counted from 0."""
+        return min(self.starts, self.first_starts * 2 ** min(number, 60))
+
+    def kept_by(self, stage: ClusterStage, starts: int) -> int:
+        """How many poses of a batch of so many starts a stage hands on."""
         share = math.sqrt(starts / self.starts)
-        coarse, middle = (
-            tuple(
-                replace(stage, kept=min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept))))
-                for stage in stages
-            )
-            for stages in (self.coarse, self.middle)
-        )
-        return Batch(starts, coarse, middle)
-
-
-class Batch(NamedTuple):
-    """starts: that are drawn. coarse, middle: the stages that they go through, with as many poses kept as they need."""
-
-    starts: int
-    coarse: tuple[ClusterStage, ...]
-    middle: tuple[ClusterStage, ...]
+        return min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept)))
 
 
 DEFAULT = SearchSettings()

@@ -89,11 +89,10 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tu
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
         pairs = np.argwhere(distance <= radius)
     else:
-        forward, backward = (
-            _neighbours(points, others, radius)
-            for points, others in ((image, projected[seen]), (projected[seen], image))
-        )
-        pairs = np.unique(np.concatenate([forward, backward[:, ::-1]]), axis=0)
+        forward, backward = _neighbours(image, projected[seen], radius), _neighbours(projected[seen], image, radius)
+        both = np.concatenate([forward, backward[:, ::-1]])
+        # One number a pair: unique rows would be sorted as records, ten times as long.
+        pairs = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
     pairs[:, 1] = seen[pairs[:, 1]]
     pairs = pairs[allowed(*pairs.T)]
     return pairs, np.linalg.norm(image[pairs[:, 0]] - projected[pairs[:, 1]], axis=-1)

@@ -55,7 +55,7 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
         function = getattr(__import__("bpnp.search.annealing", fromlist=[kernel]), kernel)
         monkeypatch.setattr(f"bpnp.search.annealing.{kernel}", counted(name, function))
     scene.deadline = PASSED
-    found = anneal_on_clusters(scene, starts(scene, 500), DEFAULT.coarse[0])
+    found = anneal_on_clusters(scene, starts(scene, 500), DEFAULT.coarse[0], 48)
     assert annealed["clusters"] == DEFAULT.starts_a_check
     assert len(found) > 0
     fine = anneal_on_points(scene, found[:5], 0.04 * scene.spread, every=True)
@@ -63,7 +63,7 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
     before = annealed["points"]
     assert len(finish(scene, fine)) == len(fine)
     assert annealed["points"] == before
-    assert len(run_batch(scene, DEFAULT.batch(9), DEFAULT.recipes[0], None, Candidates.none())) > 0
+    assert len(run_batch(scene, 1200, DEFAULT.coarse, DEFAULT.recipes[0], None, Candidates.none())) > 0
 
 
 def test_a_limit_that_is_not_reached_changes_nothing(scene: Scene) -> None:
@@ -71,7 +71,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(scene: Scene) -> None:
     ends = []
     for scene.deadline in (Deadline(), Deadline.after(1e6)):
         scene.rng = np.random.default_rng(5)  # of the clusters
-        ends.append(anneal_on_clusters(scene, begin, DEFAULT.coarse[0]))
+        ends.append(anneal_on_clusters(scene, begin, DEFAULT.coarse[0], 48))
     np.testing.assert_array_equal(ends[0].rotation, ends[1].rotation)
     np.testing.assert_array_equal(ends[0].score, ends[1].score)
 

@@ -49,12 +49,12 @@ def test_search_finds_poses_among_clutter(outliers):
 
 def test_batches_grow_until_they_are_full():
     sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
-    assert [size.starts for size in sizes] == [48, 96, 192, 384, 768, 1200, 1200, 1200]
-    for stage in ("coarse", "middle"):
-        kept = [getattr(size, stage)[-1].kept for size in sizes]
+    assert sizes == [48, 96, 192, 384, 768, 1200, 1200, 1200]
+    for stage in (*DEFAULT.coarse, *DEFAULT.middle):
+        kept = [DEFAULT.kept_by(stage, starts) for starts in sizes]
         assert kept == sorted(kept)
         assert kept[0] >= DEFAULT.least_kept
-        assert kept[-1] == getattr(DEFAULT, stage)[-1].kept
+        assert kept[-1] == stage.kept
 
 
 def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
@@ -206,6 +206,13 @@ def test_search_as_a_solver(problem):
 def test_wrong_budgets_are_refused(problem, wrong):
     with pytest.raises(ValueError, match="expected"):
         search(problem.bearings, problem.points3d, **wrong)
+
+
+def test_a_known_share_of_clutter_is_expected_and_the_only_one_tried():
+    known = DEFAULT.expecting(0.5)
+    assert (known.outliers, known.end_outliers) == (0.5, ())
+    assert known.evidence.well_matched == pytest.approx(0.5 * DEFAULT.evidence.well_matched)
+    assert DEFAULT.expecting(0.0).outliers == DEFAULT.least_outliers
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ FIXING = 3  # pairs that fix a pose
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
-FARTHEST = 40.0  # squared distance over s^2 beyond which a pair adds nothing to g
+FARTHEST = 18.0  # squared distance over s^2 beyond which a pair adds nothing to g
 OWN, ROUGH = 2.0, 4.0  # factors of the scale of a pose's residuals within which s is its own, and beyond which rougher
 
 

@@ -16,7 +16,7 @@ from bpnp.search.kernels.weighted import WeightedBearings, visible_weights
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
 CAPACITY = 96  # neighbours kept of a point
-SWEEPS = 4
+SWEEPS = 2
 LEAST_SEEN = 0.25  # of all weights: if fewer points face the camera, they count as so many
 CELLS = 64  # along the longest side of the grid
 
