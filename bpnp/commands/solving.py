@@ -1,6 +1,7 @@
 """`bpnp solve`: the pose of a camera from a file of image points and a file of scene points."""
 
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -16,6 +17,8 @@ def solve(
     camera: str | None = None,
     output: Path | None = None,
     picture: Path | None = None,
+    photo: Path | None = None,
+    colmap: Path | None = None,
     json: bool = False,
     surface: int | None = None,
     prior: Path | None = None,
@@ -38,10 +41,14 @@ def solve(
 
     Args:
         points2d: .npy, .csv or .txt; pixels with --camera, else x/z y/z; a column named label.
-        points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label.
-        camera: file with a 3x3 matrix, or COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy.
+        points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label; or a
+            COLMAP model (its folder, or points3D.bin or .txt).
+        camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
+            one camera (its folder, or cameras.bin or .txt).
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
+        photo: the photo, under the points of --picture; needs --camera.
+        colmap: folder to write, a COLMAP model of this image.
         json: print JSON instead of a table.
         surface: points to draw from a mesh; its vertices by default.
         prior: rough pose, the JSON of a solution; or a checkpoint.
@@ -66,12 +73,16 @@ def solve(
     image_points, labels2d = read_image(points2d)
     scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
     known = known_pose(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
+    lens = None if camera is None else read_camera(camera)
     _prepare(output, picture)
+    if photo is not None and (picture is None or lens is None):
+        raise ValueError("expected --photo with --picture and --camera, got it without")
+    under = None if photo is None else _photo(photo)
     with SlowProgress("searching the pose") as progress:
         solution = find_pose(
             image_points,
             scene_points,
-            None if camera is None else read_camera(camera),
+            lens,
             normals3d=normals3d,
             labels2d=labels2d,
             labels3d=labels3d,
@@ -92,10 +103,21 @@ def solve(
     if output is not None:
         say(write_text(output, solution.to_json() + "\n"), to=said)
     if picture is not None:
+        from bpnp.cameras import camera_from
         from bpnp.report.figures import save_figure
         from bpnp.report.pictures import solution_picture
 
-        say(save_figure(solution_picture(solution, title=points2d.stem), picture), to=said)
+        drawn_in = None if lens is None else camera_from(lens)
+        figure = solution_picture(solution, title=points2d.stem, photo=under, camera=drawn_in)
+        say(save_figure(figure, picture), to=said)
+    if colmap is not None:
+        say(solution.to_colmap(colmap, camera=lens, name="image.jpg" if photo is None else photo.name), to=said)
+
+
+def _photo(path: Path) -> Any:
+    from bpnp.report.pictures import read_photo
+
+    return read_photo(path)
 
 
 def _prepare(output: Path | None, picture: Path | None) -> None:

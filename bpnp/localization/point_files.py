@@ -1,24 +1,31 @@
 """Files of points and cameras, as arrays."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
+if TYPE_CHECKING:
+    from bpnp.datamodules.colmap.model_records import ModelRecords
+
 Array = npt.NDArray[np.float64]
 TEXTS = (".csv", ".txt", ".xyz")
+COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # the files of a COLMAP model, .bin or .txt
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 
 
 def read_points(path: Path, width: int | None = None, *, surface: int | None = None, seed: int = 0) -> Array:
     """The points (k, width) of a file; width None for image points, which have two columns, or three if they are rays.
 
+    width 3: also a COLMAP model, its folder or its points3D. width None: of four and more columns the first two.
     .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces, the first line may
     name them, and # starts a comment; for 3D points also .ply and meshes (.obj, .off, .stl, .glb): their different
     vertices, or `surface` points drawn from their triangles.
     Raises ValueError that names the file and what is wrong in it.
     """
+    if width == 3 and (path.is_dir() or path.stem == COLMAP_POINTS):
+        return _colmap(path).points3d
     if not path.is_file():
         raise ValueError(f"expected a file of points, got no file {path}")
     suffix = path.suffix.lower()
@@ -41,6 +48,8 @@ def read_points(path: Path, width: int | None = None, *, surface: int | None = N
         known = (".npy", *TEXTS, *meshes)
         raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
     widths = (2, 3) if width is None else (width,)
+    if width is None and points.ndim == 2 and points.shape[1] > 3:
+        return points[:, :2]  # keypoints: x, y, scale and more
     if points.ndim != 2 or points.shape[1] not in widths:
         columns = " or ".join(map(str, widths))
         hint = " (are the two files swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
@@ -56,7 +65,8 @@ def read_scene(
     As `read_points`; a text may have columns nx, ny, nz and label beside x, y, z: by the names in its first line, or
     without names after the coordinates, in this order (4, 6 or 7 columns).
     """
-    if path.suffix.lower() not in TEXTS or surface is not None or not path.is_file():
+    colmap = path.stem == COLMAP_POINTS
+    if colmap or path.suffix.lower() not in TEXTS or surface is not None or not path.is_file():
         return read_points(path, 3, surface=surface, seed=seed), None, None
     return _annotated(path, ("x", "y", "z"))
 
@@ -100,10 +110,13 @@ def _annotated(
 def read_camera(text: str) -> Any:
     """The camera that `--camera` names: a file with a 3x3 matrix, or a COLMAP model with its parameters.
 
+    Also the only camera of a COLMAP model, named by its folder or by its file of cameras.
     "PINHOLE 500 500 320 240" and "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt) are both
     understood. Raises ValueError for anything else.
     """
     path = Path(text)
+    if (text and path.is_dir()) or (path.stem == COLMAP_CAMERAS and path.is_file()):
+        return _only_camera(path)
     if path.is_file():
         return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)[0]
     words = text.replace(",", " ").split()
@@ -117,6 +130,22 @@ def read_camera(text: str) -> Any:
             f"got {text!r}"
         )
     return _described(words[0].upper(), numbers)
+
+
+def _colmap(path: Path) -> "ModelRecords":
+    """The COLMAP model in a folder, or around one of its files."""
+    from bpnp.cameras import camera_models
+    from bpnp.datamodules.colmap.model_files import read_records
+
+    return read_records(path if path.is_dir() else path.parent, camera_models=camera_models())
+
+
+def _only_camera(path: Path) -> tuple[Any, ...]:
+    cameras = list(_colmap(path).cameras.values())
+    if len(cameras) != 1:
+        shown = "; ".join(f"{c.model},{','.join(f'{value:g}' for value in c.params)}" for c in cameras[:4])
+        raise ValueError(f"expected one camera in {path}, got {len(cameras)}; try --camera with one of {shown}")
+    return cameras[0].model, *cameras[0].size, cameras[0].params
 
 
 def _described(model: str, numbers: list[float]) -> tuple[Any, ...]:

@@ -1,19 +1,21 @@
 """The picture of a solution: what the camera sees, and where the pose puts the scene's points."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bpnp.cameras import in_front
+from bpnp.cameras import Camera, in_front
 from bpnp.report.palette import LIGHT, QUIET
 from bpnp.report.photos import MARGIN, Box
 from bpnp.report.samples import Array
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
-WIDTH, CAPTIONS = 8.0, 1.3  # inches
+WIDTH, CLOSE_UP, CAPTIONS = 9.0, 2.5, 1.3  # inches
 
 
 def picture_box(points2d: Array) -> Box:
@@ -29,38 +31,89 @@ def picture_box(points2d: Array) -> Box:
     return Box(*(low - margin).tolist(), *(high + margin).tolist())
 
 
-def solution_picture(solution: Any, *, title: str | None = None, photo: Array | None = None) -> "Figure":
-    """The normalised image plane: image points, matched and unmatched reprojected 3D points, and a line for each match.
+def read_photo(path: Path | str) -> Array:
+    """The picture in a file (h, w, 3), uint8. Raises ValueError that names a file that is none."""
+    from PIL import Image
 
-    solution: as `bpnp.solve` returns it. photo: (h, w, 3) uint8, undistorted, that fills `picture_box`.
+    try:
+        with Image.open(path) as photo:
+            return np.asarray(photo.convert("RGB"))
+    except OSError as error:
+        raise ValueError(f"expected a picture, got {path}: {error}") from error
+
+
+def solution_picture(
+    solution: Any, *, title: str | None = None, photo: Array | None = None, camera: Camera | None = None
+) -> "Figure":
+    """The image: its points, matched and unmatched reprojected 3D points, a line for each match; and the residuals.
+
+    solution: as `bpnp.solve` returns it. camera: the axes are its pixels, and `photo`, (h, w, 3) uint8, is as it was
+    taken; without a camera the axes are normalised coordinates, and the photo is undistorted and fills `picture_box`.
     """
-    from matplotlib.collections import LineCollection
     from matplotlib.figure import Figure
 
-    points2d, matches = np.asarray(solution.points2d), np.asarray(getattr(solution, "match_places", solution.matches))
-    box = picture_box(points2d)
-    height = WIDTH * (box.bottom - box.top) / (box.right - box.left)
-    figure = Figure(figsize=(WIDTH, float(np.clip(height, 2.5, 9)) + CAPTIONS), layout="constrained")
-    axes = figure.add_subplot()
-    if photo is not None:
-        axes.imshow(photo, extent=(box.left, box.right, box.bottom, box.top), alpha=0.75, zorder=0)
-    size = float(np.clip(80 / np.sqrt(len(points2d)), 1.5, 6))
-    axes.plot(*points2d.T, "o", mfc="none", mec="black", mew=0.6, ms=size, label="image points", zorder=3)
+    matches = np.asarray(getattr(solution, "match_places", solution.matches))
+    seen, projected = _drawn(np.asarray(solution.points2d), None), np.empty((0, 2))
     if np.isfinite(solution.rotation).all() and np.isfinite(solution.translation).all():
         projected = in_front(np.asarray(solution.points3d) @ solution.rotation.T + solution.translation)[:, :2]
-        free = np.ones(len(projected), bool)
-        free[matches[:, 1]] = False
-        axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
-        axes.plot(*projected[~free].T, "x", color=LIGHT[0], ms=size, mew=0.8, label="3D points, matched", zorder=4)
-        ends = np.stack([points2d[matches[:, 0]], projected[matches[:, 1]]], 1)
-        axes.add_collection(LineCollection(list(ends), colors=LIGHT[0], linewidths=0.8, zorder=2))
-    axes.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top), aspect="equal")
+    box = picture_box(seen)
+    if camera is not None:
+        seen, projected = _drawn(seen, camera), _drawn(projected, camera)
+        box = picture_box(seen) if photo is None else Box(0, 0, photo.shape[1], photo.shape[0])
+    height = WIDTH * (box.bottom - box.top) / (box.right - box.left)
+    figure = Figure(figsize=(WIDTH + CLOSE_UP, float(np.clip(height, 3, 10)) + CAPTIONS), layout="constrained")
+    axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
+    if photo is not None:
+        axes.imshow(photo, extent=(box.left, box.right, box.bottom, box.top), zorder=0)
+    _draw_points(axes, seen, projected, matches, hidden=photo is None)
+    unit = "pixels" if camera is not None else "normalised coordinates"
+    axes.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top), aspect="equal", ylabel=unit)
     axes.tick_params(labelsize=8)
+    _draw_residuals(close, seen, projected, matches, "px" if camera is not None else "normalised")
     shown = "" if title is None else f"{title}\n"
     figure.suptitle((shown + _described(solution)).replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
     axes.set_xlabel(str(solution.reason).replace("$", r"\$"), fontsize=8, color=QUIET, wrap=True)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
+
+
+def _drawn(points: Array, camera: Camera | None) -> Array:
+    """Normalised coordinates (k, 2) as the axes have them."""
+    return points if camera is None else camera.project(np.column_stack([points, np.ones(len(points))]))
+
+
+def _draw_points(axes: "Axes", seen: Array, projected: Array, matches: Any, *, hidden: bool) -> None:
+    """Rings around the image points, crosses where the pose puts 3D points; without a photo, those of no match too."""
+    from matplotlib.collections import LineCollection
+
+    size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
+    colour = "black" if hidden else "white"
+    axes.plot(*seen.T, "o", mfc="none", mec=colour, mew=0.7, ms=size, label="image points", zorder=3)
+    if not len(projected):
+        return
+    free = np.ones(len(projected), bool)
+    free[matches[:, 1]] = False
+    if free.any() and hidden:
+        axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
+    if not free.all():
+        axes.plot(*projected[~free].T, "x", color=LIGHT[0], ms=size, mew=0.9, label="3D points, matched", zorder=4)
+        ends = np.stack([seen[matches[:, 0]], projected[matches[:, 1]]], 1)
+        axes.add_collection(LineCollection(list(ends), colors=LIGHT[0], linewidths=0.8, zorder=2))
+
+
+def _draw_residuals(axes: "Axes", seen: Array, projected: Array, matches: Any, unit: str) -> None:
+    """A close-up: image point minus reprojected 3D point of each match."""
+    if not len(matches) or not len(projected):
+        axes.set_axis_off()
+        return
+    residuals = seen[matches[:, 0]] - projected[matches[:, 1]]
+    reach = 1.1 * float(np.nanmax(np.abs(residuals))) or 1.0
+    axes.plot(*residuals.T, ".", color=LIGHT[0], ms=4)
+    axes.axhline(0, color=QUIET, lw=0.5)
+    axes.axvline(0, color=QUIET, lw=0.5)
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    axes.set_title(f"residuals, {unit}", fontsize=8)
+    axes.tick_params(labelsize=7)
 
 
 def _described(solution: Any) -> str:

@@ -13,6 +13,8 @@ Array = npt.NDArray[np.float64]
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
 
+WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
+
 
 def numbers(name: str, values: Any, where: str) -> Array:
     """The values in float64."""
@@ -25,6 +27,20 @@ def numbers(name: str, values: Any, where: str) -> Array:
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
+
+
+def keypoints(values: Any, where: str) -> Array:
+    """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays or lists of cv2.KeyPoint, and
+    rows of four or more numbers that begin with x and y (scale, orientation, strength)."""
+    if isinstance(values, (list, tuple)) and len(values) and all(hasattr(value, "pt") for value in values):
+        values = [value.pt for value in values]
+    points = one_row_each(numbers("points2d", values, where))
+    return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
+
+
+def one_row_each(points: Array) -> Array:
+    """(k, 1, d) as OpenCV has them, as (k, d)."""
+    return points[:, 0] if points.ndim == 3 and points.shape[1] == 1 else points
 
 
 def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int, where: str) -> None:

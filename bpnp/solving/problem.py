@@ -12,7 +12,7 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.search.point_sets import PointSets, faces
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.annotations import checked_labels, checked_normals, checked_scores
-from bpnp.solving.given_points import check_points, normalised, numbers, unit_bearings
+from bpnp.solving.given_points import check_points, keypoints, normalised, numbers, one_row_each, unit_bearings
 from bpnp.solving.priors import Prior
 
 Array = npt.NDArray[np.float64]
@@ -148,7 +148,7 @@ def problem_from(
     scores that do not go with the points.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
-    given2d, given3d = numbers("points2d", points2d, where), numbers("points3d", points3d, where)
+    given2d, given3d = keypoints(points2d, where), one_row_each(numbers("points3d", points3d, where))
     if given2d.ndim == 2 and given2d.shape[1] == 3 and (camera is not None or given3d.shape[-1:] == (2,)):
         wrong = given2d if camera is not None else given3d
         what = "`points3d` of shape (n, 3)" if camera is None else "pixels `points2d` of shape (m, 2) with a `camera`"

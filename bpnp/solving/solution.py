@@ -1,5 +1,6 @@
 """What `bpnp.solve` returns, and its JSON file."""
 
+import io
 import json
 import math
 from collections.abc import Callable
@@ -123,15 +124,52 @@ class Solution:
             f"  candidates: {len(self.candidates)}, seconds: {self.seconds:.2f})"
         )
 
-    def plot(self, *, photo: npt.NDArray[np.uint8] | None = None) -> "Figure":
+    def plot(self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: Any = None) -> "Figure":
         """The image points and the scene points where the pose puts them, as a matplotlib figure.
 
-        photo: (h, w, 3) under the points, undistorted, that fills `bpnp.report.pictures.picture_box(points2d)`.
+        camera: as for `bpnp.solve`; the axes are pixels then. photo: a file or (h, w, 3) uint8, under the points;
+        with a camera as it was taken, without one undistorted to fill `bpnp.report.pictures.picture_box(points2d)`.
         Raises ValueError if no image point is in front of the camera.
         """
-        from bpnp.report.pictures import solution_picture
+        from bpnp.cameras import camera_from
+        from bpnp.report.pictures import read_photo, solution_picture
 
-        return solution_picture(self, photo=photo)
+        picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
+        return solution_picture(self, photo=picture, camera=None if camera is None else camera_from(camera))
+
+    def _repr_png_(self) -> bytes | None:
+        """The picture that a notebook shows; None without points in front of the camera."""
+        if not np.isfinite(self.points2d).all(-1).any():
+            return None
+        content = io.BytesIO()
+        self.plot().savefig(content, format="png", dpi=80)
+        return content.getvalue()
+
+    def to_colmap(
+        self, folder: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None
+    ) -> Path:
+        """A COLMAP model with this image, its matches as tracks, and all 3D points: cameras, images, points3D.txt.
+
+        camera: as for `bpnp.solve`; without one a pinhole of 1000 pixels. name: of the image file. size: its width and
+        height, pixels; by default the camera's, or what holds the points. Raises ValueError without a pose.
+        """
+        from bpnp.report.exports import write_colmap
+
+        return write_colmap(self, Path(folder), camera=camera, name=name, size=size)
+
+    def to_nerfstudio(
+        self, path: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None
+    ) -> Path:
+        """nerfstudio's transforms.json with this image as its frame; arguments and errors as for `to_colmap`."""
+        from bpnp.report.exports import write_nerfstudio
+
+        return write_nerfstudio(self, Path(path), camera=camera, name=name, size=size)
+
+    def to_rerun(self, entity: str = "bpnp", *, camera: Any = None, size: tuple[int, int] | None = None) -> None:
+        """Log points, camera and keypoints to rerun's current recording. Raises ValueError without rerun-sdk."""
+        from bpnp.report.exports import log_to_rerun
+
+        log_to_rerun(self, entity, camera=camera, size=size)
 
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""

@@ -37,7 +37,7 @@ def solve(
     """Camera pose from 2D and 3D points that nobody has matched.
 
     points2d: (m, 2) pixels with a `camera`; without one normalised image coordinates, or (m, 3) unit bearings. numpy or
-        torch.
+        torch; also OpenCV's (m, 1, 2) arrays and keypoints, and rows of four or more numbers that begin with x and y.
     points3d: (n, 3) points of the scene, in any unit.
     camera: 3x3 matrix K; (COLMAP model, parameters) or (model, width, height, parameters); or a pycolmap.Camera.
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.

@@ -1,6 +1,7 @@
 """`bpnp solve` on planted problems: files in, JSON, table and picture out; a mistake is one line."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -11,8 +12,10 @@ from planted import plant
 from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
+import bpnp
 from bpnp import Solution
 from bpnp.cli import main
+from bpnp.examples import load
 from bpnp.localization import slow_progress
 from bpnp.localization.slow_progress import SlowProgress
 from bpnp.report.pictures import solution_picture
@@ -168,3 +171,24 @@ def test_the_picture_shows_every_match(tmp_path: Path) -> None:
     np.testing.assert_allclose(ends[:, 0], X[np.lexsort(X.T)][np.argsort(np.lexsort(X.T))], atol=1e-9)
     np.testing.assert_allclose(ends[:, 0], ends[:, 1], atol=1e-7)
     assert figure.get_suptitle().startswith("a \\$ sign\nconfident: 40 matches (100 %)")
+
+
+def test_a_colmap_model_is_scene_and_camera_and_the_photo_lies_under_the_picture(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example = load("mesh")
+    solution = bpnp.solve(example.points2d, example.points3d, example.camera)
+    model = solution.to_colmap(tmp_path / "map", camera=example.camera, size=(1280, 960))
+    # A detector's rows: x, y, scale, angle.
+    np.savetxt(tmp_path / "keypoints.txt", np.c_[example.points2d, np.ones((200, 2))])
+    Image.fromarray(np.full((960, 1280, 3), 200, np.uint8)).save(tmp_path / "photo.png")
+    for scene, camera in ((model, model), (model / "points3D.txt", model / "cameras.txt")):
+        files = [str(tmp_path / "keypoints.txt"), str(scene), "--camera", str(camera)]
+        drawn = ["--picture", str(tmp_path / "p.png"), "--photo", str(tmp_path / "photo.png")]
+        main(["solve", *files, *drawn, "--colmap", str(tmp_path / "found"), "--output", str(tmp_path / "s.json")])
+        found = Solution.from_json(tmp_path / "s.json")
+        assert example.rotation_error_deg(found.rotation) < 0.2
+        assert (tmp_path / "p.png").stat().st_size > 20_000
+        assert (tmp_path / "found" / "images.txt").read_text().splitlines()[0].endswith(" 1 photo.png")
+        shutil.rmtree(tmp_path / "found")
+    assert "wrote" in capsys.readouterr().out

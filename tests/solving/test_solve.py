@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -11,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from small_data import small_net
 
 from bpnp import GravityPrior, PosePrior, Solution, solve, solve_many
+from bpnp.examples import load
 from bpnp.models import Search
 from bpnp.types import Pose, Prediction, SolveStats
 
@@ -361,3 +363,16 @@ def test_the_seed_decides() -> None:
     planted = plant(1, 60, noise=0.002)
     first, second = (solve(planted.points2d[0], planted.points3d[0], seed=7) for _ in range(2))
     assert replace(first, seconds=0.0).to_json() == replace(second, seconds=0.0).to_json()
+
+
+@pytest.mark.parametrize("form", ["opencv", "keypoints", "rows"])
+def test_what_detectors_return_is_taken(form: str) -> None:
+    example = load("mesh")
+    given = {
+        "opencv": example.points2d[:, None].astype(np.float32),
+        "keypoints": [cv2.KeyPoint(float(x), float(y), 3.0) for x, y in example.points2d],
+        "rows": np.c_[example.points2d, np.full(200, 2.5), np.zeros(200)],
+    }[form]
+    solution = solve(given, example.points3d[:, None] if form == "opencv" else example.points3d, example.camera)
+    assert example.rotation_error_deg(solution.rotation) < 0.2
+    assert solution.points2d.shape == (200, 2)
