@@ -100,10 +100,10 @@ def run(blocks: Sequence[Block], *, processes: int) -> Iterator[int]:
         for k in range(0, len(missing), size):
             turns[k // size].append((block, missing[k : k + size]))
     jobs = [job for turn in turns for job in turn]
-    alone = processes == 1 or len(jobs) < 2
-    for (block, indices), views in _inline(jobs) if alone else _parallel(jobs, processes):
-        block.keep(views)
-        yield len(indices)
+    with one_thread():
+        for (block, indices), views in _tested(jobs, processes):
+            block.keep(views)
+            yield len(indices)
 
 
 class PairKeeper(Callback):
@@ -171,19 +171,28 @@ def quiet() -> Iterator[None]:
             logger.setLevel(level)
 
 
-def _inline(jobs: Sequence[Job]) -> Iterator[tuple[Job, list[PairView]]]:
-    tester, threads = Tester(), torch.get_num_threads()
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for this process and for those that it starts, whose libraries read the variables when they load."""
+    kept, threads = {name: os.environ.get(name) for name in THREAD_VARIABLES}, torch.get_num_threads()
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
     torch.set_num_threads(1)
     try:
-        for job in jobs:
-            yield job, tester.test(*job)
+        yield
     finally:
         torch.set_num_threads(threads)
+        for name in THREAD_VARIABLES:
+            del os.environ[name]
+        os.environ.update({name: value for name, value in kept.items() if value is not None})
 
 
-def _parallel(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, list[PairView]]]:
-    kept = {name: os.environ.get(name) for name in THREAD_VARIABLES}
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # read when a process starts, by libraries that never ask
+def _tested(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, list[PairView]]]:
+    """Each job with what `Tester.test` returns, as they are finished."""
+    if processes == 1 or len(jobs) < 2:
+        tester = Tester()
+        for job in jobs:
+            yield job, tester.test(*job)
+        return
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_process_tester)
     try:
@@ -192,11 +201,6 @@ def _parallel(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, list[P
             yield futures[future], future.result()
     finally:
         pool.shutdown(cancel_futures=True)
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
 
 
 @cache
