@@ -100,15 +100,19 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         assert 24 <= 2 * np.degrees(np.arctan(half)) <= 115
         assert np.abs(pair.points2d).max() <= half * (1 + 1e-6)
         assert np.abs(pair.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
-    for rotate in (False, True):
+    for frame in ("any", "upright", "view"):
         kinds = {"facades": 1.0}
-        data = SfmSceneDataModule(num_points=40, test_pairs=60, eval_batch_size=60, rotate=rotate, kinds=kinds)
+        data = SfmSceneDataModule(num_points=40, test_pairs=60, eval_batch_size=60, frame=frame, kinds=kinds)
         data.setup("test")
         (batch,) = data.test_dataloader()
-        if rotate:
+        if frame == "any":
             assert batch.rotation.mean(0).abs().max() < 0.35
+        elif frame == "view":  # another photo near by, which looks almost the same way
+            angles = np.degrees(Rotation.from_matrix(batch.rotation.numpy()).magnitude())
+            assert 3 < np.median(angles) < 30
         else:
             assert batch.rotation[:, 1, 2].quantile(0.75) < -0.8  # the third axis is upwards in the image
+            assert batch.rotation[:, 2, :2].mean(0).norm() < 0.35  # and any horizontal direction is ahead
     extents = [np.median(np.ptp(pair.points3d, axis=0)) for pair in plenty]
     assert max(extents) / min(extents) > 20
 

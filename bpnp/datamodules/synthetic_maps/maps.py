@@ -3,10 +3,11 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.augment import Drawn, bounds
 from bpnp.datamodules.pair import Pair
@@ -23,6 +24,7 @@ from bpnp.datamodules.synthetic_maps.photos import (
 from bpnp.datamodules.synthetic_maps.scene import Array, Kind, Scene, Viewpoint
 from bpnp.datamodules.synthetic_maps.surrounded import courtyard, interior, street
 
+Frame = Literal["upright", "view"]
 LONG_SIDE = 1200.0  # of an image, pixels
 LEAST_POINTS = 1500  # feature points of a scene
 MOST_ERROR_PX = 5.0  # of a true pair, pixels; beyond, a reconstruction drops the keypoint from its point
@@ -55,13 +57,18 @@ WEIGHTS = {name: kind.weight for name, kind in KINDS.items()}
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How pairs of synthetic maps are drawn; see `SfmSceneDataModule`."""
+    """How pairs of synthetic maps are drawn; see `SfmSceneDataModule`.
+
+    frame: of the map, "upright" for the third axis upwards and any heading, "view" for the camera axes of the first of
+    the photos whose map points are taken.
+    """
 
     num_points: int = 256
     min_points: int = 16
     outliers: Drawn = (0.25, 1.0)
     views: tuple[int, int] = (1, 3)
     kinds: Mapping[str, float] = field(default_factory=lambda: dict(WEIGHTS))
+    frame: Frame = "upright"
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: Drawn = (24.0, 115.0)
     noise_px: Drawn = (0.1, 1.5)
@@ -80,6 +87,8 @@ class MapOptions:
                 )
         if not 0 < self.scale_range[0] <= self.scale_range[1] < np.inf:
             raise ValueError(f"expected a positive `scale_range` (low, high), got {self.scale_range}")
+        if self.frame not in get_args(Frame):
+            raise ValueError(f"expected `frame` among {', '.join(get_args(Frame))}, got {self.frame!r}")
         if not 1 <= self.views[0] <= self.views[1]:
             raise ValueError(f"expected `views` (low, high) of 1 or more, got {self.views}")
         if not set(self.kinds) <= set(KINDS) or not all(w >= 0 for w in self.kinds.values()) or not any(
@@ -142,10 +151,12 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     kept, extra2d, extra3d = _amounts(len(true2d), len(others2d), len(others3d), options, rng)
     if kept < options.min_points:
         return None
+    heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
+    turn = cameras[0].rotation if options.frame == "view" else heading
     pick = rng.permutation(len(true2d))[:kept]
     chosen2d = np.concatenate([true2d[pick], rng.permutation(others2d)[:extra2d]])
     chosen3d = np.concatenate([true3d[pick], rng.permutation(others3d)[:extra3d]])
-    points3d, rotation, translation = _in_frame(mapped.points[chosen3d], photo, options.scale_range, rng)
+    points3d, rotation, translation = _in_frame(mapped.points[chosen3d], photo, turn, options.scale_range, rng)
     return Pair(
         name, keypoints[chosen2d].astype(np.float32), points3d.astype(np.float32), kept, rotation, translation, focal
     )  # fmt: skip
@@ -218,9 +229,10 @@ def _log_uniform(value: Drawn, rng: np.random.Generator) -> float:
 
 
 def _in_frame(
-    points: Array, camera: Camera, scale_range: tuple[float, float], rng: np.random.Generator
+    points: Array, camera: Camera, turn: Array, scale_range: tuple[float, float], rng: np.random.Generator
 ) -> tuple[Array, Array, Array]:
-    """Points and pose in an upright frame of any scale and an origin nearby."""
+    """Points and pose in a frame turned by `turn` (3, 3), of any scale and an origin nearby."""
     scale = _log_uniform(scale_range, rng)
     origin = 20 * scale * rng.standard_normal(3)
-    return scale * points + origin, camera.rotation, scale * camera.translation - camera.rotation @ origin
+    rotation = camera.rotation @ turn.T
+    return scale * points @ turn.T + origin, rotation, scale * camera.translation - rotation @ origin

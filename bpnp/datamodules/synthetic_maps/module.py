@@ -1,7 +1,7 @@
 """Maps without a download: as many scenes, photos and maps as one likes."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Int
@@ -60,7 +60,8 @@ class SfmSceneDataModule(PairDataModule):
             [low, high], draw it for each pair, uniformly.
         views: lowest and highest number of photos whose map points are taken.
         kinds: weight of each kind of scene; none for all kinds, in the shares of `maps.WEIGHTS`.
-        rotate: turn each scene by a random rotation; false for scenes whose third axis points upwards.
+        frame: of the map: any, turned by a random rotation; upright, the third axis upwards and any heading; view, the
+            camera axes of the first of the photos whose map points are taken.
         scale_range: lowest and highest number of scene units in a metre, drawn for each scene, uniformly in its
             logarithm.
         field_of_view: of the longer side of an image, degrees; a number or [low, high], uniform in the logarithm.
@@ -81,7 +82,7 @@ class SfmSceneDataModule(PairDataModule):
         outliers: Drawn = (0.25, 1.0),
         views: tuple[int, int] = (1, 3),
         kinds: Mapping[str, float] | None = None,
-        rotate: bool = True,
+        frame: Literal["any", "upright", "view"] = "any",
         scale_range: tuple[float, float] = (0.1, 10.0),
         field_of_view: Drawn = (24.0, 115.0),
         noise_px: Drawn = (0.1, 1.5),
@@ -94,15 +95,16 @@ class SfmSceneDataModule(PairDataModule):
             outliers=outliers,
             views=views,
             kinds=WEIGHTS if kinds is None else kinds,
+            frame="upright" if frame == "any" else frame,
             scale_range=scale_range,
             field_of_view=field_of_view,
             noise_px=noise_px,
         )
         self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
-        self.fresh, self.rotate = fresh_views, rotate
+        self.fresh, self.turned = fresh_views, frame == "any"
 
     def _augmentation(self, part: str) -> Augmentation:
-        return Augmentation(rotate=self.rotate, outliers=self.outliers[part])
+        return Augmentation(rotate=self.turned, outliers=self.outliers[part])
 
     def _source(self, part: str, seed: tuple[int, int]) -> MapSource:
         split = "test" if part == "predict" else part
