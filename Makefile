@@ -35,7 +35,11 @@ wheel: install
 	$(BIN)/python -m pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
 	$(PYTHON) -m venv --clear build/empty
 	build/empty/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt dist/bpnp-*.whl
-	cd build/empty && bin/bpnp --version && bin/bpnp fit --config quickstart --trainer.fast_dev_run true
+	cp examples/wheel.py build/empty && cd build/empty && bin/bpnp --version && bin/python wheel.py
+	cd build/empty && bin/bpnp solve points2d.csv points3d.csv --camera camera.csv --picture pose.png
+	cd build/empty && bin/bpnp fit --config quickstart --config presets/debug
+	cd build/empty && bin/bpnp test --config quickstart --config presets/debug --ckpt_path last
+	cd build/empty && bin/bpnp report runs/debug/test --html report.html
 
 clean:
 	rm -rf $(VENV) runs .cache build dist

@@ -1,7 +1,12 @@
+import importlib
+import inspect
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
+from lightning import Trainer
 from planted_model import plant_model
 from small_data import SMALL_NET, write_mesh_tree
 from torch import Tensor, nn
@@ -9,6 +14,7 @@ from torch import Tensor, nn
 import bpnp
 from bpnp import BPnPNet
 from bpnp.cli import main
+from bpnp.training import BlindPnPTask
 
 CONFIGS = Path(bpnp.__file__).parent / "configs"
 RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
@@ -81,3 +87,37 @@ def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: p
     configs = ["--config=quickstart", f"--config=presets/{Path(preset).stem}"]
     arguments = [*configs, *data_for("quickstart", tmp_path), *SMALL_NET[1:]]
     main(["fit", *arguments, f"--trainer.default_root_dir={tmp_path}"])
+
+
+def restated(content: Any, kind: type) -> Iterator[str]:
+    """Options of a configuration that have the value which they have without it."""
+    for name, value in (content or {}).items():
+        if isinstance(value, dict) and "class_path" in value:
+            yield from restated(value.get("init_args"), import_object(value["class_path"]))
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for each in value:
+                yield from restated(each.get("init_args"), import_object(each["class_path"]))
+        elif any(
+            name in signature and list_or_value(signature[name].default) == value
+            for signature in (inspect.signature(base.__init__).parameters for base in kind.__mro__)
+        ):
+            yield f"{kind.__name__}.{name}"
+
+
+def list_or_value(value: Any) -> Any:
+    return list(value) if isinstance(value, tuple) else value
+
+
+def import_object(path: str) -> Any:
+    module, name = path.rsplit(".", 1)
+    return getattr(importlib.import_module(module), name)
+
+
+@pytest.mark.parametrize("recipe", RECIPES)
+def test_a_recipe_says_only_what_differs_from_the_defaults(recipe: str) -> None:
+    content = yaml.safe_load((CONFIGS / recipe).read_text())
+    data = import_object(content["data"]["class_path"])
+    found = [*restated(content["model"], BlindPnPTask), *restated(content["data"].get("init_args"), data)]
+    found += restated(content["trainer"], Trainer)
+    assert found == []
+    assert list(restated({"batch_size": 16}, data)) == [f"{data.__name__}.batch_size"]

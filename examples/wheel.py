@@ -1,0 +1,14 @@
+"""What an installed wheel has to do, away from the checkout: solve, load packaged weights, and write the files that
+`make wheel` gives to `bpnp solve`."""
+
+import numpy as np
+
+import bpnp
+from bpnp.examples import load
+
+example = load("photo")
+solution = bpnp.solve(example.points2d, example.points3d, example.camera)
+print(bpnp.__file__, solution.verdict, f"{example.rotation_error_deg(solution.rotation):.2f} deg")
+bpnp.BPnPNet.from_pretrained("procedural-so3")
+for name in ("points2d", "points3d", "camera"):
+    np.savetxt(f"{name}.csv", getattr(example, name), delimiter=",")
