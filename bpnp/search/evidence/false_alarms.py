@@ -137,8 +137,11 @@ def _density(image: ImageStatistics, bearings: Array, directions: Array) -> Arra
     if not len(some):
         return np.full(len(bearings), mean)
     width2 = (OUTLINE * image.spread) ** 2
-    squared = np.maximum(2 - 2 * bearings @ some.T, 0)
-    smooth = np.exp(squared / (-2 * width2)).sum(1) / (2 * math.pi * width2) * (len(directions) / len(some))
+    # From the centre of the view float32 has the digits of a narrow one.
+    one, other = ((points - image.centre).astype(np.float32) for points in (bearings, some))
+    squared = (one * one).sum(1)[:, None] + (other * other).sum(1) - 2 * (one @ other.T)
+    kernel = np.exp(squared * np.float32(-0.5 / width2)).sum(1, dtype=np.float64)
+    smooth = kernel / (2 * math.pi * width2) * (len(directions) / len(some))
     return np.maximum(smooth, mean)
 
 
