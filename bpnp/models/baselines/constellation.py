@@ -10,11 +10,10 @@ from torch import Tensor
 from bpnp.checks import check_positive
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
 from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
 from bpnp.robust.local_refinement import refine_locally
 from bpnp.robust.p3p import p3p
 from bpnp.robust.scoring import Pairs
-from bpnp.types import Pose
 
 CHUNK = 2**14  # triples solved at a time
 SHORTLIST = 64  # poses that are matched one to one and refined
@@ -57,7 +56,7 @@ class Constellation(PairSolver):
         self.radius, self.min_matches = radius, min_matches
         self.neighbours2d, self.neighbours3d = neighbours2d, neighbours3d
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
         triples2d = neighbour_triples(pair.points2d, self.neighbours2d, ordered=False)
         triples3d = neighbour_triples(pair.points3d, self.neighbours3d, ordered=True)
         poses, counts, tried = [], [], 0
@@ -72,14 +71,14 @@ class Constellation(PairSolver):
             counts.append(count[best])
             tried += len(part)
         if tried == 0 or len(candidates := torch.cat(poses)) == 0:
-            return no_pose(pair.points3d, tried)
+            return Answer(iterations=tried)
         shortlist = torch.cat(counts).topk(min(SHORTLIST, len(candidates))).indices
         results = [self._refined(pair, pose) for pose in candidates[shortlist]]
         pose, matches, squared = max(results, key=lambda result: (result[1], -result[2]))
         if matches < MIN_POINTS:
-            return no_pose(pair.points3d, tried)
+            return Answer(iterations=tried)
         converged = matches >= self.min_matches and tried == len(triples2d) * len(triples3d)
-        return one_pose(pose[:, :3], pose[:, 3], tried, (squared / matches) ** 0.5, converged)
+        return Answer((pose[:, :3], pose[:, 3]), tried, (squared / matches) ** 0.5, converged)
 
     def _refined(self, pair: SinglePair, pose: Float[Tensor, "3 4"]) -> tuple[Float[Tensor, "3 4"], int, float]:
         """The pose refined on its matches, or as it was if that has fewer; number of matches, sum of their squares."""

@@ -7,10 +7,9 @@ from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS, bearings
 from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over, pair_seed
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over, pair_seed
 from bpnp.robust.p3p import p3p
 from bpnp.robust.sampling import distinct_triples
-from bpnp.types import Pose
 
 TRIPLES = 256  # solved at a time
 PREVIEW = 32  # 2D points on which every hypothesis is scored
@@ -51,7 +50,7 @@ class RandomRansac(PairSolver):
         self.threshold, self.confidence, self.seed = threshold, confidence, seed
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
         m, n = len(pair.points2d), len(pair.points3d)
         best, tried, most, pairs = None, 0, 0, 0
         while tried < self.max_hypotheses and not over(deadline) and not self._enough(pairs, m, n, tried):
@@ -61,8 +60,8 @@ class RandomRansac(PairSolver):
             if found is not None and found[2] > most:
                 best, most, pairs = found[:2], found[2], found[3]
         if best is None:
-            return no_pose(pair.points3d, tried)
-        return one_pose(*best, tried, 1 - most / (m + n), self._enough(pairs, m, n, tried))
+            return Answer(iterations=tried)
+        return Answer(best, tried, 1 - most / (m + n), self._enough(pairs, m, n, tried))
 
     def _triples(self, pair: SinglePair, count: int, tried: int) -> tuple[Int[Tensor, "h 3"], Int[Tensor, "h 3"]]:
         """Three different points of each side for every hypothesis."""

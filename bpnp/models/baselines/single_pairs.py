@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -24,6 +25,15 @@ class SinglePair:
     translation: Float[Tensor, "3"] | None = None
 
 
+class Answer(NamedTuple):
+    """The pose of one pair, None if there is none, and how its solver ended: the fields of `SolveStats`."""
+
+    pose: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]] | None = None
+    iterations: int = 0
+    residual: float = math.inf
+    converged: bool = False
+
+
 class PairSolver(nn.Module):
     """A solver of single pairs: subclasses implement `solve` and name their one estimate.
 
@@ -41,27 +51,22 @@ class PairSolver(nn.Module):
     def forward(self, batch: Batch) -> Prediction:
         # The trainer's inference mode would forbid a local optimiser's gradients.
         with torch.inference_mode(False), torch.no_grad():
-            found = [self._solve(pair) for pair in _pairs(batch)]
-            return Prediction(poses={self.estimates[0]: _collect(found, batch)})
+            answers = [self._solve(pair) for pair in _pairs(batch)]
+            like = batch.points3d
+            missing = like.new_full((3, 3), math.nan), like.new_full((3,), math.nan)
+            poses = zip(*(missing if answer.pose is None else answer.pose for answer in answers), strict=True)
+            stats = SolveStats(*(torch.tensor(values) for values in zip(*(a[1:] for a in answers), strict=True)))
+            rotation, translation = (torch.stack([value.to(like) for value in values]) for values in poses)
+            return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
-        """The pose of one pair, a batch of one, found before `deadline` on the clock of `time.monotonic`."""
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
+        """The pose of one pair, found before `deadline` on the clock of `time.monotonic`."""
         raise NotImplementedError
 
-    def _solve(self, pair: SinglePair) -> Pose:
+    def _solve(self, pair: SinglePair) -> Answer:
         if min(len(pair.points2d), len(pair.points3d)) < MIN_POINTS:
-            return no_pose(pair.points3d)
+            return Answer()
         return self.solve(pair, math.inf if self.time_limit is None else time.monotonic() + self.time_limit)
-
-
-def one_pose(rotation: Tensor, translation: Tensor, iterations: int, residual: float, converged: bool) -> Pose:
-    """A batch of one pose, of a rotation (3, 3) and a translation (3,)."""
-    stats = SolveStats(torch.tensor([iterations]), rotation.new_tensor([residual]), torch.tensor([converged]))
-    return Pose(rotation.unsqueeze(0), translation.unsqueeze(0), stats.to(rotation.device))
-
-
-def no_pose(like: Tensor, iterations: int = 0) -> Pose:
-    return one_pose(like.new_full((3, 3), math.nan), like.new_full((3,), math.nan), iterations, math.inf, False)
 
 
 def over(deadline: float) -> bool:
@@ -79,13 +84,3 @@ def _pairs(batch: Batch) -> Iterator[SinglePair]:
         pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
         points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
         yield SinglePair(points2d.double().clone(), points3d.double().clone(), index, *pose)
-
-
-def _collect(found: list[Pose], batch: Batch) -> Pose:
-    stats = zip(*((pose.stats.iterations, pose.stats.residual, pose.stats.converged) for pose in found), strict=True)
-    pose = Pose(
-        torch.cat([pose.rotation for pose in found]),
-        torch.cat([pose.translation for pose in found]),
-        SolveStats(*(torch.cat(values) for values in stats)),
-    )
-    return pose.to(batch.points3d)

@@ -21,8 +21,7 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
 )  # fmt: skip
 from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
 from bpnp.models.baselines.initial_poses import weak_perspective_distance
-from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
-from bpnp.types import Pose
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
@@ -125,14 +124,14 @@ class GOPAC(PairSolver):
         check_positive(angle=angle)
         self.angle, self.max_boxes = angle, max_boxes
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
         points, centre, radius = unit_scene(pair.points3d)
         domain = whole_domain(points, DOMAIN * weak_perspective_distance(pair.points2d, points))
         found = maximise_inliers(
             bearings(pair.points2d), points, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline
         )
         if found.rotation is None:
-            return no_pose(points, found.boxes)
+            return Answer(iterations=found.boxes)
         translation = -found.rotation @ (radius * found.place + centre)
         residual = 1 - found.inliers / len(pair.points2d)
-        return one_pose(found.rotation, translation, found.boxes, residual, found.inliers >= found.bound)
+        return Answer((found.rotation, translation), found.boxes, residual, found.inliers >= found.bound)

@@ -25,8 +25,7 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
 from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, lower_bound, squared_norm
 from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
 from bpnp.models.baselines.initial_poses import weak_perspective_distance
-from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, one_pose, over
-from bpnp.types import Pose
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
 
 DOMAIN = 1.5
 CLOSEST = 0.5
@@ -187,7 +186,7 @@ class GOSMA(PairSolver):
         check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
         self.cluster2d, self.cluster3d, self.batch, self.max_boxes = cluster2d, cluster3d, batch, max_boxes
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
         rays = bearings(pair.points2d)
         mean_ray = torch.nn.functional.normalize(rays.sum(0), dim=0)
         angle = root_mean_square(torch.acos((rays @ mean_ray).clamp(-1, 1)))
@@ -199,4 +198,4 @@ class GOSMA(PairSolver):
             deadline=deadline,
         )  # fmt: skip
         translation = -found.rotation @ (radius * found.place + centre)
-        return one_pose(found.rotation, translation, found.boxes, found.value, found.certified)
+        return Answer((found.rotation, translation), found.boxes, found.value, found.certified)

@@ -1,15 +1,13 @@
 """SoftPOSIT as a solver of batches, from the paper's initial poses or from many random ones."""
 
-from dataclasses import replace
 from typing import Literal
 
 from torch import Tensor
 
 from bpnp.models.baselines.agreement import agreement
 from bpnp.models.baselines.initial_poses import mean_pose, near_truth, random_poses
-from bpnp.models.baselines.single_pairs import PairSolver, SinglePair, no_pose, one_pose, over
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
 from bpnp.models.baselines.softposit.algorithm import softposit
-from bpnp.types import Pose
 
 Start = Literal["mean", "near_truth", "random"]
 CHUNK = 2**22  # pairs of points, times initial poses, that are annealed together
@@ -47,10 +45,10 @@ class SoftPOSIT(PairSolver):
             raise ValueError(f"expected `start` mean, near_truth or random, got {start!r}")
         self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
-    def solve(self, pair: SinglePair, deadline: float) -> Pose:
+    def solve(self, pair: SinglePair, deadline: float) -> Answer:
         rotation, translation = self._initial_poses(pair)
         together = max(1, CHUNK // (len(pair.points2d) * len(pair.points3d)))
-        best, most, finished = no_pose(pair.points3d), -1, True
+        best, most, finished = Answer(), -1, True
         for turned, shift in zip(rotation.split(together), translation.split(together), strict=True):
             if over(deadline):
                 finished = False
@@ -62,10 +60,9 @@ class SoftPOSIT(PairSolver):
             score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
             i = int(score.argmax())
             if int(score[i]) > most:
-                most, residual, accepted = int(score[i]), float(found.residual[i]), bool(found.accepted[i])
-                best = one_pose(found.rotation[i], found.translation[i], found.steps, residual, accepted)
-        converged = best.stats.converged & finished
-        return replace(best, stats=replace(best.stats, converged=converged))
+                most, pose = int(score[i]), (found.rotation[i], found.translation[i])
+                best = Answer(pose, found.steps, float(found.residual[i]), bool(found.accepted[i]))
+        return best._replace(converged=best.converged and finished)
 
     def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
         if self.start == "mean":
