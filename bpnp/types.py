@@ -19,21 +19,31 @@ from bpnp.geometry import is_finite
 _T = TypeVar("_T")
 
 
+class Tensors:
+    """A dataclass of tensors, of dicts of them, and of such dataclasses."""
+
+    def to(self: _T, *args: Any, **kwargs: Any) -> _T:
+        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
+
+        def move(x: Tensor) -> Tensor:
+            moved = x.to(*args, **kwargs)
+            # A dtype is for numbers: half precision has no index 257.
+            return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
+
+        return _mapped(self, move)
+
+
 @dataclass(frozen=True)
-class SolveStats:
+class SolveStats(Tensors):
     """How an iterative solver ended, per sample."""
 
     iterations: Int[Tensor, " b"]
     residual: Float[Tensor, " b"]
     converged: Bool[Tensor, " b"]
 
-    def to(self, *args: Any, **kwargs: Any) -> "SolveStats":
-        """Move every tensor; a dtype applies to the floating-point ones. Same arguments as `Tensor.to`."""
-        return _moved(self, *args, **kwargs)
-
 
 @dataclass(frozen=True)
-class Pose:
+class Pose(Tensors):
     """World-to-camera poses. A sample without a pose holds NaN and `stats.converged` False."""
 
     rotation: Float[Tensor, "b 3 3"]
@@ -45,12 +55,9 @@ class Pose:
         """Samples that have a finite pose."""
         return is_finite(self.rotation, self.translation)
 
-    def to(self, *args: Any, **kwargs: Any) -> "Pose":
-        return _moved(self, *args, **kwargs)
-
 
 @dataclass(frozen=True)
-class Prediction:
+class Prediction(Tensors):
     """A solver's answer: the joint probability of every pair, and each pose estimate by name.
 
     assignment: what the solver's own transport gave. rematched: that of the last round, of a solver that matches again
@@ -65,12 +72,9 @@ class Prediction:
     unmatched3d: Float[Tensor, "b n"] | None = None
     rematched: Float[Tensor, "b m n"] | None = None
 
-    def to(self, *args: Any, **kwargs: Any) -> "Prediction":
-        return _moved(self, *args, **kwargs)
-
 
 @dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy
-class Batch:
+class Batch(Tensors):
     """Pairs of point sets, padded and masked.
 
     points2d: (b, m, 2) normalised image coordinates.
@@ -107,9 +111,6 @@ class Batch:
     @property
     def count3d(self) -> Int[Tensor, " b"]:
         return self.mask3d.sum(-1)
-
-    def to(self, *args: Any, **kwargs: Any) -> "Batch":
-        return _moved(self, *args, **kwargs)
 
     def pin_memory(self) -> "Batch":
         return _mapped(self, lambda x: x.pin_memory())
@@ -169,15 +170,6 @@ class Batch:
             translation=None if translations is None else stacked("translation", translations, (3,), dtype),
             match3d=None if matches is None else padded(matches, n, -1),
         )
-
-
-def _moved(value: _T, *args: Any, **kwargs: Any) -> _T:
-    def move(x: Tensor) -> Tensor:
-        moved = x.to(*args, **kwargs)
-        # A dtype is for numbers: half precision has no index 257.
-        return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
-
-    return _mapped(value, move)
 
 
 def _mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
+from bpnp.layers.plan import cached_parts
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.composition import AnyModule, chosen
@@ -103,9 +104,11 @@ class _PairwiseDistance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
-        squared = torch.baddbmm(a.new_full((1, 1, 1), 2.0), a, b.mT, alpha=-2)
-        near = squared <= SQUARED_FLOOR
-        distance = squared.sqrt_().masked_fill_(near, 0)
+        distance = a.new_empty(*a.shape[:2], b.shape[1])
+        for part, x, y in cached_parts(distance, a, b):
+            squared = torch.baddbmm(x.new_full((1, 1, 1), 2.0), x, y.mT, alpha=-2, out=part)
+            near = squared <= SQUARED_FLOOR
+            squared.sqrt_().masked_fill_(near, 0)
         ctx.save_for_backward(a, b, distance)
         return distance
 
@@ -113,5 +116,9 @@ class _PairwiseDistance(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, distance = ctx.saved_tensors
-        weight = (gradient / distance).masked_fill_(distance == 0, 0).neg_()
-        return weight @ b, weight.mT @ a
+        parts = []
+        for d, g, x, y in cached_parts(distance, gradient, a, b):
+            weight = (g / d).masked_fill_(d == 0, 0).neg_()
+            parts.append((weight @ y, weight.mT @ x))
+        to_a, to_b = map(torch.cat, zip(*parts, strict=True))
+        return to_a, to_b
