@@ -22,15 +22,16 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
     names another one); where neither can, each process compiles again. A function is compiled without the wrappers that
     a type checker puts around it when it is imported.
-    options: of `numba.njit`.
+    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time.
     """
+    options |= {"nogil": True, "no_cfunc_wrapper": True}
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
         try:
-            return numba.njit(function, nogil=True, cache=True, **options)
+            return numba.njit(function, cache=True, **options)
         except RuntimeError:  # numba finds no folder for its cache
-            return numba.njit(function, nogil=True, **options)
+            return numba.njit(function, **options)
 
     return compiled
 

@@ -25,6 +25,13 @@ LACKING = 0.25  # matches that an expected but missing point takes away
 
 
 @compiled
+def copy(values: Any, to: Any) -> None:
+    """Element by element: numba compiles an assignment of arrays for more than a second."""
+    for k in range(len(values)):
+        to[k] = values[k]
+
+
+@compiled
 def consider(
     pose: Any, rays: Any, scene: Any, image: Any, reach: float, used: int, density: float, prior: Any, found: Any,
     work: Any,
@@ -119,9 +126,11 @@ def keep(pose: Any, value: float, count: int, visible: int, expected: int, found
                 place = c
     if values[place] >= value:
         return
-    poses[place], values[place] = pose, value
+    values[place] = value
+    copy(pose, poses[place])
     counts[place, 0], counts[place, 1], counts[place, 2] = count, visible, expected
-    matches[place], distances2[place] = work[3], work[4]
+    copy(work[3], matches[place])
+    copy(work[4], distances2[place])
     for c in range(len(values)):
         if values[c] > values[best[0]]:
             best[0] = c
@@ -162,7 +171,8 @@ def exchange(
     for i in range(len(own)):
         if own[i] < 0 or count - 1 <= used:
             continue
-        pose[:], matched[:] = best, own
+        copy(best, pose)
+        copy(own, matched)
         matched[i] = -1
         if not _stepped(pose, rays, scene, prior, work):
             continue
@@ -171,7 +181,8 @@ def exchange(
             settle(rays, scene, image, used, density, prior, found, work)
         if other < 0:
             continue
-        pose[:], matched[:] = best, own
+        copy(best, pose)
+        copy(own, matched)
         for k in range(len(own)):
             if own[k] == other:
                 matched[k] = -1
