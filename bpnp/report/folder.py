@@ -18,7 +18,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from bpnp.files import written_whole
+from bpnp.files import named, written_whole
 from bpnp.metrics import RecallThresholds
 from bpnp.report.results import PairRow, Results, pipeline_order, summarise
 
@@ -112,7 +112,7 @@ def append_rows(folder: Path, rows: Iterable[PairRow]) -> None:
     """
     path = folder / UNFINISHED
     folder.mkdir(parents=True, exist_ok=True)
-    with path.open("ab") as file:
+    with named(path), path.open("ab") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         if file.tell() and not path.read_bytes().endswith(b"\n"):
             file.truncate(len(_encoded([COLUMNS, *map(astuple, _rows(path, cut=True))])))

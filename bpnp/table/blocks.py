@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bpnp.files import written_whole
 from bpnp.report.figures import save_figure
 from bpnp.report.published import Paper
 from bpnp.report.runs import mean_and_spread
@@ -55,7 +56,8 @@ def lines_of(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Lin
 def write_tables(folder: Path, lines: Sequence[Line], paper: Paper | None) -> list[Path]:
     written = []
     for name, write in (("table.csv", as_csv), ("table.md", as_markdown), ("table.tex", as_latex)):
-        (folder / name).write_text(write(lines, paper), encoding="utf-8", newline="")
+        with written_whole(folder / name) as temporary:
+            temporary.write_text(write(lines, paper), encoding="utf-8", newline="")
         written.append(folder / name)
     if any(line.rho is not None for line in lines):
         written.append(save_figure(sweep_figure(lines), folder / "outliers.png"))

@@ -195,6 +195,12 @@ def test_finished_pairs_are_on_the_disk_before_the_test_ends(tmp_path: Path) -> 
     assert finished_rows(tmp_path / "run") == list(read_results(tmp_path / "run").rows)
 
 
+def test_a_full_disk_names_the_file_of_the_finished_pairs(tmp_path: Path) -> None:
+    (tmp_path / "unfinished.csv").symlink_to("/dev/full")
+    with pytest.raises(OSError, match=r"No space left on device: '.*unfinished\.csv'"):
+        append_rows(tmp_path, [row(0)])
+
+
 def test_results_as_a_data_frame(tmp_path: Path) -> None:
     rows = [row(i, rotation_error_deg=float(i)) for i in range(12)]
     frame = write_results(tmp_path, rows).frame()
