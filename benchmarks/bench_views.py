@@ -4,6 +4,7 @@ python benchmarks/bench_views.py --data ../shared/data --methods solve view-prio
 Methods: solve; view-prior (the first view's pose as `PosePrior`); rough-prior (4 degrees and 4 % of the distance off,
 2 s); bpnpnet, matcher and learned (the packaged networks); oracle (RANSAC on the true pairs). Photos are left out of
 their map.
+The first three use the cones from which the points are seen; --known: these, and the lengths of the tracks, or nothing.
 """
 
 import argparse
@@ -12,6 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import poselib
@@ -19,17 +21,27 @@ from scipy.spatial.transform import Rotation
 from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, scene_pairs
 
 from bpnp import PosePrior, solve
+from bpnp.cameras import camera_from
 from bpnp.models import TrainedNet
+from bpnp.solving.problem import problem_from
+from bpnp.solving.sources import Options, solutions_of
 
 AUC_PX = (1.0, 5.0, 10.0)
 VIEW_DEGREES, VIEW_SHARE = 12.0, 0.12  # how far a photo is from a view that shares a third of its points
 ROUGH_DEGREES, ROUGH_SHARE, ROUGH_SECONDS = 4.0, 0.04, 2.0
+KNOWN: set[str] = {"cones", "tracks"}  # what `solve`, `view-prior` and `rough-prior` are told of the points
 Answer = tuple[Array, Array, str]  # rotation, translation, verdict
 
 
 def by_search(pair: ViewPair, prior: PosePrior | None, seed: int, time_limit: float | None) -> Answer:
-    camera = np.diag([pair.focal, pair.focal, 1.0])
-    found = solve(pair.focal * pair.points2d, pair.points3d, camera, prior=prior, seed=seed, time_limit=time_limit)
+    known: dict[str, Any] = {}
+    if "cones" in KNOWN:
+        known |= {"normals3d": pair.cones.axes, "cosines3d": pair.cones.cosines}
+    if "tracks" in KNOWN:
+        known |= {"scores3d": pair.scores3d}
+    camera = camera_from(np.diag([pair.focal, pair.focal, 1.0]))
+    problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, prior=prior, **known)
+    found = solutions_of({0: problem}, Options(seed=seed, time_limit=time_limit))[0]
     return found.rotation, found.translation, found.verdict
 
 
@@ -151,11 +163,15 @@ def main() -> None:
     )
     parser.add_argument("--all-points", action="store_true", help="do not thin to 1,024")
     parser.add_argument("--limit", type=int, default=12, help="photos of a scene (default: 12)")
+    parser.add_argument(
+        "--known", nargs="*", choices=sorted(KNOWN), default=["cones"], help="of the points (default: cones)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--time-limit", type=float)
     parser.add_argument("--output", type=Path, help="JSON to write the rows to")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
+    KNOWN.intersection_update(options.known)
     results = []
     for outliers in options.outliers:
         chosen = {"limit": options.limit, "views": options.views, "most": None if options.all_points else MOST_POINTS}

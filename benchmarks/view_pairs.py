@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
+from bpnp.maps.cones import Cones, seen_again, viewing_cones
 
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024
@@ -25,6 +26,7 @@ class ViewPair:
 
     rotation, translation: of the photo. views: poses of the k views, most overlap first. focal: pixels.
     outliers: share of the points without a partner, of the 2D and of the 3D side.
+    cones, scores3d: from the tracks in the map without the photo.
     """
 
     name: str
@@ -35,6 +37,8 @@ class ViewPair:
     translation: Array
     views: tuple[tuple[Array, Array], ...]
     focal: float
+    cones: Cones
+    scores3d: Array
 
     @property
     def true_pairs(self) -> int:
@@ -107,17 +111,22 @@ def view_pair(
     ).astype(np.float64)
     index3d = np.concatenate([true[pick], rng.choice(others3d, extra3d, replace=False)]).astype(np.int64)
     order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
+    others = ((-view.rotation.T @ view.translation, view.observed) for view in scene.images if view is not query)
+    cones = viewing_cones(scene.points3d, others)
+    chosen3d = index3d[order3d]
     match3d = np.full(len(index3d), -1)
     match3d[:kept] = np.argsort(order2d)[:kept]
     return ViewPair(
         name=f"{scene.name}/{query.name}",
         points2d=points2d[order2d],
-        points3d=scene.points3d[index3d[order3d]],
+        points3d=scene.points3d[chosen3d],
         match3d=match3d[order3d],
         rotation=query.rotation,
         translation=query.translation,
         views=tuple((view.rotation, view.translation) for view in chosen),
         focal=query.focal,
+        cones=Cones(cones.axes[chosen3d], cones.cosines[chosen3d]),
+        scores3d=seen_again(tracks[chosen3d]),
     )
 
 

@@ -92,7 +92,10 @@ def _tried(
 ) -> Solution:
     """The best pose of the photo among the points of one region."""
     known = checked_prior(region.prior(scene) if prior is None else prior)
-    problem = problem_from(keypoints, scene.points3d[region.points], camera_from(camera), prior=known)
+    problem = problem_from(
+        keypoints, scene.points3d[region.points], camera_from(camera), normals3d=scene.cones.axes[region.points],
+        cosines3d=scene.cones.cosines[region.points], prior=known,
+    )  # fmt: skip
     found = solutions_of({0: problem}, options)[0]
     ids = scene.point_ids[region.points]
     matches = np.column_stack([found.matches[:, 0], ids[found.matches[:, 1]]])

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from bpnp.cameras import Camera
+from bpnp.maps.cones import Cones, viewing_cones
 
 Array = NDArray[np.float64]
 Map = TypeVar("Map", bound="ViewedPoints")
@@ -55,6 +56,11 @@ class ViewedPoints:
         columns = np.concatenate([view.points for view in self.views])
         entries = np.ones(len(columns), np.int32), columns, np.concatenate([[0], np.cumsum(counts)])
         return csr_array(entries, shape=(len(self.views), len(self.points3d)))
+
+    @cached_property
+    def cones(self) -> Cones:
+        """From where each point is seen."""
+        return viewing_cones(self.points3d, ((view.centre, view.points) for view in self.views))
 
     @cached_property
     def covisibility(self) -> csr_array:

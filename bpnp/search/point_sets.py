@@ -24,8 +24,9 @@ class PointSets:
 
     bearings: (m, 3) unit vectors. points3d: (n, 3). normals3d: (n, 3) outward unit normals; a point that faces away is
     not seen. labels2d (m,), labels3d (n,): only points of one label can be partners, -1 fits any.
-    cosines3d: (n,) least cosine, 0 or more, between a normal and the direction to a camera that sees the point; None
-    for 0. scores2d (m,), scores3d (n,): probability that a point has a partner, in (0, 1]; None for equal ones.
+    cosines3d: (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0. With
+    them the few-point search leaves the normals aside. scores2d (m,), scores3d (n,): probability that a point has a
+    partner, in (0, 1]; None for equal ones.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
     prior: what is known of the pose.
     """

@@ -37,6 +37,8 @@ def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) ->
     """
 
     certain = False
+    if sets.cosines3d is not None:
+        sets = replace(sets, normals3d=None, cosines3d=None)
 
     def is_safe(found: FewPoses) -> bool:
         nonlocal certain
