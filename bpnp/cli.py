@@ -91,14 +91,22 @@ def help_text() -> str:
     )
 
 
+def _config_file(name: str) -> str:
+    """The file of a configuration, which may be a packaged one. Raises ValueError if there is none."""
+    path = packaged_config(name)
+    if not os.path.isfile(path):
+        _known(name, config_names(), "a configuration file or the name of a packaged one")
+    return path
+
+
 def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
     """The arguments with the file in place of the name of a packaged configuration."""
     found = list(arguments)
     for i, text in enumerate(arguments):
         if text in ("-c", "--config") and i + 1 < len(arguments):
-            found[i + 1] = packaged_config(arguments[i + 1])
+            found[i + 1] = _config_file(arguments[i + 1])
         elif text.startswith("--config="):
-            found[i] = f"--config={packaged_config(text.removeprefix('--config='))}"
+            found[i] = f"--config={_config_file(text.removeprefix('--config='))}"
     return found
 
 
