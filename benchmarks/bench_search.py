@@ -188,7 +188,17 @@ def table(results: dict[str, dict]) -> str:
             f"{row['cpu_seconds_mean']:.2f}",
             f"{row['batches_mean']:.1f}",
         ))  # fmt: skip
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    parts = [row for name, row in results.items() if not name.endswith("-all")]
+    wholes = [row for name, row in results.items() if name.endswith("-all")]
+    return f"\n{rows}\n\nOf all sets but `SCENE-all`: {_claims(parts)}. Of these: {_claims(wholes)}.\n"
+
+
+def _claims(rows: list[dict]) -> str:
+    confident = sum(round(row["confident"] * row["pairs"]) for row in rows)
+    over2, over5 = (sum(row[f"confident_over_{degrees}_deg"] for row in rows) for degrees in (2, 5))
+    pairs = sum(row["pairs"] for row in rows)
+    return f"{confident} of {pairs} poses confident, {over2} of them over 2 and {over5} over 5 degrees off"
 
 
 def write_json(path: Path, results: dict) -> None:

@@ -77,7 +77,7 @@ def test_the_table_of_the_search_takes_the_place_of_the_old_one(
     guide.write_text(f"before\n{bench_search.START}\nold\n{bench_search.END}\nafter\n")
     monkeypatch.setattr("sys.argv", ["bench_search.py", "psb", "--document", str(guide)])
     bench_search.main()
-    before, _, head, _, row, _, after = guide.read_text().splitlines()
+    before, _, _, head, _, row, _, claims, _, _, after = guide.read_text().splitlines()
     assert (before, after) == ("before", "after")
     values = dict(zip(*([cell.strip() for cell in line.strip("|").split("|")] for line in (head, row)), strict=True))
     assert values["pairs"] == "3"
@@ -85,4 +85,5 @@ def test_the_table_of_the_search_takes_the_place_of_the_old_one(
     assert values["under 1 / 2 deg"] == "67% / 67%"
     assert values["confident"] == "67%"
     assert values["over 2 / 5 deg"] == "0 / 0"
+    assert "2 of 3 poses confident, 0 of them over 2" in claims
     assert (values["failed"], values["CPU s"], values["batches"]) == ("1", "1.00", "4.0")

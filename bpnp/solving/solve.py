@@ -51,7 +51,8 @@ def solve(
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.
-    clutter: share of the points that has no partner, if known; other shares are then not tried.
+    clutter: share of the points that has no partner, if known: it is expected throughout, and a pose that matches most
+        of the other points is believed sooner.
     time_limit: seconds a pair, for the module of `prior` and the search together. At the limit each stage of the search
         ends with the poses that it has, and the best of them is returned; matching it to all points comes after.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
