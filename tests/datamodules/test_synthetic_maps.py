@@ -117,6 +117,17 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
     assert max(extents) / min(extents) > 20
 
 
+def test_an_upright_frame_is_tilted_by_so_many_degrees() -> None:
+    kinds = {"facades": 1.0}
+    level, tilted = (pairs(60, num_points=60, noise_px=0.0, kinds=kinds, tilt_deg=tilt) for tilt in (0.0, 10.0))
+    angles = []
+    for straight, turned in zip(level, tilted, strict=True):
+        turn = turned.rotation.T @ straight.rotation
+        angles.append(np.degrees(np.arccos(turn[2, 2])))
+        assert np.abs(errors_px(turned)).max() < 0.1
+    assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(10 * 2**0.5, rel=0.2)
+
+
 def test_a_wall_hides_what_is_behind_it_and_nothing_else() -> None:
     """A wall 4 m wide and 3 m high on the x axis; rays from (2, -10, 1.5) by hand."""
     one = np.ones(1)
@@ -264,8 +275,8 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
 
 WRONG: list[tuple[str, object]] = [
     ("min_points", 3), ("min_points", 400), ("outliers", -0.1), ("outliers", (1.0, 0.5)), ("field_of_view", 170.0),
-    ("noise_px", (0.0, np.inf)), ("scale_range", (0.0, 1.0)), ("views", (0, 2)), ("kinds", {"caves": 1.0}),
-    ("kinds", {"statue": 0.0}), ("train_pairs", 0),
+    ("noise_px", (0.0, np.inf)), ("scale_range", (0.0, 1.0)), ("views", (0, 2)), ("tilt_deg", -1.0),
+    ("kinds", {"caves": 1.0}), ("kinds", {"statue": 0.0}), ("train_pairs", 0),
 ]  # fmt: skip
 
 

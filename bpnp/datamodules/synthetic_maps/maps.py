@@ -60,7 +60,8 @@ class MapOptions:
     """How pairs of synthetic maps are drawn; see `SfmSceneDataModule`.
 
     frame: of the map, "upright" for the third axis upwards and any heading, "view" for the camera axes of the first of
-    the photos whose map points are taken.
+    the photos whose map points are taken. tilt_deg: standard deviation of the upright frame's turn about each of its
+    horizontal axes, as where the vertical is known roughly.
     """
 
     num_points: int = 256
@@ -69,6 +70,7 @@ class MapOptions:
     views: tuple[int, int] = (1, 3)
     kinds: Mapping[str, float] = field(default_factory=lambda: dict(WEIGHTS))
     frame: Frame = "upright"
+    tilt_deg: float = 0.0
     scale_range: tuple[float, float] = (0.1, 10.0)
     field_of_view: Drawn = (24.0, 115.0)
     noise_px: Drawn = (0.1, 1.5)
@@ -87,6 +89,8 @@ class MapOptions:
                 )
         if not 0 < self.scale_range[0] <= self.scale_range[1] < np.inf:
             raise ValueError(f"expected a positive `scale_range` (low, high), got {self.scale_range}")
+        if not 0 <= self.tilt_deg <= 180:
+            raise ValueError(f"expected `tilt_deg` from 0 to 180, got {self.tilt_deg}")
         if self.frame not in get_args(Frame):
             raise ValueError(f"expected `frame` among {', '.join(get_args(Frame))}, got {self.frame!r}")
         if not 1 <= self.views[0] <= self.views[1]:
@@ -152,7 +156,8 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     if kept < options.min_points:
         return None
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
-    turn = cameras[0].rotation if options.frame == "view" else heading
+    tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
+    turn = cameras[0].rotation if options.frame == "view" else tilt @ heading
     pick = rng.permutation(len(true2d))[:kept]
     chosen2d = np.concatenate([true2d[pick], rng.permutation(others2d)[:extra2d]])
     chosen3d = np.concatenate([true3d[pick], rng.permutation(others3d)[:extra3d]])

@@ -62,6 +62,7 @@ class SfmSceneDataModule(PairDataModule):
         kinds: weight of each kind of scene; none for all kinds, in the shares of `maps.WEIGHTS`.
         frame: of the map: any, turned by a random rotation; upright, the third axis upwards and any heading; view, the
             camera axes of the first of the photos whose map points are taken.
+        tilt_deg: by how much an upright frame is off, about each of its horizontal axes, standard deviation in degrees.
         scale_range: lowest and highest number of scene units in a metre, drawn for each scene, uniformly in its
             logarithm.
         field_of_view: of the longer side of an image, degrees; a number or [low, high], uniform in the logarithm.
@@ -83,6 +84,7 @@ class SfmSceneDataModule(PairDataModule):
         views: tuple[int, int] = (1, 3),
         kinds: Mapping[str, float] | None = None,
         frame: Literal["any", "upright", "view"] = "any",
+        tilt_deg: float = 0.0,
         scale_range: tuple[float, float] = (0.1, 10.0),
         field_of_view: Drawn = (24.0, 115.0),
         noise_px: Drawn = (0.1, 1.5),
@@ -96,6 +98,7 @@ class SfmSceneDataModule(PairDataModule):
             views=views,
             kinds=WEIGHTS if kinds is None else kinds,
             frame="upright" if frame == "any" else frame,
+            tilt_deg=tilt_deg,
             scale_range=scale_range,
             field_of_view=field_of_view,
             noise_px=noise_px,
