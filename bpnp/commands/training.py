@@ -16,6 +16,7 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import bpnp.datamodules
+from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser
 from bpnp.commands.training_help import GROUPS
 from bpnp.files import claimed
@@ -101,6 +102,12 @@ class BpnpCLI(LightningCLI):
         training = subcommand == "fit" and self.trainer.global_rank == 0
         with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext(), interruptible(self.trainer):
             super()._run_subcommand(subcommand)
+
+    def after_fit(self) -> None:
+        """Say where the checkpoints are."""
+        for path in sorted(Path(_checkpoint_folder(self.trainer.default_root_dir)).glob("*.ckpt")):
+            if self.trainer.is_global_zero and not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
+                say(path)
 
     def _check_checkpoint(self, subcommand: str) -> None:
         """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""

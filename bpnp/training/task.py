@@ -198,7 +198,9 @@ class BlindPnPTask(LightningModule):
         return {"prediction": prediction, "seconds": seconds, "losses": losses}
 
     def _log_train(self, **values: Tensor | float) -> None:
-        self.log_dict({f"train/{k}": v for k, v in values.items()}, on_step=True, on_epoch=False, batch_size=1)
+        for name, value in values.items():
+            shown = name == "loss"  # in the progress bar
+            self.log(f"train/{name}", value, on_step=True, on_epoch=False, prog_bar=shown, batch_size=1)
 
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """What a training step logs beside its loss."""

@@ -141,3 +141,14 @@ def test_an_unknown_name_lists_the_packaged_weights() -> None:
         source_from("procedural-so2")
     with pytest.raises(FileNotFoundError, match="no file at procedural-so2; try .*, or packaged weights: matcher-c"):
         TrainedNet.from_checkpoint("procedural-so2")
+
+
+def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    main(["fit", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path)])
+    printed = capsys.readouterr().out
+    assert "train/loss:" in printed
+    for name in ("best", "last"):
+        assert f"wrote {tmp_path}/run/checkpoints/{name}.ckpt" in printed.replace("\n", " ")
