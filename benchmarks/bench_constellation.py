@@ -82,9 +82,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0, help="(default: %(default)s)")
     parser.add_argument("--peers", type=int, default=0, help="frames of some rows for the baselines")
     parser.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
+    parser.add_argument("--failures", type=Path, help="draw the first two frames of the first row that are not right")
     parser.add_argument("--out", type=Path, default=Path(__file__).parent / "results" / "constellation.json")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
+    if options.failures:
+        setting = next(s for s in SETTINGS if any(part in s.name for part in options.only))
+        draw_failures(setting, options.frames, options.seed, options.failures)
+        return
     rows = [
         (name, run)
         for name, run in rows_of(options.frames, options.seed, options.peers)
@@ -167,17 +172,21 @@ def _picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
 
 
 def _outcome(picture: Frame, setting: Setting, rng: np.random.Generator, solver: Any) -> Outcome:
+    if solver != "search":
+        return _peer_outcome(picture, solver)
+    start = time.process_time()
+    solution = _solved(picture, setting, rng)
+    milliseconds = 1000 * (time.process_time() - start)
+    return Outcome(degrees(solution.rotation, picture.rotation), solution.verdict, milliseconds, limit(picture))
+
+
+def _solved(picture: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Solution:
     prior, normals = None, picture.device.normals3d if setting.normals else None
     if setting.gravity:
         up, own = picture.gravity
         tilt = Rotation.from_rotvec(np.radians(1.0) * rng.standard_normal(3)).as_matrix()
         prior = bpnp.GravityPrior(tilt @ up, own, 1.5)
-    if solver != "search":
-        return _peer_outcome(picture, solver)
-    start = time.process_time()
-    solution = bpnp.solve(picture.pixels, picture.device.points3d, picture.camera.model, normals3d=normals, prior=prior)
-    milliseconds = 1000 * (time.process_time() - start)
-    return Outcome(degrees(solution.rotation, picture.rotation), solution.verdict, milliseconds, limit(picture))
+    return bpnp.solve(picture.pixels, picture.device.points3d, picture.camera.model, normals3d=normals, prior=prior)
 
 
 def _peer_outcome(picture: Frame, solver: Any) -> Outcome:
@@ -261,6 +270,40 @@ def degrees(one: Array, other: Array) -> float:
 def _first_call() -> tuple[Any, ...]:
     picture = frame(device("ring", 0), np.random.default_rng(0), least=7)
     return picture.pixels, picture.device.points3d, picture.camera.model
+
+
+def draw_failures(setting: Setting, frames: int, seed: int, path: Path, count: int = 2) -> None:
+    """Lights, where the LEDs that were detected really are, and where the answer puts them."""
+    import matplotlib.pyplot as plt
+
+    rng = np.random.default_rng([seed, SETTINGS.index(setting)])
+    figure, panels = plt.subplots(1, count, figsize=(5.5 * count, 5.6), layout="constrained")
+    shown = 0
+    for picture in pictures(setting, frames, seed, rng):
+        solution = _solved(picture, setting, rng)
+        error = degrees(solution.rotation, picture.rotation)
+        if error < RIGHT_DEG or shown == count:
+            continue
+        panel, points, own = panels[shown], picture.device.points3d, picture.led >= 0
+        panel.plot(*picture.pixels[~own].T, "x", color="0.5", label="lights that are not the device's")
+        panel.plot(*picture.pixels[own].T, "k.", ms=9, label="detected LEDs")
+        for pose, colour, size, name in (
+            ((picture.rotation, picture.translation), "#31a354", 11, "all LEDs, true pose"),
+            ((solution.rotation, solution.translation), "#cb181d", 16, "all LEDs, answer"),
+        ):
+            seen = picture.camera.project(points @ pose[0].T + pose[1])
+            panel.plot(*seen.T, "o", mfc="none", mec=colour, ms=size, label=name)
+        middle, half = picture.pixels[own].mean(0), 0.9 * np.ptp(picture.pixels[own], axis=0).max() + 10
+        panel.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half), aspect="equal")
+        panel.set_title(
+            f"{setting.name}: {own.sum()} LEDs seen, answer {error:.0f} deg off,\n{solution.verdict}, "
+            f"log10 of false alarms {solution.log10_false_alarms:.1f}",
+            fontsize=9,
+        )
+        shown += 1
+    panels[0].legend(fontsize=8)
+    figure.savefig(path, dpi=100)
+    plt.close(figure)
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:

@@ -1,6 +1,6 @@
 """What `confident` is worth: how often it is said of points that have no pose in common, and of the wrong twin.
 
-python benchmarks/bench_verdict.py --data ../shared/data --trials 200 --output benchmarks/results/verdict.json
+python benchmarks/bench_verdict.py --data ../shared/data --trials 1000 --output benchmarks/results/verdict.json
 
 noise: image points and scene points drawn evenly and independently, several sizes. shuffled: keypoints of one photo
 against the map points or surface points that another one sees. twins: points with a symmetry, exact or nearly so, of
@@ -12,13 +12,16 @@ import json
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+import torch
 from bench_search import source
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp import Solution, solve
+from bpnp.datamodules.meshes.surfaces import read_mesh, sample_surface
 from bpnp.report.figures import save_figure
 
 Array = NDArray[np.float64]
@@ -28,15 +31,28 @@ NOISE_SIZES = ((4, 4), (6, 6), (8, 8), (10, 17), (20, 20), (10, 50), (30, 30), (
                (100, 100), (200, 200), (400, 400), (1000, 1000))  # fmt: skip
 SHUFFLED = ("castle-P30", "fountain-P11", "south_building", "statue_of_liberty", "walkthrough", "psb")
 SHUFFLED_SIZES = (8, 15, 40, 120, 400, 1000)
+KINDS = ("noise", "shuffled", "twins", "surfaces")
 CLAIMS = (0.0, -1.0, -2.0, -3.0)  # log10 of false alarms
-LARGE = 100  # points of both sides together, from which a tenth of the trials is made
-WRONG_DEG = 5.0
+SIZES = (
+    (36, 1.0),
+    (200, 0.5),
+    (1000, 0.1),
+    (np.inf, 0.01),
+)  # pairs of points up to which a share of the trials is made
+SURFACES = 0.1  # share of the trials
+MESH_VERTICES, SAMPLES = (100, 2000), 400
+WRONG_DEG = 3.0
+
+
+def trials_of(pairs: int, trials: int) -> int:
+    """Fewer trials of large sets, each of which takes seconds."""
+    return max(int(next(share for most, share in SIZES if pairs <= most) * trials), 3)
 
 
 def noise(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
     """Each size's name, a solution, and NaN: nothing is right."""
     for m, n in NOISE_SIZES:
-        for _ in range(trials if m + n < LARGE else max(trials // 10, 3)):
+        for _ in range(trials_of(m * n, trials)):
             points2d = rng.uniform((0, 0), (WIDTH, HEIGHT), (m, 2))
             yield f"{m} x {n}", solve(points2d, rng.uniform(-1, 1, (n, 3)), CAMERA), np.nan
 
@@ -44,7 +60,7 @@ def noise(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution
 def shuffled(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
     sources = {name: source(name, data, 8) for name in SHUFFLED}
     for size in SHUFFLED_SIZES:
-        for _ in range(trials // 2 if size < LARGE // 2 else max(trials // 20, 3)):
+        for _ in range(trials_of(size**2, trials)):
             first, second = (sources[name] for name in rng.choice(SHUFFLED, 2, replace=False))
             image = first.pair(int(rng.integers(len(first)))).points2d[0].double().numpy()
             scene = second.pair(int(rng.integers(len(second)))).points3d[0].double().numpy()
@@ -64,9 +80,29 @@ def twins(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution
                 seen = (points @ rotation.T + translation) @ CAMERA.T
                 points2d = seen[:, :2] / seen[:, 2:] + 0.3 * rng.standard_normal((len(seen), 2))
                 found = solve(points2d, points, CAMERA)
-                turned = Rotation.from_matrix(found.rotation.T @ rotation) if found.found else None
-                error = np.degrees(turned.magnitude()) if turned is not None else 180.0
-                yield f"{2 * corners} points, displaced by {displaced:g}", found, float(error)
+                yield f"{2 * corners} points, displaced by {displaced:g}", found, degrees(found, rotation)
+
+
+def surfaces(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
+    """Meshes in random poses, 4 to 6 radii away."""
+    files = sorted((data / "psb").rglob("*.off"))
+    for _ in range(max(int(SURFACES * trials), 3)):
+        while True:
+            mesh = read_mesh(files[rng.integers(len(files))])
+            if MESH_VERTICES[0] <= len(mesh.vertices) <= MESH_VERTICES[1]:
+                break
+        middle = mesh.vertices.mean(0)
+        radius = np.abs(mesh.vertices - middle).max()
+        points = (sample_surface(mesh, SAMPLES, rng) - middle) / radius
+        rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.0, 0, rng.uniform(4, 6)])
+        seen = ((mesh.vertices - middle) / radius @ rotation.T + translation) @ CAMERA.T
+        found = solve(seen[:, :2] / seen[:, 2:], points, CAMERA)
+        yield f"vertices against {SAMPLES} points of the faces", found, degrees(found, rotation)
+
+
+def degrees(found: Solution, rotation: Array) -> float:
+    """Error of the rotation, 180 where there is none."""
+    return float(np.degrees(Rotation.from_matrix(found.rotation.T @ rotation).magnitude())) if found.found else 180.0
 
 
 def table(rows: list[tuple[str, Solution, float]]) -> dict[str, dict[str, float]]:
@@ -88,14 +124,14 @@ def table(rows: list[tuple[str, Solution, float]]) -> dict[str, dict[str, float]
     return results
 
 
-def draw(alarms: dict[str, Array], path: Path) -> None:
+def draw(alarms: dict[str, list[float]], path: Path) -> None:
     """Observed shares of unrelated points against the claim, all sizes of a kind together."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(6, 4.5), layout="constrained")
     axes = figure.add_subplot()
     for name, values in alarms.items():
-        ordered = np.sort(values)
+        ordered = np.sort(np.array(values))
         axes.step(ordered, np.arange(1, len(ordered) + 1) / len(ordered), where="post", label=name)
     bound = np.linspace(-4, 0, 50)
     axes.plot(bound, 10**bound, "k--", label="bound of the theory")
@@ -107,32 +143,47 @@ def draw(alarms: dict[str, Array], path: Path) -> None:
     save_figure(figure, path)
 
 
+def rows_of(
+    kind: str, data: Path | None, trials: int, rng: np.random.Generator
+) -> Iterator[tuple[str, Solution, float]]:  # fmt: skip
+    """What a kind measures; nothing without the data that it needs."""
+    if kind == "noise":
+        yield from noise(trials, rng)
+    elif kind == "twins":
+        yield from twins(trials, rng)
+    elif data:
+        yield from (shuffled if kind == "shuffled" else surfaces)(data, trials, rng)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="without it no shuffled pairs")
-    parser.add_argument("--trials", type=int, default=200, help="of the small sizes; a tenth of the large ones")
+    parser.add_argument("--trials", type=int, default=200, help="of the small sizes; fewer of the large ones")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kinds", nargs="*", choices=KINDS, default=KINDS)
     parser.add_argument("--output", type=Path)
     parser.add_argument("--picture", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    kinds = {"noise": noise(options.trials, np.random.default_rng(options.seed))}
-    if options.data:
-        kinds["shuffled"] = shuffled(options.data, options.trials, np.random.default_rng(options.seed + 1))
-    kinds["twins"] = twins(options.trials, np.random.default_rng(options.seed + 2))
-    results, alarms = {}, {}
-    for kind, rows in kinds.items():
-        found = list(rows)
-        results[kind] = table(found)
-        for name, row in results[kind].items():
+    torch.set_num_threads(1)
+    record: dict[str, Any] = {"results": {}, "alarms": {}}
+    if options.output and options.output.exists():
+        record = json.loads(options.output.read_text())
+    for kind in options.kinds:
+        rng = np.random.default_rng([options.seed, KINDS.index(kind)])
+        found = list(rows_of(kind, options.data, options.trials, rng))
+        if not found:
+            continue
+        record["results"][kind] = {"seed": options.seed, **table(found)}
+        for name, row in table(found).items():
             print(kind, name, " ".join(f"{key}: {value:.4g}" for key, value in row.items()), flush=True)
-        if kind != "twins":
-            alarms[kind] = np.array([solution.log10_false_alarms for _, solution, _ in found])
-    if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(json.dumps({"seed": options.seed, "results": results}, indent=1) + "\n")
+        if kind in ("noise", "shuffled"):
+            record["alarms"][kind] = sorted(round(solution.log10_false_alarms, 2) for _, solution, _ in found)
+        if options.output:
+            options.output.parent.mkdir(parents=True, exist_ok=True)
+            options.output.write_text(json.dumps(record) + "\n")
     if options.picture:
-        draw(alarms, options.picture)
+        draw(record["alarms"], options.picture)
 
 
 if __name__ == "__main__":

@@ -117,8 +117,8 @@ class Evidence:
 
     false_alarms: of the number of false alarms, at most, for "confident". It is a bound; on unrelated points an
     exhaustive search stayed above 1 in 999 of 1000 cases, and never came below 0.1.
-    lead: by which every different pose must have more. other_deg, other_shift: poses with rotations farther apart, or
-    translations by this share of their length, are different.
+    lead: by which every different pose must have more: a wrong pose leads so by chance once in a thousand. other_deg,
+        other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
     loose_deg: error of the rotation about its least certain axis that is exceeded once in a thousand, at most.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
     first four have 720 starts, of which 5 are within 30 degrees of any rotation. Of so many batches well_matched_hits
@@ -130,7 +130,7 @@ class Evidence:
     """
 
     false_alarms: float = -2.0
-    lead: float = 2.0
+    lead: float = 3.0
     other_deg: float = 2.0
     other_shift: float = 0.05
     loose_deg: float = 3.0
