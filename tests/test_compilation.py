@@ -128,3 +128,28 @@ def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> 
         printed, logged = doubled(package, "/dev/null/nowhere")
         assert printed == "8 10\n"
         assert logged.count("compiling") == 1
+
+
+def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, tmp_path: Path) -> None:
+    """All find the loop's value, and what they leave in the cache is whole: the next one compiles nothing."""
+    cache = str(tmp_path / "cache")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
+    environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": cache, "HOME": cache}
+    gate = tmp_path / "gate"
+    gate.mkdir()
+    ask = (
+        f"import os, time\nfrom bpnp.loop import double\nopen(f'{gate}/{{os.getpid()}}', 'w').close()\n"
+        f"while len(os.listdir('{gate}')) < 3: time.sleep(0.001)\n"
+    )
+    together = [
+        subprocess.Popen(
+            [sys.executable, "-c", ask + "print(double(4), double(5))"], env=environment, cwd=package,
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        for _ in range(3)
+    ]  # fmt: skip
+    for process in together:
+        printed, logged = process.communicate(timeout=120)
+        assert process.returncode == 0, logged
+        assert printed == "8 10\n"
+    assert doubled(package, cache) == ("8 10\n", "")
