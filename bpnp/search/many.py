@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.few.search import is_few, search_few
-from bpnp.search.nearby import cooled, nearby_batch
+from bpnp.search.nearby import beside, cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -85,6 +86,13 @@ def search_poses(
         poses = finish(scene, poses, annealed) if len(poses) else poses
         return judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
 
+    def certain(leaders: Candidates) -> SearchResult | None:
+        """The result, if it holds on all bearings too."""
+        if not is_certain(leaders, sets, rule, batches=batches):
+            return None
+        result = finished(candidates[np.isfinite(candidates.log10_false_alarms)], 1)
+        return result if result.verdict == "confident" else None
+
     exhausted = False
     while searched < settings.max_batches and not (exhausted or deadline.passed()):
         if guess is not None and batches < settings.around:
@@ -105,11 +113,20 @@ def search_poses(
         candidates, leaders = _weighed_leaders(candidates, scene, sets)
         # A pose that was just found may be an optimum beside a better one, which starts around it will find.
         settled = stalled or is_unique(leaders, sets, rule)
-        if settled and is_certain(leaders, sets, rule, batches=batches):
-            certain = finished(candidates[np.isfinite(candidates.log10_false_alarms)], 1)
-            if certain.verdict == "confident":  # on all bearings too
-                return certain
+        if settled and (safe := certain(leaders)) is not None:
+            return safe
         exhausted = is_exhausted(candidates, scene, searched - bettered)
+    result = finished(candidates, settings.finished)
+    if result.log10_false_alarms <= 0:
+        return result
+    leading = candidates[: settings.beside_poses]
+    for look, k in product(settings.beside, range(len(leading))):
+        if deadline.passed():
+            break
+        candidates = merged([candidates, beside(scene, leading[k : k + 1], look)], scene)
+        candidates, leaders = _weighed_leaders(candidates, scene, sets)
+        if (safe := certain(leaders)) is not None:
+            return safe
     return finished(candidates, settings.finished)
 
 

@@ -26,7 +26,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Stages
+from bpnp.search.settings import Nearby, Stages
 from bpnp.search.starts import Array, PosePrior
 
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
@@ -40,19 +40,29 @@ class Raster(NamedTuple):
     per_cell: np.float32
 
 
-def nearby_batch(scene: Scene, prior: PosePrior) -> Candidates:
-    """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed."""
-    rule = scene.settings.nearby
-    poses, raster = drawn_around(scene, prior, starts_of(scene, prior)), raster_of(scene)
+def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> Candidates:
+    """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
+
+    rule: None for that of the settings.
+    """
+    rule = rule or scene.settings.nearby
+    poses, raster = drawn_around(scene, prior, starts_of(scene, prior, rule)), raster_of(scene, rule)
     for points, kept in zip(rule.points, rule.kept, strict=True):
         poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
     outliers = max(scene.settings.outliers, rule.outliers)
     return anneal_on_points(scene, poses, rule.scale * scene.spread, outliers=outliers)
 
 
-def starts_of(scene: Scene, prior: PosePrior) -> int:
+def beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
+    """Distinct poses around one, as far as the rule's widest prior reaches; they have no hits."""
+    prior = PosePrior(pose.rotation[0], pose.translation[0], rule.wide_deg)
+    sigma = rule.wide_shift * _distance(scene, prior)
+    found = nearby_batch(scene, prior._replace(translation_sigma=sigma), rule)
+    return replace(found, hits=np.zeros_like(found.hits))
+
+
+def starts_of(scene: Scene, prior: PosePrior, rule: Nearby) -> int:
     """As many starts as lie as densely around a narrow prior as `Nearby.starts` do around a wide one."""
-    rule = scene.settings.nearby
     wide = math.radians(rule.wide_deg), rule.wide_shift * _distance(scene, prior)
     share = (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
     return int(np.clip(rule.starts * share, rule.least_starts, rule.starts))
@@ -83,9 +93,8 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
 
 
-def raster_of(scene: Scene) -> Raster:
+def raster_of(scene: Scene, rule: Nearby) -> Raster:
     """The raster of a scene's bearings."""
-    rule = scene.settings.nearby
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / (2 + d[:, 2:])
     scale = rule.scale * scene.spread

@@ -163,6 +163,9 @@ class SearchSettings:
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
     around: batches from a guess of the pose before those from anywhere.
     refined_directly: starts of `refine_poses` that need no clusters; more compete on clusters first.
+    beside: how poses around the best `beside_poses` are looked up, one rule after the other, if the batches end without
+        a pose that exceeds chance: among many outliers the right pose is no optimum on clusters, but is often some
+        degrees beside one.
     kept: candidates from batch to batch, and in the end.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
@@ -183,6 +186,11 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
+    beside: tuple[Nearby, ...] = (
+        Nearby(2**18, 8.0, 0.08, kept=(2**15, 2**11, 150), scale=0.025),
+        Nearby(kept=(2**16, 2**12, 200)),
+    )
+    beside_poses: int = 2
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
     least_annealed: int = 12

@@ -1,6 +1,7 @@
 """Starts around a rough pose find a planted one among more outliers than annealing on clusters can stand."""
 
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -59,7 +60,7 @@ def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
 def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
     bearings, points, rotation, translation = cluttered(0, outliers=1500)
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
-    raster = raster_of(scene)
+    raster = raster_of(scene, DEFAULT.nearby)
     inside = raster.values != 0
     assert abs(raster.values[inside].mean()) < 0.1 * raster.values[inside].std()
     right = scene.enter(rotation, translation)
@@ -120,3 +121,13 @@ def test_a_deadline_that_has_passed_still_gives_poses_and_stops_early() -> None:
         assert len(nearby_batch(scene, prior)) >= 1
         seconds.append(time.process_time() - start)
     assert seconds[0] < 0.7 * seconds[1]
+
+
+def test_a_lost_search_looks_around_its_best_poses() -> None:
+    """Among five outliers a true pair the right pose is no optimum on clusters, but some degrees beside one."""
+    bearings, points, rotation, translation = cluttered(1, outliers=400)
+    lost = search_poses(PointSets(bearings, points), settings=replace(DEFAULT, beside=()))
+    assert lost.verdict == "failed"
+    found = search_poses(PointSets(bearings, points))
+    assert angle(found.best[0], rotation) < 0.3
+    np.testing.assert_allclose(found.best[1], translation, atol=0.05)
