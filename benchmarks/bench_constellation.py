@@ -282,7 +282,7 @@ def draw_failures(setting: Setting, frames: int, seed: int, path: Path, count: i
     for picture in pictures(setting, frames, seed, rng):
         solution = _solved(picture, setting, rng)
         error = degrees(solution.rotation, picture.rotation)
-        if error < RIGHT_DEG or shown == count:
+        if error < RIGHT_DEG:
             continue
         panel, points, own = panels[shown], picture.device.points3d, picture.led >= 0
         panel.plot(*picture.pixels[~own].T, "x", color="0.5", label="lights that are not the device's")
@@ -301,6 +301,8 @@ def draw_failures(setting: Setting, frames: int, seed: int, path: Path, count: i
             fontsize=9,
         )
         shown += 1
+        if shown == count:
+            break
     panels[0].legend(fontsize=8)
     figure.savefig(path, dpi=100)
     plt.close(figure)

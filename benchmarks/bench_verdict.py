@@ -33,12 +33,8 @@ SHUFFLED = ("castle-P30", "fountain-P11", "south_building", "statue_of_liberty",
 SHUFFLED_SIZES = (8, 15, 40, 120, 400, 1000)
 KINDS = ("noise", "shuffled", "twins", "surfaces")
 CLAIMS = (0.0, -1.0, -2.0, -3.0)  # log10 of false alarms
-SIZES = (
-    (36, 1.0),
-    (200, 0.5),
-    (1000, 0.1),
-    (np.inf, 0.01),
-)  # pairs of points up to which a share of the trials is made
+# Pairs of points up to which this share of the trials is made.
+SIZES = ((70, 1.0), (200, 0.2), (1000, 0.03), (np.inf, 0.005))
 SURFACES = 0.1  # share of the trials
 MESH_VERTICES, SAMPLES = (100, 2000), 400
 WRONG_DEG = 3.0
