@@ -11,11 +11,13 @@ import numpy as np
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import beside, cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
+from bpnp.search.refine import score_poses
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
 from bpnp.search.starts import PosePrior, Prior
 from bpnp.search.verdict import (
     SearchResult,
@@ -64,6 +66,7 @@ def search_poses(
     if is_few(sets) and not deadline.passed():
         few, exhausted = search_few(sets, deadline, settings)
         result = judged(few, sets, batches=0, exhaustive=True, rule=rule)
+        result = _against_repetitions(result, sets, deadline, exhaustive=True, rule=rule)
         if progress is not None:
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
@@ -84,7 +87,8 @@ def search_poses(
 
     def finished(poses: Candidates, annealed: int) -> SearchResult:
         poses = finish(scene, poses, annealed) if len(poses) else poses
-        return judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
+        result = judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
+        return _against_repetitions(result, sets, deadline, rule=rule)
 
     def certain(leaders: Candidates) -> SearchResult | None:
         """The result, if it holds on all bearings too."""
@@ -128,6 +132,27 @@ def search_poses(
         if (safe := certain(leaders)) is not None:
             return safe
     return finished(candidates, settings.finished)
+
+
+def _against_repetitions(
+    result: SearchResult, sets: PointSets, deadline: Deadline, *, exhaustive: bool = False, rule: Evidence
+) -> SearchResult:
+    """A confident result once more, beside the poses that a repeated structure would confuse with it."""
+    if result.verdict != "confident":
+        return result
+    best = result.best
+    rotation, translation = repeated_poses(sets, *best, result.residual)
+    if not len(rotation):
+        return result
+    rotation, translation = np.concatenate([best[0][None], rotation]), np.concatenate([best[1][None], translation])
+    rivals = score_poses(sets, rotation, translation, deadline, result.residual).candidates
+    if not len(rivals):
+        return result
+    # The density of the scene around them, which false alarms count, does not say which of equal things is seen.
+    behind = len(sets.bearings) * (rivals.score[0] - rivals.score) / math.log(10)
+    alarms = np.minimum(rivals.log10_false_alarms, rivals.log10_false_alarms[0] + np.maximum(behind, 0))
+    candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
+    return judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
 
 
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:

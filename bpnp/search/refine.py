@@ -51,22 +51,30 @@ def refine_poses(
 
 
 def score_poses(
-    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
-) -> SearchResult:
+    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline,
+    scale: float | None = None,
+) -> SearchResult:  # fmt: skip
     """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
+
+    scale: of their residuals, radians; by default the median distance of a point to the nearest bearing.
 
     They have no hits, since no other starts were tried: only overwhelming evidence makes the best of them certain.
     """
     scene, starts = _entered(sets, rotation, translation, 0, DEFAULT, deadline)
     if not len(starts):
         return no_pose("the module found no pose")
-    # Each starts at the scale of its own residuals: the median distance of a point to the nearest bearing.
+    poses = finish(scene, replace(starts, scale=_own_scales(scene, starts, scale)))
+    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
+
+
+def _own_scales(scene: Scene, starts: Candidates, known: float | None) -> NDArray[np.float32]:
+    """Scales (c,) of the residuals of poses of a scene, radians."""
+    if known is not None:
+        return np.full(len(starts), max(known, scene.smallest_scale), np.float32)
     camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
     length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
     distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
-    scale = np.maximum(np.median(distance, -1), scene.smallest_scale).astype(np.float32)
-    poses = finish(scene, replace(starts, scale=scale))
-    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
+    return np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
 
 
 def _entered(

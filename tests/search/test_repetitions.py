@@ -1,0 +1,81 @@
+"""Scenes with a repeated structure: a pose that sees one of several equal things is never called confident."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp import solve
+from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.point_sets import PointSets
+
+Array = NDArray[np.float64]
+CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
+NOISE = 0.5  # pixels
+
+
+def lattice(columns: int, rows: int) -> Array:
+    return np.array([[0.3 * i, 0.3 * j, 0] for i in range(columns) for j in range(rows)])
+
+
+def stairs(rng: np.random.Generator) -> Array:
+    """Eight points across, the same on each of twelve steps."""
+    across = rng.uniform(-1, 1, 8)
+    return np.array([[x, 0.2 * k, 0.25 * k] for k in range(12) for x in across])
+
+
+def wallpaper(rng: np.random.Generator) -> Array:
+    """A motif of five points in relief, eight times five of it."""
+    motif = rng.uniform(0, 0.5, (5, 3)) * (1, 1, 0.3)
+    return np.concatenate([motif + (0.5 * i, 0.5 * j, 0) for i in range(8) for j in range(5)])
+
+
+def part_of(scene: Array, distance: float, rng: np.random.Generator) -> tuple[Array, Array]:
+    """Pixels of the points in a view of the middle of the scene, and the rotation of the camera."""
+    rotation = Rotation.from_rotvec(rng.uniform(-0.4, 0.4, 3)).as_matrix()
+    camera = (scene - scene.mean(0)) @ rotation.T + (0, 0, distance)
+    seen = camera @ CAMERA.T
+    pixels = seen[:, :2] / seen[:, 2:] + NOISE * rng.standard_normal((len(scene), 2))
+    inside = (camera[:, 2] > 0) & (pixels > 0).all(1) & (pixels < (640, 480)).all(1)
+    return rng.permutation(pixels[inside]), rotation
+
+
+@pytest.mark.parametrize("kind", ["lattice", "stairs", "wallpaper"])
+def test_one_of_many_equal_parts_is_not_called_confident(kind: str) -> None:
+    """A view that ends within the structure: shifted by a period the scene looks the same."""
+    rng = np.random.default_rng(3)
+    for _ in range(4):
+        scene = {"lattice": lambda _: lattice(14, 10), "stairs": stairs, "wallpaper": wallpaper}[kind](rng)
+        pixels, _ = part_of(scene, 1.8, rng)
+        assert solve(pixels, scene, CAMERA).verdict != "confident"
+
+
+def test_a_facade_with_a_door_in_view_stays_confident() -> None:
+    """Its windows repeat, and the corners of the door tell where it is seen."""
+    rng = np.random.default_rng(4)
+    window = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0.1]])
+    scene = np.concatenate(
+        [window + (i, 1.5 * j, 0) for i in range(6) for j in range(2)]
+        + [rng.uniform((0, -1, 0), (5, -0.3, 0.5), (8, 3))]
+    )
+    pixels, rotation = part_of(scene, 7.0, rng)
+    found = solve(pixels, scene, CAMERA)
+    assert found.verdict == "confident"
+    assert np.degrees(Rotation.from_matrix(found.rotation.T @ rotation).magnitude()) < 1
+
+
+def test_the_half_turn_of_a_lattice_is_found() -> None:
+    points = lattice(5, 4) + (0, 0, 6)
+    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    rotations, translations = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3)
+    angles = np.degrees(Rotation.from_matrix(rotations).magnitude())
+    best = int(np.argmax(angles))
+    assert angles[best] == pytest.approx(180)
+    moved = points @ rotations[best].T + translations[best]
+    assert np.linalg.norm(moved[:, None] - points, axis=-1).min(1).max() < 1e-9
+
+
+def test_scattered_points_have_none() -> None:
+    points = np.random.default_rng(5).uniform(-1, 1, (200, 3)) + (0, 0, 6)
+    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    assert len(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3)[0]) == 0
