@@ -122,7 +122,7 @@ def search_poses(
         exhausted = is_exhausted(candidates, scene, searched - bettered)
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
-    if result.log10_false_alarms <= 0 or candidates.hits[0] > batches / 2:
+    if result.log10_false_alarms <= 0 or not len(candidates) or candidates.hits[0] > batches / 2:
         return result
     leading = candidates[: settings.beside_poses]
     for look, k in product(settings.beside, range(len(leading))):
