@@ -30,7 +30,7 @@ def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integ
     sees has a cone of all directions.
 
     >>> cones = viewing_cones(np.zeros((1, 3)), [(np.array([0.0, 0, 2]), np.array([0]))])
-    >>> cones.axes.tolist(), round(float(np.degrees(np.arccos(cones.cosines[0]))))
+    >>> (cones.axes + 0.0).tolist(), round(float(np.degrees(np.arccos(cones.cosines[0]))))
     ([[0.0, 0.0, 1.0]], 25)
     """
     tracks = list(views)
