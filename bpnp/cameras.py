@@ -84,29 +84,40 @@ def in_front(points: Array) -> Array:
 
 def camera_from(given: Any) -> Camera:
     """The camera of a 3x3 matrix K, of (COLMAP model name, parameters) or (name, width, height, parameters), of a
-    mapping with `model` and `params`, or of a pycolmap.Camera.
+    mapping with `model` and `params` (and `width`, `height`), or of a pycolmap.Camera; a `Camera` as it is.
 
     Raises ValueError for a singular or broken K, an unknown model, a wrong number of parameters, or no positive focal
     length.
     """
+    if isinstance(given, (Pinhole, Lens)):
+        return given
     if hasattr(given, "cam_from_img") and hasattr(given, "img_from_cam"):
         return _checked(Lens(given), f"{given.params}")
     if isinstance(given, Mapping):
         if not {"model", "params"} <= set(given):
             raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(given)}")
-        return colmap_camera(str(given["model"]), given["params"])
+        return colmap_camera(str(given["model"]), given["params"], (given.get("width", 0), given.get("height", 0)))
     if isinstance(given, (tuple, list)) and len(given) and isinstance(given[0], str):
         if len(given) not in (2, 4):
             raise ValueError(
                 f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(given)} "
                 "values"
             )
-        return colmap_camera(given[0], given[-1])
+        return colmap_camera(given[0], given[-1], given[1:-1] or (0, 0))
     return _pinhole(given)
 
 
-def colmap_camera(model: str, params: Any) -> Lens:
-    """The camera of a COLMAP model's name and parameters, in COLMAP's order. Raises ValueError as `camera_from`."""
+def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:
+    """A camera as JSON can hold it, which `camera_from` reads again."""
+    if isinstance(camera, Pinhole):
+        return camera.matrix.tolist()
+    own = camera.camera
+    return {"model": own.model.name, "width": own.width, "height": own.height, "params": own.params.tolist()}
+
+
+def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
+    """The camera of a COLMAP model's name and parameters, in COLMAP's order; size: width and height of its images,
+    pixels, 0 if unknown. Raises ValueError as `camera_from`."""
     counts = dict(camera_models().values())
     if model not in counts:
         raise ValueError(f"expected a COLMAP camera model among {', '.join(counts)}, got {model!r}")
@@ -118,7 +129,9 @@ def colmap_camera(model: str, params: Any) -> Lens:
         raise ValueError(f"expected {counts[model]} parameters of a {model} camera, got {values.tolist()}")
     if not np.isfinite(values).all():
         raise ValueError(f"expected finite parameters of a {model} camera, got {values.tolist()}")
-    return _checked(Lens(_pycolmap().Camera(model=model, params=values.tolist())), f"{values.tolist()}")
+    width, height = map(int, size)
+    lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
+    return _checked(lens, f"{values.tolist()}")
 
 
 def read_text_model(folder: Path) -> Any:
@@ -152,7 +165,7 @@ def _pycolmap() -> Any:
     import pycolmap
 
     if threading.current_thread() is threading.main_thread():
-        # Whoever ends a process wants no stack trace, which pycolmap prints: back to what Python had set.
+        # Restore the SIGTERM handler, which pycolmap replaces by one that prints a stack trace.
         signal.signal(signal.SIGTERM, kept)
     return pycolmap
 

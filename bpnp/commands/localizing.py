@@ -119,7 +119,7 @@ def _localize_photos(
                 if solution is None:
                     solution = localize_photo(scene, name, photo, options)
                     if pictures:
-                        draw_photo(output, name, photo, solution, options.camera)
+                        draw_photo(output, name, photo, solution)
                     write_text(solution_file(output, name), solution.to_json() + "\n")
                 done[name] = solution
                 write_poses(output, done)

@@ -103,15 +103,12 @@ def solve(
     if output is not None:
         say(write_text(output, solution.to_json() + "\n"), to=said)
     if picture is not None:
-        from bpnp.cameras import camera_from
         from bpnp.report.figures import save_figure
         from bpnp.report.pictures import solution_picture
 
-        drawn_in = None if lens is None else camera_from(lens)
-        figure = solution_picture(solution, title=points2d.stem, photo=under, camera=drawn_in)
-        say(save_figure(figure, picture), to=said)
+        say(save_figure(solution_picture(solution, title=points2d.stem, photo=under), picture), to=said)
     if colmap is not None:
-        say(solution.to_colmap(colmap, camera=lens, name="image.jpg" if photo is None else photo.name), to=said)
+        say(solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name), to=said)
 
 
 def _photo(path: Path) -> Any:

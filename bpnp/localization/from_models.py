@@ -69,10 +69,11 @@ def model_photos(model: Path) -> tuple[str, PhotoFinder]:
 
 def draw_image(scene: str, find: PhotoFinder, solution: Solution, result: Localized, folder: Path) -> None:
     """Draw <image>.png into the folder, over the photo where there is one."""
-    photo = find(f"{scene}/{result.image}", picture_box(solution.points2d))
+    box = picture_box(solution.points2d)
+    photo = find(f"{scene}/{result.image}", box)
     title = f"{result.image}: {result.rotation_error_deg:.3g} deg off"
     name = re.sub(r"[^A-Za-z0-9._-]+", "_", result.image)
-    save_figure(solution_picture(solution, title=title, photo=photo), folder / f"{name}.png")
+    save_figure(solution_picture(solution, title=title, photo=photo, box=box), folder / f"{name}.png")
 
 
 def write_localized(folder: Path, done: Sequence[Localized], settings: dict[str, object]) -> None:

@@ -3,23 +3,20 @@
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import camera_from
-from bpnp.datamodules.colmap.photos import photo_crop
 from bpnp.localization.solved import write_text
 from bpnp.maps.keypoints import detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.figures import save_figure
 from bpnp.report.fitted_table import FittedTable
-from bpnp.report.pictures import VERDICTS, picture_box, solution_picture
+from bpnp.report.pictures import VERDICTS, read_photo, solution_picture
 from bpnp.report.tables import number
 from bpnp.solving.solution import Solution
 
@@ -99,13 +96,10 @@ def write_poses(folder: Path, solutions: Mapping[str, Solution]) -> None:
     write_text(folder / "poses.txt", POSES_HEADER + "".join(lines))
 
 
-def draw_photo(folder: Path, name: str, photo: Path, solution: Solution, camera: Any) -> None:
-    """pictures/<name>.png: keypoints, reprojected points and matches over the undistorted photo."""
-    lens = camera_from(camera_from_exif(photo) if camera is None else camera)
-    seen = replace(solution, points2d=solution.points2d[np.isfinite(solution.points2d).all(-1)])
-    crop = photo_crop(photo, lens.project, picture_box(seen.points2d))
-    title = f"{name}: {solution.view}"
-    save_figure(solution_picture(solution, title=title, photo=crop), folder / "pictures" / f"{_safe(name)}.png")
+def draw_photo(folder: Path, name: str, photo: Path, solution: Solution) -> None:
+    """pictures/<name>.png: keypoints, reprojected points and matches over the photo."""
+    figure = solution_picture(solution, title=f"{name}: {solution.view}", photo=read_photo(photo))
+    save_figure(figure, folder / "pictures" / f"{_safe(name)}.png")
 
 
 def photos_table(solutions: Mapping[str, Solution]) -> FittedTable:

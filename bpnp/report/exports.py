@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, Lens, camera_from
+from bpnp.cameras import Lens, camera_from
 from bpnp.files import written_whole
 
 Array = npt.NDArray[np.float64]
@@ -101,13 +101,12 @@ def _camera_of(solution: Any, camera: Any, size: tuple[int, int] | None) -> tupl
     """The camera as one of COLMAP's, and the size of its image, which holds all points where it is not known."""
     if not solution.found:
         raise ValueError(f"expected a solution with a pose to export, got none: {solution.reason}")
+    camera = solution.camera if camera is None else camera
     if camera is None:
         seen = solution.points2d[np.isfinite(solution.points2d).all(-1)]
         half = NOMINAL_FOCAL * np.abs(seen).max(0)
         camera = ("PINHOLE", (NOMINAL_FOCAL, NOMINAL_FOCAL, *half.tolist()))
-    given: Camera = camera_from(camera)
-    if size is None and isinstance(camera, (tuple, list)) and len(camera) == 4 and isinstance(camera[0], str):
-        size = (int(camera[1]), int(camera[2]))
+    given = camera_from(camera)
     if not isinstance(given, Lens):
         matrix = given.matrix
         if abs(matrix[0, 1]) > 1e-9 * matrix[0, 0]:

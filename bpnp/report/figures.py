@@ -86,23 +86,32 @@ def plot_pair(
     estimate = estimate or next(iter(view.estimates), None)
     if lines == "match3d" and (view.match3d < 0).all():
         lines = "assigned3d"
-    figure = Figure(figsize=(9, 4.2), layout="constrained")
+    figure = Figure(figsize=(13, 6), layout="constrained")
     figure.suptitle(_text(view.id), fontsize=10)
     colours = dict(zip(view.estimates, LIGHT, strict=False))
     poses = {name: pose for name, pose in view.estimates.items() if np.isfinite(np.c_[pose]).all()}
     _draw_scene(figure.add_subplot(1, 2, 1, projection="3d"), view, poses, colours)
     axes = figure.add_subplot(1, 2, 2)
-    axes.plot(*view.points2d.T, "o", mfc="none", mec="black", ms=5, label="image points", zorder=3)
+    axes.plot(
+        *view.points2d.T,
+        "o",
+        mfc="none",
+        mec="black" if photo is None else "white",
+        ms=5,
+        label="image points",
+        zorder=3,
+    )
     limits = axes.axis()
     if photo is not None:
         left, top, right, bottom = box_of(view)
-        axes.imshow(photo, extent=(left, right, bottom, top), alpha=0.75, zorder=0)
+        axes.imshow(photo, extent=(left, right, bottom, top), zorder=0)
     if estimate in poses:
         _draw_reprojection(axes, view, poses[estimate], colours[estimate], lines)
         axes.plot([], [], "x", color=colours[estimate], label=_text(f"3D points, {estimate}"))
     else:
         axes.set_title("no pose", fontsize=9)
     axes.set(xlim=limits[:2], ylim=limits[3:1:-1], aspect="equal")
+    axes.set_xlabel("normalised image coordinates", fontsize=8)
     axes.tick_params(labelsize=8)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.06), ncols=2, frameon=False, fontsize=8)
     return figure

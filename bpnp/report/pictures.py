@@ -1,5 +1,6 @@
 """The picture of a solution: what the camera sees, and where the pose puts the scene's points."""
 
+import textwrap
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
-WIDTH, CLOSE_UP, CAPTIONS = 9.0, 2.5, 1.3  # inches
+WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches
+LINE = 130  # characters
 
 
 def picture_box(points2d: Array) -> Box:
@@ -43,36 +45,40 @@ def read_photo(path: Path | str) -> Array:
 
 
 def solution_picture(
-    solution: Any, *, title: str | None = None, photo: Array | None = None, camera: Camera | None = None
+    solution: Any, *, title: str | None = None, photo: Array | None = None, box: Box | None = None
 ) -> "Figure":
     """The image: its points, matched and unmatched reprojected 3D points, a line for each match; and the residuals.
 
-    solution: as `bpnp.solve` returns it. camera: the axes are its pixels, and `photo`, (h, w, 3) uint8, is as it was
-    taken; without a camera the axes are normalised coordinates, and the photo is undistorted and fills `picture_box`.
+    solution: as `bpnp.solve` returns it; the axes are pixels of its camera, without one normalised coordinates.
+    photo: (h, w, 3) uint8, as it was taken with the camera; or undistorted, filling a `box` of the normalised image
+    plane, `picture_box(solution.points2d)` for a solution without a camera.
     """
     from matplotlib.figure import Figure
 
+    camera = solution.camera
     matches = np.asarray(getattr(solution, "match_places", solution.matches))
-    seen, projected = _drawn(np.asarray(solution.points2d), None), np.empty((0, 2))
+    seen, projected = np.asarray(solution.points2d), np.empty((0, 2))
     if np.isfinite(solution.rotation).all() and np.isfinite(solution.translation).all():
         projected = in_front(np.asarray(solution.points3d) @ solution.rotation.T + solution.translation)[:, :2]
-    box = picture_box(seen)
-    if camera is not None:
-        seen, projected = _drawn(seen, camera), _drawn(projected, camera)
-        box = picture_box(seen) if photo is None else Box(0, 0, photo.shape[1], photo.shape[0])
-    height = WIDTH * (box.bottom - box.top) / (box.right - box.left)
+    if photo is not None and (box is not None or camera is None):
+        (left, top), (right, bottom) = _drawn(np.reshape(box or picture_box(seen), (2, 2)), camera)
+        frame = Box(left, top, right, bottom)
+    elif photo is not None:
+        frame = Box(0, 0, photo.shape[1], photo.shape[0])
+    seen, projected = _drawn(seen, camera), _drawn(projected, camera)
+    if photo is None:
+        frame = picture_box(seen)
+    height = WIDTH * (frame.bottom - frame.top) / (frame.right - frame.left)
     figure = Figure(figsize=(WIDTH + CLOSE_UP, float(np.clip(height, 3, 10)) + CAPTIONS), layout="constrained")
     axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
     if photo is not None:
-        axes.imshow(photo, extent=(box.left, box.right, box.bottom, box.top), zorder=0)
+        axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
     _draw_points(axes, seen, projected, matches, hidden=photo is None)
-    unit = "pixels" if camera is not None else "normalised coordinates"
-    axes.set(xlim=(box.left, box.right), ylim=(box.bottom, box.top), aspect="equal", ylabel=unit)
+    unit = "normalised coordinates" if camera is None else "pixels"
+    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal", xlabel=unit, ylabel=unit)
     axes.tick_params(labelsize=8)
-    _draw_residuals(close, seen, projected, matches, "px" if camera is not None else "normalised")
-    shown = "" if title is None else f"{title}\n"
-    figure.suptitle((shown + _described(solution)).replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
-    axes.set_xlabel(str(solution.reason).replace("$", r"\$"), fontsize=8, color=QUIET, wrap=True)
+    _draw_residuals(close, seen, projected, matches, unit)
+    figure.suptitle(_described(solution, title).replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
 
@@ -112,14 +118,15 @@ def _draw_residuals(axes: "Axes", seen: Array, projected: Array, matches: Any, u
     axes.axhline(0, color=QUIET, lw=0.5)
     axes.axvline(0, color=QUIET, lw=0.5)
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
-    axes.set_title(f"residuals, {unit}", fontsize=8)
+    axes.set_title(f"residuals, {unit}", fontsize=9)
     axes.tick_params(labelsize=7)
 
 
-def _described(solution: Any) -> str:
-    if not len(solution.matches):
-        return f"{solution.verdict}: no match"
-    error = f"{solution.reprojection_error:.3g} {solution.unit}"
-    return (
-        f"{solution.verdict}: {solution.inlier_count} matches ({100 * solution.inlier_ratio:.0f} %), mean error {error}"
-    )
+def _described(solution: Any, title: str | None) -> str:
+    """Title, verdict with the figures of the matches, and the reason, a line each."""
+    found = "no match"
+    if len(solution.matches):
+        share, error = f"{100 * solution.inlier_ratio:.0f} %", f"{solution.reprojection_error:.3g} {solution.unit}"
+        found = f"{solution.inlier_count} matches ({share}), mean error {error}"
+    reason = textwrap.fill(str(solution.reason), LINE)
+    return "\n".join([*([] if title is None else [title]), f"{solution.verdict}: {found}", reason])

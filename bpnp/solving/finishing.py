@@ -55,6 +55,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         seconds=seconds + time.perf_counter() - start,
         points2d=problem.points2d,
         points3d=problem.points3d,
+        camera=problem.camera,
     )
 
 
@@ -68,6 +69,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None) 
         stats=SolutionStats(dropped2d=dropped, taken2d=taken),
         points2d=problem.points2d,
         points3d=problem.points3d,
+        camera=problem.camera,
     )
 
 

@@ -4,7 +4,7 @@ import io
 import json
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 import numpy.typing as npt
 
+from bpnp.cameras import Camera, camera_from, plain_camera
 from bpnp.search.verdict import Verdict
 from bpnp.solving.problem import Unit
 
@@ -73,6 +74,7 @@ class Solution:
     view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
         the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
+    camera: that of the pixels that were given, None for normalised coordinates and bearings.
     """
 
     rotation: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
@@ -92,6 +94,7 @@ class Solution:
     seconds: float = 0.0
     points2d: Array = field(repr=False)
     points3d: Array = field(repr=False)
+    camera: Camera | None = field(default=None, repr=False)
     view: str | None = None
     point_ids: npt.NDArray[np.int64] | None = field(default=None, repr=False)
 
@@ -127,15 +130,15 @@ class Solution:
     def plot(self, *, photo: Path | str | npt.NDArray[np.uint8] | None = None, camera: Any = None) -> "Figure":
         """The image points and the scene points where the pose puts them, as a matplotlib figure.
 
-        camera: as for `bpnp.solve`; the axes are pixels then. photo: a file or (h, w, 3) uint8, under the points;
-        with a camera as it was taken, without one undistorted to fill `bpnp.report.pictures.picture_box(points2d)`.
-        Raises ValueError if no image point is in front of the camera.
+        camera: as for `bpnp.solve`, by default the one that was given there; the axes are its pixels, and normalised
+        coordinates without a camera. photo: a file or (h, w, 3) uint8 under the points, as it was taken; it needs a
+        camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
         """
-        from bpnp.cameras import camera_from
         from bpnp.report.pictures import read_photo, solution_picture
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
-        return solution_picture(self, photo=picture, camera=None if camera is None else camera_from(camera))
+        drawn = self if camera is None else replace(self, camera=camera_from(camera))
+        return solution_picture(drawn, photo=picture)
 
     def _repr_png_(self) -> bytes | None:
         """The picture that a notebook shows; None without points in front of the camera."""
@@ -150,8 +153,9 @@ class Solution:
     ) -> Path:
         """A COLMAP model with this image, its matches as tracks, and all 3D points: cameras, images, points3D.txt.
 
-        camera: as for `bpnp.solve`; without one a pinhole of 1000 pixels. name: of the image file. size: its width and
-        height, pixels; by default the camera's, or what holds the points. Raises ValueError without a pose.
+        camera: as for `bpnp.solve`, by default the one that was given there, else a pinhole of 1000 pixels. name: of
+        the image file. size: its width and height, pixels; by default the camera's, or what holds the points. Raises
+        ValueError without a pose.
         """
         from bpnp.report.exports import write_colmap
 
@@ -200,6 +204,8 @@ def _plain(value: Any) -> Any:
         return _plain(value.tolist())
     if isinstance(value, (list, tuple)):
         return [_plain(item) for item in value]
+    if isinstance(value, Camera):
+        return plain_camera(value)
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -226,6 +232,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in
     "points2d": partial(_array, shape=(-1, 2)),
     "points3d": partial(_array, shape=(-1, 3)),
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),
+    "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),
     "log10_false_alarms": partial(_float, missing=math.inf),
     **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual"), _float),

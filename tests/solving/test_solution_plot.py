@@ -1,11 +1,18 @@
 """What a solution shows of itself."""
 
+import pickle
+from typing import Any
+
 import numpy as np
+import pytest
 from planted import plant
 
 import bpnp
+from bpnp.cameras import camera_from
 
 PLANTED = plant(1, 40, seed=2)
+LENS = ("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.05))
+MATRIX = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]])
 
 
 def test_a_solution_is_drawn_with_a_cross_on_every_image_point() -> None:
@@ -24,3 +31,37 @@ def test_the_text_of_a_solution_is_short_and_has_its_pose() -> None:
     assert text.startswith("Solution(confident: ")
     assert all(f"{value:.6f}" in text for value in solution.rotation.ravel())
     assert "matches: 40 of 40" in text
+
+
+@pytest.mark.parametrize("camera", [LENS, MATRIX], ids=["lens", "matrix"])
+def test_a_solution_of_pixels_is_drawn_in_pixels_also_from_its_file(camera: Any) -> None:
+    pixels = camera_from(camera).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), camera)
+    for own in (solution, bpnp.Solution.from_json(solution.to_json()), pickle.loads(pickle.dumps(solution))):
+        image, close_up = own.plot().axes
+        drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in image.get_lines()}
+        assert np.abs(drawn["image points"] - pixels).max() < 1e-2
+        assert image.get_xlabel() == image.get_ylabel() == "pixels"
+        assert close_up.get_title() == "residuals, pixels"
+        assert np.linalg.norm(np.asarray(close_up.get_lines()[0].get_xydata()), axis=-1).mean() == pytest.approx(
+            own.reprojection_error, abs=1e-3
+        )
+
+
+def test_a_photo_as_it_was_taken_fills_the_picture_and_is_not_faded() -> None:
+    pixels = camera_from(MATRIX).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), MATRIX)
+    axes = solution.plot(photo=np.zeros((480, 640, 3), np.uint8)).axes[0]
+    (photo,) = axes.get_images()
+    assert tuple(photo.get_extent()) == (0, 640, 480, 0)
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 640), (480, 0))
+    assert photo.get_alpha() is None
+
+
+def test_the_legend_names_only_what_is_drawn() -> None:
+    solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
+    figure = solution.plot()
+    drawn = {line.get_label() for line in figure.axes[0].get_lines() if len(np.asarray(line.get_xydata()))}
+    assert (
+        {text.get_text() for text in figure.legends[0].get_texts()} == drawn == {"image points", "3D points, matched"}
+    )

@@ -48,18 +48,6 @@ def photo_finder(root: Path) -> Callable[[str, tuple[float, float, float, float]
     return find
 
 
-def photo_crop(
-    path: Path,
-    project: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    box: tuple[float, float, float, float],
-) -> Pixels:
-    """The undistorted photo (h, 480, 3) in a box (left, top, right, bottom) of the normalised image plane.
-
-    project: from rays (k, 3) to pixels (k, 2). Raises OSError for a file that is no photo.
-    """
-    return _resampled(_read(path), project, box)
-
-
 def image_file(model: Path, image: str) -> Path | None:
     """The photo of a model's image, if it is where COLMAP's or MegaDepth's layout has it."""
     for folder in [model, *model.parents][: UP + 1]:
