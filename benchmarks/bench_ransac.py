@@ -28,6 +28,7 @@ from timing import machine, write_json
 
 from bpnp.geometry import rotation_angle
 from bpnp.robust.consensus import consensus
+from bpnp.robust.scoring import Pairs, normalised
 
 NOISE, THRESHOLD, POINTS, FOCAL = 0.0025, 0.01, 1000, 1000.0
 CAMERA = {"model": "SIMPLE_PINHOLE", "width": 1000, "height": 1000, "params": [FOCAL, 0.0, 0.0]}
@@ -41,7 +42,6 @@ class Problem:
 
     points2d: Array
     points3d: Array
-    weights: Array
     rotation: Array
 
 
@@ -73,14 +73,16 @@ def planted(seed: int, *, inliers: float, pairs: int, ordered: bool) -> Problem:
     second[:true] = first[:true]
     quality = rng.standard_normal(pairs) + 2.0 * ordered * (np.arange(pairs) < true)
     order = np.argsort(-quality)
-    return Problem(points2d[first[order]], points3d[second[order]], np.exp(quality[order]), rotation)
+    return Problem(points2d[first[order]], points3d[second[order]], rotation)
 
 
 def with_torch(problems: list[Problem], *, hypotheses: int) -> Array:
     """All problems in one batch."""
-    arrays = [[getattr(p, name) for p in problems] for name in ("points2d", "points3d", "weights")]
-    points2d, points3d, weights = (torch.as_tensor(np.stack(a), dtype=torch.float32) for a in arrays)
-    return consensus(points2d, points3d, weights, threshold=THRESHOLD, hypotheses=hypotheses).rotation.double().numpy()
+    arrays = [[getattr(p, name) for p in problems] for name in ("points2d", "points3d")]
+    points2d, points3d = (torch.as_tensor(np.stack(a), dtype=torch.float32) for a in arrays)
+    real = torch.ones(points2d.shape[:2], dtype=torch.bool)  # the most probable pair first, as they are
+    pairs, *_ = normalised(Pairs(points2d, points3d, real))
+    return consensus(pairs, THRESHOLD, hypotheses, 0)[0][..., :3].numpy()
 
 
 def with_poselib(problems: list[Problem], *, options: dict[str, float | bool]) -> Array:

@@ -11,7 +11,7 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.backends import BACKENDS
 from bpnp.robust.sampling import take
-from bpnp.robust.scoring import Pairs, residuals
+from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]
@@ -91,9 +91,10 @@ def ransac_pnp(
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
     chosen = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
-    image, scene = take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double()
-    pairs = Pairs(image, scene, chosen.mask)
-    rotation, translation, iterations = BACKENDS[backend](pairs, threshold, max_iterations, seed)
+    pairs = Pairs(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
+    local, centre, scale = normalised(pairs)
+    poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
+    rotation, translation = (values.squeeze(1) for values in in_scene(poses.unsqueeze(1), centre, scale))
     # The returned pose itself is scored: a refit to the inliers of another pose may have lost them.
     poses = torch.cat([rotation, translation.unsqueeze(-1)], -1).unsqueeze(1)
     squared, inlier, *_ = (values.squeeze(1) for values in residuals(poses, pairs, threshold**2))

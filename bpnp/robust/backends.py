@@ -1,8 +1,8 @@
-"""RANSAC of this and of other libraries on candidate pairs, most probable first: one signature, one pose a sample."""
+"""RANSAC of this and of other libraries on candidate pairs: one signature, one pose a sample."""
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -14,43 +14,26 @@ from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
 from bpnp.robust.consensus import consensus
-from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals
+from bpnp.robust.scoring import Pairs, residuals
 
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
 SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
+Estimator = Callable[[Pairs, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]
 
 
-class Estimate(NamedTuple):
-    """Poses, NaN for none. iterations: hypotheses, or the bound on them where the library does not tell."""
-
-    rotation: Float[Tensor, "b 3 3"]
-    translation: Float[Tensor, "b 3"]
-    iterations: Int[Tensor, " b"]
-
-
-def torch_ransac(pairs: Pairs, threshold: float, max_iterations: int, seed: int) -> Estimate:
-    """`consensus`: all samples at once on their device, `max_iterations` hypotheses each."""
-    weights = -torch.arange(pairs.real.shape[1], device=pairs.real.device, dtype=torch.float64)
-    found = consensus(
-        pairs.points2d, pairs.points3d, weights.expand(pairs.real.shape), mask=pairs.real,
-        threshold=threshold, hypotheses=max_iterations, seed=seed,
-    )  # fmt: skip
-    return Estimate(found.rotation, found.translation, pairs.real.sum(-1).fill_(max_iterations))
-
-
-def _each(estimate: SingleEstimator, pairs: Pairs, threshold: float, max_iterations: int, seed: int) -> Estimate:
+def _each(
+    estimate: SingleEstimator, pairs: Pairs, threshold: float, max_iterations: int, seed: int
+) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
     """One sample after the other; those with fewer than 4 pairs have no pose and no iterations."""
-    pairs, centre, scale = normalised(pairs)
-    poses, iterations = pairs.points3d.new_full((len(pairs.real), 1, 3, 4), torch.nan), pairs.real.sum(-1)
+    poses, iterations = pairs.points3d.new_full((len(pairs.real), 3, 4), torch.nan), pairs.real.sum(-1)
     for i, count in enumerate(iterations.tolist()):
         iterations[i] = 0 if count < MIN_POINTS else max_iterations
         x, p = (points[i][pairs.real[i]].cpu().numpy() for points in pairs[:2])
         if count >= MIN_POINTS and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
-            poses[i, 0], iterations[i] = torch.as_tensor(found[0]), found[1]
-    rotation, translation = in_scene(poses, centre, scale)
-    return Estimate(rotation.squeeze(1), translation.squeeze(1), iterations)
+            poses[i], iterations[i] = torch.as_tensor(found[0]), found[1]
+    return poses, iterations
 
 
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
@@ -91,6 +74,10 @@ def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> 
     return int(residuals(torch.as_tensor(pose)[None, None], pairs, threshold**2).inlier.sum())
 
 
-BACKENDS: dict[str, Callable[[Pairs, float, int, int], Estimate]] = {
-    "poselib": partial(_each, _poselib), "opencv": partial(_each, _opencv), "torch": torch_ransac,
-}  # fmt: skip
+# Pairs as `bpnp.robust.scoring.normalised` gives them, most probable first, threshold, most hypotheses, seed -> poses
+# [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
+BACKENDS: dict[str, Estimator] = {
+    "poselib": partial(_each, _poselib),
+    "opencv": partial(_each, _opencv),
+    "torch": consensus,
+}

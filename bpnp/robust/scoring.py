@@ -31,15 +31,16 @@ class Residuals(NamedTuple):
 def normalised(pairs: Pairs) -> tuple[Pairs, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
     """The pairs in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
 
-    A scene far from its origin then loses no digits in the minimal solver.
+    A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
     """
-    real = pairs.real.unsqueeze(-1)
+    usable = pairs.real & pairs.points2d.isfinite().all(-1) & pairs.points3d.isfinite().all(-1)
+    real = usable.unsqueeze(-1)
     image, scene = (torch.where(real, points, 0).double() for points in pairs[:2])
-    count = pairs.real.sum(-1, keepdim=True).clamp(min=1)
+    count = usable.sum(-1, keepdim=True).clamp(min=1)
     centre = scene.sum(1) / count
     scene = torch.where(real, scene - centre.unsqueeze(1), 0)
     scale = (scene.square().sum((1, 2)).unsqueeze(-1) / count).sqrt().clamp(min=1e-300)
-    return Pairs(image, scene / scale.unsqueeze(-1), pairs.real), centre, scale
+    return Pairs(image, scene / scale.unsqueeze(-1), usable), centre, scale
 
 
 def in_scene(
