@@ -128,35 +128,23 @@ class Refinement(nn.Module):
     def forward(self, prediction: Prediction, batch: Batch) -> Prediction:
         if not self.enabled:
             return prediction
-        own = list(prediction.poses.values())
-        rotation = torch.stack([pose.rotation for pose in own], 1)
-        translation = torch.stack([pose.translation for pose in own], 1)
-        refined = _annealed(batch, rotation, translation, *self._proposed(prediction, batch))
+        poses = prediction.poses.values()
+        rotation = torch.stack([pose.rotation for pose in poses], 1)
+        translation = torch.stack([pose.translation for pose in poses], 1)
+        proposed = rotation[:, :0], translation[:, :0]
+        if self.hypotheses:
+            assert prediction.assignment is not None
+            proposed = pose_hypotheses(
+                prediction.assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
+                mask3d=batch.mask3d,
+            )[:2]  # fmt: skip
+        proposed = proposed[0].to(rotation), proposed[1].to(translation)
+        refined = refine(batch, torch.cat([rotation, proposed[0]], 1), torch.cat([translation, proposed[1]], 1))
         doubtful = log_support(prediction, batch, refined) < 0
         if self.hypotheses and bool(doubtful.any()):
-            alone = torch.where(doubtful[:, None, None], translation, torch.nan)
-            again = _annealed(batch, rotation, alone)
+            again = refine(batch, rotation, torch.where(doubtful[:, None, None], translation, torch.nan))
             refined = _chosen(doubtful & (log_support(prediction, batch, again) > 0), again, refined)
         return replace(prediction, poses=prediction.poses | {REFINED: refined})
-
-    def _proposed(self, prediction: Prediction, batch: Batch) -> tuple[Tensor, ...]:
-        """Rotations (b, s, 3, 3) and translations (b, s, 3) that the assignment proposes; nothing if none is wanted."""
-        if not self.hypotheses:
-            return ()
-        assert prediction.assignment is not None
-        return pose_hypotheses(
-            prediction.assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
-            mask3d=batch.mask3d,
-        )[:2]  # fmt: skip
-
-
-def _annealed(batch: Batch, rotation: Tensor, translation: Tensor, *proposed: Tensor) -> Pose:
-    """`refine` from the given poses (b, s, ...) and from those proposed."""
-    if proposed:
-        rotation = torch.cat([rotation, proposed[0].to(rotation)], 1)
-        translation = torch.cat([translation, proposed[1].to(translation)], 1)
-    masks = {"mask2d": batch.mask2d, "mask3d": batch.mask3d}
-    return Pose(*refine(bearings(batch.points2d), batch.points3d, rotation, translation, **masks))
 
 
 @contextmanager

@@ -74,7 +74,7 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
     refinement, batch = Refinement(), planted.batch()
     wrong, calls = planted.near(2.5), []
 
-    def annealed(_: Tensor, __: Tensor, rotation: Tensor, translation: Tensor, **masks: Tensor) -> object:
+    def annealed(_: Batch, rotation: Tensor, translation: Tensor) -> Pose:
         calls.append(rotation.shape[1])
         crowd = rotation.shape[1] > 2
         ends = (torch.stack([planted.rotation[0], wrong[0][1]]), torch.stack([planted.translation[0], wrong[1][1]]))
@@ -82,7 +82,7 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
         missing = ~is_finite(rotation, translation).any(1)
         turned = turned.masked_fill(missing[:, None, None], torch.nan)
         shifted = shifted.masked_fill(missing[:, None], torch.nan)
-        return turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing)
+        return Pose(turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing))
 
     monkeypatch.setattr(evaluation, "refine", annealed)
     stats = SolveStats(torch.zeros(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))

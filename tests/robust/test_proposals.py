@@ -9,6 +9,7 @@ from bpnp.geometry import project, transform
 from bpnp.metrics import rotation_error
 from bpnp.models.search_solver import refine
 from bpnp.robust.proposals import pose_hypotheses
+from bpnp.types import Batch
 
 
 def blurred(scene: Planted, share: float) -> Tensor:
@@ -112,9 +113,9 @@ def test_refinement_finds_the_start_that_is_roughly_right_among_many() -> None:
     translation = scene.translation.unsqueeze(1).repeat(1, 60, 1)
     rotation[:, 37], translation[:, 37] = scene.near(0.15)
     rotation[:, 5] = torch.nan
-    refined, shifted, stats = refine(scene.bearings, scene.points3d, rotation, translation)
-    assert errors(refined.unsqueeze(1), scene).max() < 0.5
-    assert (shifted - scene.translation).norm(dim=-1).max() < 0.05
-    assert (stats.iterations > 59).all()
-    alone, _, _ = refine(scene.bearings[1:], scene.points3d[1:], rotation[1:], translation[1:])
-    assert torch.equal(alone[0], refined[1])
+    refined = refine(scene.batch(), rotation, translation)
+    assert errors(refined.rotation.unsqueeze(1), scene).max() < 0.5
+    assert (refined.translation - scene.translation).norm(dim=-1).max() < 0.05
+    assert (refined.stats.iterations > 59).all()
+    alone = refine(Batch.from_arrays(scene.points2d[1:], scene.points3d[1:]), rotation[1:], translation[1:])
+    assert torch.equal(alone.rotation[0], refined.rotation[1])

@@ -9,10 +9,11 @@ import torch
 from planted import plant
 from scipy.spatial.transform import Rotation
 
+from bpnp.compilation import Deadline
 from bpnp.geometry import bearings
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
-from bpnp.models.search_solver import refine, search
+from bpnp.models.search_solver import best_poses, refine
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -30,6 +31,13 @@ def found(rotation, translation, problem, degrees):
     shift = translation_error(translation, problem.translation)
     assert (error < degrees).all(), f"rotation errors {error.tolist()}"
     assert (shift < 0.05).all(), f"translation errors {shift.tolist()}"
+
+
+def search(f, p, prior=None, **options):
+    """`search_poses` of each sample: rotation, translation and stats of the best pose."""
+    sets = (PointSets(x.double().numpy(), y.double().numpy(), prior=prior) for x, y in zip(f, p, strict=True))
+    pose = best_poses((search_poses(each, **options) for each in sets), p)
+    return pose.rotation, pose.translation, pose.stats
 
 
 def test_search_finds_planted_poses(problem):
@@ -82,10 +90,10 @@ def test_neighbours_padding_and_batch_size_do_not_matter(problem):
         [problem.points2d[0].numpy(), problem.points2d[1, :150].numpy()],
         [problem.points3d[0].numpy(), problem.points3d[1, :150].numpy()],
     )
-    together = search(bearings(padded.points2d), padded.points3d, mask2d=padded.mask2d, mask3d=padded.mask3d)
-    alone = search(problem.bearings[1:2, :150], problem.points3d[1:2, :150])
-    torch.testing.assert_close(together[0][1], alone[0][0], rtol=0, atol=0)
-    torch.testing.assert_close(together[1][1], alone[1][0], rtol=0, atol=0)
+    together = Search()(padded).poses["search"]
+    rotation, translation, _ = search(problem.bearings[1:2, :150], problem.points3d[1:2, :150])
+    torch.testing.assert_close(together.rotation[1], rotation[0], rtol=0, atol=0)
+    torch.testing.assert_close(together.translation[1], translation[0], rtol=0, atol=0)
 
 
 def test_the_seed_decides(problem):
@@ -188,12 +196,12 @@ def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
     rotation, translation = problem.near(0.08, seed=2)
     rotation, translation = rotation.unsqueeze(1).clone(), translation.unsqueeze(1).clone()
     rotation[2] = torch.nan
-    r, t, stats = refine(problem.bearings, problem.points3d, rotation, translation)
-    assert (rotation_error(r, problem.rotation)[:2] < 0.3).all()
-    assert (translation_error(t, problem.translation)[:2] < 0.02).all()
-    assert r[2].isnan().all()
-    assert not stats.converged[2]
-    assert stats.converged[:2].all()
+    pose = refine(problem.batch(), rotation, translation)
+    assert (rotation_error(pose.rotation, problem.rotation)[:2] < 0.3).all()
+    assert (translation_error(pose.translation, problem.translation)[:2] < 0.02).all()
+    assert pose.rotation[2].isnan().all()
+    assert not pose.stats.converged[2]
+    assert pose.stats.converged[:2].all()
 
 
 def test_search_as_a_solver(problem):
@@ -202,10 +210,11 @@ def test_search_as_a_solver(problem):
     found(prediction.poses["search"].rotation, prediction.poses["search"].translation, problem, 0.5)
 
 
-@pytest.mark.parametrize("wrong", [{"time_limit": 0.0}, {"clutter": 1.0}])
-def test_wrong_budgets_are_refused(problem, wrong):
-    with pytest.raises(ValueError, match="expected"):
-        search(problem.bearings, problem.points3d, **wrong)
+def test_wrong_budgets_are_refused(problem):
+    with pytest.raises(ValueError, match="expected a positive `time_limit`"):
+        Search(time_limit=0.0)
+    with pytest.raises(ValueError, match="expected `clutter`"):
+        search(problem.bearings, problem.points3d, clutter=1.0)
 
 
 def test_a_known_share_of_clutter_is_expected_and_the_only_one_tried():
@@ -226,7 +235,7 @@ def test_settings_without_a_meaning_are_refused(wrong):
 def test_a_time_limit_ends_the_search():
     generator = torch.Generator().manual_seed(0)
     f, p = bearings(torch.rand(1, 60, 2, generator=generator)), torch.rand(1, 60, 3, generator=generator)
-    *_, stats = search(f, p, time_limit=1e-6)
+    *_, stats = search(f, p, deadline=Deadline.after(1e-6))
     assert stats.iterations.item() == 0
     assert np.isinf(stats.residual.item())
 
