@@ -18,8 +18,17 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
 )
 from bpnp.models.baselines.branch_and_bound.gopac import maximise_inliers
 from bpnp.models.baselines.branch_and_bound.gosma import align_mixtures, polish
-from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, log_z, lower_bound, overlap, squared_norm
-from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
+from bpnp.models.baselines.branch_and_bound.mixtures import (
+    RayMixture,
+    SceneMixture,
+    distance,
+    log_z,
+    lower_bound,
+    overlap,
+    ray_mixture,
+    scene_mixture,
+    squared_norm,
+)
 from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
 
 

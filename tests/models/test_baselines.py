@@ -13,11 +13,10 @@ from scipy.optimize import linear_sum_assignment
 from bpnp import Batch, BPnPNet
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Constellation, Hungarian, RandomRansac, SoftPOSIT
-from bpnp.models.baselines.agreement import agreement
 from bpnp.models.baselines.hungarian import hungarian
 from bpnp.models.baselines.random_ransac import probability_of_true_triple
-from bpnp.models.baselines.single_pairs import PairSolver
-from bpnp.models.baselines.softposit.algorithm import slack_scalings, softposit
+from bpnp.models.baselines.single_pairs import PairSolver, agreement
+from bpnp.models.baselines.softposit import slack_scalings, softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 
 QUICK: dict[str, PairSolver] = {

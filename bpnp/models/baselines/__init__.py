@@ -5,6 +5,6 @@ from bpnp.models.baselines.branch_and_bound.gosma import GOSMA
 from bpnp.models.baselines.constellation import Constellation
 from bpnp.models.baselines.hungarian import Hungarian
 from bpnp.models.baselines.random_ransac import RandomRansac
-from bpnp.models.baselines.softposit.solver import SoftPOSIT
+from bpnp.models.baselines.softposit import SoftPOSIT
 
 __all__ = ["GOPAC", "GOSMA", "Constellation", "Hungarian", "RandomRansac", "SoftPOSIT"]

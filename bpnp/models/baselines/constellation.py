@@ -8,9 +8,9 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from bpnp.checks import check_positive
+from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
-from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement
 from bpnp.robust.local_refinement import refine_locally
 from bpnp.robust.p3p import p3p
 from bpnp.robust.scoring import Pairs
@@ -56,12 +56,12 @@ class Constellation(PairSolver):
         self.radius, self.min_matches = radius, min_matches
         self.neighbours2d, self.neighbours3d = neighbours2d, neighbours3d
 
-    def solve(self, pair: SinglePair, deadline: float) -> Answer:
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         triples2d = neighbour_triples(pair.points2d, self.neighbours2d, ordered=False)
         triples3d = neighbour_triples(pair.points3d, self.neighbours3d, ordered=True)
         poses, counts, tried = [], [], 0
         for part in torch.cartesian_prod(torch.arange(len(triples2d)), torch.arange(len(triples3d))).split(CHUNK):
-            if over(deadline):
+            if deadline.passed():
                 break
             solution = p3p(bearings(pair.points2d)[triples2d[part[:, 0]]], pair.points3d[triples3d[part[:, 1]]])
             rotation, translation = solution.rotation[solution.valid], solution.translation[solution.valid]

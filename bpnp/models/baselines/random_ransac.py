@@ -5,9 +5,9 @@ import math
 from jaxtyping import Int
 from torch import Tensor
 
+from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, bearings
-from bpnp.models.baselines.agreement import agreement
-from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over, pair_seed
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement, pair_seed
 from bpnp.robust.p3p import p3p
 from bpnp.robust.sampling import distinct_triples
 
@@ -50,10 +50,10 @@ class RandomRansac(PairSolver):
         self.threshold, self.confidence, self.seed = threshold, confidence, seed
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
-    def solve(self, pair: SinglePair, deadline: float) -> Answer:
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         m, n = len(pair.points2d), len(pair.points3d)
         best, tried, most, pairs = None, 0, 0, 0
-        while tried < self.max_hypotheses and not over(deadline) and not self._enough(pairs, m, n, tried):
+        while tried < self.max_hypotheses and not deadline.passed() and not self._enough(pairs, m, n, tried):
             count = int(min(TRIPLES, self.max_hypotheses - tried))
             found = self._best_of(pair, *self._triples(pair, count, tried))
             tried += count

@@ -1,17 +1,19 @@
-"""What the baselines share: each pair of a batch is solved by itself, in float64, within a limit of time."""
+"""What the baselines share: each pair by itself, in float64, within a limit of time; and the count of partners."""
 
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 
-from bpnp.geometry import MIN_POINTS
+from bpnp.compilation import Deadline
+from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+CHUNK = 2**22  # distances computed at a time, in float32
 
 
 @dataclass(frozen=True)
@@ -59,18 +61,14 @@ class PairSolver(nn.Module):
             rotation, translation = (torch.stack([value.to(like) for value in values]) for values in poses)
             return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
-    def solve(self, pair: SinglePair, deadline: float) -> Answer:
-        """The pose of one pair, found before `deadline` on the clock of `time.monotonic`."""
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
+        """The pose of one pair, found before the deadline."""
         raise NotImplementedError
 
     def _solve(self, pair: SinglePair) -> Answer:
         if min(len(pair.points2d), len(pair.points3d)) < MIN_POINTS:
             return Answer()
-        return self.solve(pair, math.inf if self.time_limit is None else time.monotonic() + self.time_limit)
-
-
-def over(deadline: float) -> bool:
-    return time.monotonic() >= deadline
+        return self.solve(pair, Deadline.after(self.time_limit))
 
 
 def pair_seed(seed: int, index: int) -> int:
@@ -84,3 +82,54 @@ def _pairs(batch: Batch) -> Iterator[SinglePair]:
         pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
         points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
         yield SinglePair(points2d.double().clone(), points3d.double().clone(), index, *pose)
+
+
+def weak_perspective_distance(points2d: Tensor, points3d: Tensor) -> float:
+    """Distance at which the scene looks as large as the image: the ratio of their root mean square radii.
+
+    Averaged over rotations, the image shows two of the scene's three axes: the factor sqrt(2/3).
+    """
+    image, scene = ((points - points.mean(0)).square().sum(-1).mean().sqrt() for points in (points2d, points3d))
+    return float(math.sqrt(2 / 3) * scene / image.clamp_min(1e-12))
+
+
+class Agreement(NamedTuple):
+    """Points of each side with a point of the other within the threshold in the image, per pose."""
+
+    partnered2d: Int[Tensor, " h"]
+    partnered3d: Int[Tensor, " h"]
+
+    @property
+    def points(self) -> Int[Tensor, " h"]:
+        return self.partnered2d + self.partnered3d
+
+    @property
+    def pairs(self) -> Int[Tensor, " h"]:
+        """Upper bound on the number of one-to-one matches within the threshold."""
+        return torch.minimum(self.partnered2d, self.partnered3d)
+
+
+def agreement(
+    points2d: Float[Tensor, "m 2"],
+    points3d: Float[Tensor, "n 3"],
+    rotation: Float[Tensor, "h 3 3"],
+    translation: Float[Tensor, "h 3"],
+    *,
+    threshold: float,
+) -> Agreement:
+    """Count the points with a partner closer than `threshold` (normalised image units), for every pose.
+
+    A 3D point behind the camera has none, and no point has one under a pose that is NaN.
+    """
+    part = max(1, CHUNK // (len(points2d) * len(points3d)))
+    counts2d, counts3d = [], []
+    for turned, shift in zip(rotation.split(part), translation.split(part), strict=True):
+        camera = transform(turned, shift, points3d.expand(len(turned), -1, -1))
+        front = camera[..., 2:] > 0
+        seen = torch.where(front, project(camera), torch.inf).nan_to_num(torch.inf).float()
+        x, y = points2d.float().unsqueeze(-1).unbind(1)
+        squared = (seen[:, None, :, 0] - x).square_()
+        squared += (seen[:, None, :, 1] - y).square_()
+        counts2d.append((squared.amin(2) < threshold**2).sum(-1))
+        counts3d.append((squared.amin(1) < threshold**2).sum(-1))
+    return Agreement(torch.cat(counts2d), torch.cat(counts3d))

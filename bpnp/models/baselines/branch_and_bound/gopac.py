@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bpnp.checks import check_positive
+from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
 from bpnp.models.baselines.branch_and_bound.boxes import (
@@ -20,8 +21,7 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
     whole_domain,
 )  # fmt: skip
 from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
-from bpnp.models.baselines.initial_poses import weak_perspective_distance
-from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, weak_perspective_distance
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
@@ -44,7 +44,7 @@ def maximise_inliers(
     *,
     angle: float,
     max_boxes: int | None = None,
-    deadline: float = math.inf,
+    deadline: Deadline = NEVER,
 ) -> MostInliers:
     """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
 
@@ -58,7 +58,7 @@ def maximise_inliers(
     queue = [(-len(rays), next(order), domain)]
     unresolved = 0
     while queue and -queue[0][0] > count:
-        if over(deadline) or (max_boxes is not None and done >= max_boxes):
+        if deadline.passed() or (max_boxes is not None and done >= max_boxes):
             break
         _, _, box = heapq.heappop(queue)
         children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
@@ -124,7 +124,7 @@ class GOPAC(PairSolver):
         check_positive(angle=angle)
         self.angle, self.max_boxes = angle, max_boxes
 
-    def solve(self, pair: SinglePair, deadline: float) -> Answer:
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         points, centre, radius = unit_scene(pair.points3d)
         domain = whole_domain(points, DOMAIN * weak_perspective_distance(pair.points2d, points))
         found = maximise_inliers(

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bpnp.checks import check_positive
+from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import bearings, retract
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
@@ -22,10 +23,16 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
     unit_scene,
     whole_domain,
 )  # fmt: skip
-from bpnp.models.baselines.branch_and_bound.mixture_distance import distance, lower_bound, squared_norm
-from bpnp.models.baselines.branch_and_bound.mixtures import RayMixture, SceneMixture, ray_mixture, scene_mixture
-from bpnp.models.baselines.initial_poses import weak_perspective_distance
-from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, over
+from bpnp.models.baselines.branch_and_bound.mixtures import (
+    RayMixture,
+    SceneMixture,
+    distance,
+    lower_bound,
+    ray_mixture,
+    scene_mixture,
+    squared_norm,
+)
+from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, weak_perspective_distance
 
 DOMAIN = 1.5
 CLOSEST = 0.5
@@ -56,7 +63,7 @@ def align_mixtures(
     closest: float = 0.0,
     batch: int = 512,
     max_boxes: int | None = None,
-    deadline: float = math.inf,
+    deadline: Deadline = NEVER,
 ) -> Aligned:
     """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
     squared norm.
@@ -71,7 +78,7 @@ def align_mixtures(
     assert place is not None
     done = len(bounds)
     while len(bounds) and float(bounds.min()) < best - gap * norm:
-        if over(deadline) or (max_boxes is not None and done >= max_boxes):
+        if deadline.passed() or (max_boxes is not None and done >= max_boxes):
             break
         parents, others, rest = take_best(pending, -bounds, batch)
         moving = translation_uncertainty(parents, scene.means).amax(-1)
@@ -186,7 +193,7 @@ class GOSMA(PairSolver):
         check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
         self.cluster2d, self.cluster3d, self.batch, self.max_boxes = cluster2d, cluster3d, batch, max_boxes
 
-    def solve(self, pair: SinglePair, deadline: float) -> Answer:
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         rays = bearings(pair.points2d)
         mean_ray = torch.nn.functional.normalize(rays.sum(0), dim=0)
         angle = root_mean_square(torch.acos((rays @ mean_ray).clamp(-1, 1)))

@@ -7,8 +7,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from bpnp.compilation import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound.boxes import Boxes, join, rotation_uncertainty, split, take_best
-from bpnp.models.baselines.single_pairs import over
 
 CHUNK = 2**22  # angles computed at a time
 ROUNDING = 1e-9  # of a cosine
@@ -33,7 +33,7 @@ def best_rotation(
     floor: int,
     first: bool = False,
     smallest: float = 1e-3,
-    deadline: float = math.inf,
+    deadline: Deadline = NEVER,
 ) -> BestRotation:
     """Most rays f_i with some angle(f_i, R d_j) <= reach_j, over the rotations of a domain.
 
@@ -45,7 +45,7 @@ def best_rotation(
     bounds = rays.new_full((len(pending.turn),), len(rays))
     count, rotation, unresolved, done = floor, None, floor, 0
     part = max(1, CHUNK // (8 * len(rays) * len(directions)))
-    while len(bounds) and not over(deadline):
+    while len(bounds) and not deadline.passed():
         parents, others, rest = take_best(pending, bounds, part)
         children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
         reached, reachable = _counts(rays, directions, reach, children)

@@ -1,14 +1,27 @@
 """SoftPOSIT: alternating soft assignment and scaled-orthographic pose (David, DeMenthon et al., IJCV 2004)."""
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
+import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.models.baselines.single_pairs import over
+from bpnp.compilation import NEVER, Deadline
+from bpnp.geometry import random_rotations, retract
+from bpnp.models.baselines.single_pairs import (
+    Answer,
+    PairSolver,
+    SinglePair,
+    agreement,
+    pair_seed,
+    weak_perspective_distance,
+)
 
+Start = Literal["mean", "near_truth", "random"]
+CHUNK = 2**22  # pairs of points, times initial poses, that are annealed together
+THRESHOLD = 0.01  # distance of partners in the normalised image, to choose between starts
 FOCAL = 800.0  # pixels per unit of the normalised image, in which the other constants are
 NOISE = 2.0  # standard deviation of the image points, pixels
 ALPHA = 9.21 * NOISE**2 + 1  # squared pixels; 9.21 is the 99 % quantile of chi^2 with two degrees of freedom
@@ -16,6 +29,84 @@ BETA_START, BETA_FINAL, BETA_RATE = 4e-4, 0.5, 1.05  # weight of squared distanc
 STEPS = 1 + int(math.log(BETA_FINAL / BETA_START) / math.log(BETA_RATE))
 ENOUGH_STEPS = 20
 WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
+
+
+class SoftPOSIT(PairSolver):
+    """SoftPOSIT (David et al., IJCV 2004), a local solver: its result depends on its initial pose.
+
+    Of several poses that under which most points have a partner is returned, an accepted one before one that is not.
+    `residual` of the pose is the root mean square distance of the matched points in pixels.
+
+    Args:
+        start: mean, a fixed pose (the paper's start for ModelNet40: its mean pose); near_truth, the true pose disturbed
+            (the paper's start for MegaDepth: not comparable with solvers that start blind); random, uniform rotations.
+        starts: number of random starts.
+        max_steps: most annealing steps; null for all.
+        seed: of the random starts and disturbances.
+        time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
+    """
+
+    estimates = ("softposit",)
+
+    def __init__(
+        self,
+        *,
+        start: Start = "mean",
+        starts: int = 64,
+        max_steps: int | None = None,
+        seed: int = 0,
+        time_limit: float | None = 30.0,
+    ) -> None:
+        super().__init__(time_limit)
+        if start not in ("mean", "near_truth", "random"):
+            raise ValueError(f"expected `start` mean, near_truth or random, got {start!r}")
+        self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
+
+    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
+        rotation, translation = self._initial_poses(pair)
+        together = max(1, CHUNK // (len(pair.points2d) * len(pair.points3d)))
+        best, most, finished = Answer(), -1, True
+        for turned, shift in zip(rotation.split(together), translation.split(together), strict=True):
+            if deadline.passed():
+                finished = False
+                break
+            points = pair.points2d, pair.points3d
+            found = softposit(*points, turned, shift, max_steps=self.max_steps, deadline=deadline)
+            finished = finished and found.finished
+            counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
+            score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
+            i = int(score.argmax())
+            if int(score[i]) > most:
+                most, pose = int(score[i]), (found.rotation[i], found.translation[i])
+                best = Answer(pose, found.steps, float(found.residual[i]), bool(found.accepted[i]))
+        return best._replace(converged=best.converged and finished)
+
+    def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
+        if self.start == "mean":  # Rz Ry Rx of 22.5 degrees each
+            rotation = roma.euler_to_rotmat("xyz", torch.full((3,), 22.5, dtype=torch.float64), degrees=True)
+            return rotation.unsqueeze(0).to(pair.points3d), pair.points3d.new_tensor([[0.0, 0.0, 4.5]])
+        generator = torch.Generator().manual_seed(pair_seed(self.seed, pair.index))
+        return near_truth(pair, generator) if self.start == "near_truth" else random_poses(pair, self.starts, generator)
+
+
+def near_truth(pair: SinglePair, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """The true pose turned by up to 10 degrees about a random axis and moved by up to 0.5 in a random direction,
+    uniformly: the paper's start for MegaDepth. Raises ValueError where the true pose is not known."""
+    if pair.rotation is None or pair.translation is None:
+        raise ValueError("expected a batch with its true poses to start near them, got none; try start 'random'")
+    directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
+    amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
+    step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
+    rotation, translation = retract(step.flatten().to(pair.points3d), pair.rotation, pair.translation)
+    return rotation.unsqueeze(0), translation.unsqueeze(0)
+
+
+def random_poses(pair: SinglePair, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Uniform rotations, the scene's centre on the viewing ray of the image's, at the weak-perspective distance."""
+    rotation = random_rotations(count, generator).to(pair.points3d)
+    ray = torch.nn.functional.pad(pair.points2d.mean(0), (0, 1), value=1.0)
+    centred = weak_perspective_distance(pair.points2d, pair.points3d) * ray
+    return rotation, centred - rotation @ pair.points3d.mean(0)
 
 
 class Annealed(NamedTuple):
@@ -36,7 +127,7 @@ def softposit(
     translation: Float[Tensor, "s 3"],
     *,
     max_steps: int | None = None,
-    deadline: float = math.inf,
+    deadline: Deadline = NEVER,
 ) -> Annealed:
     """Anneal every initial pose (R, t) of one pair.
 
@@ -58,7 +149,7 @@ def softposit(
     residual = image.new_full((len(turned),), math.inf)
     beta, step = BETA_START, 0
     limit = STEPS if max_steps is None else min(STEPS, max_steps)
-    while step < limit and not over(deadline):
+    while step < limit and not deadline.passed():
         rows, depth = _scaled_rows(scene, turned, shift)
         kernel = _kernel(image, rows, depth, beta)
         u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))

@@ -1,1 +1,0 @@
-"""SoftPOSIT (David, DeMenthon, Duraiswami, Samet, IJCV 2004)."""
