@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
-from bpnp.models.composition import built, class_name, differences
+from bpnp.models.composition import built, class_name, described, differences
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.features import ImageFeatures, PointFeatures, SceneFeatures
 from bpnp.models.older_checkpoints import brought_up_to_date
@@ -21,7 +21,6 @@ PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, Weigh
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
-
 
 Net = TypeVar("Net", bound="TrainedNet")
 
@@ -54,7 +53,7 @@ class TrainedNet(nn.Module):
             raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
         try:
             net = built(saved, (*networks.values(), *PARTS, *parts))
-            net.load_state_dict(solver_state(content["state_dict"]))
+            net.load_state_dict(solver_state(content))
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
         assert isinstance(net, cls)
@@ -122,21 +121,19 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
     return brought_up_to_date(content)
 
 
-def solver_state(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The weights of the solver among those of a `BlindPnPTask`, by their names in the solver."""
+def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
+    """The weights of the solver in the checkpoint of a `BlindPnPTask`, by their names in the solver."""
+    state = content["state_dict"]
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
 
-def check_solver(
-    saved: Mapping[str, Any], state: Mapping[str, Tensor], own: Mapping[str, Any], own_state: Mapping[str, Tensor]
-) -> None:
-    """Raise ValueError, naming what differs, unless a solver's description and the shapes of its weights fit.
-
-    saved, state: of the checkpoint. own, own_state: of the configured solver.
-    """
+def fitting_state(content: Mapping[str, Any], solver: nn.Module) -> dict[str, Tensor]:
+    """`solver_state` of a checkpoint. Raises ValueError, naming what differs, unless class and shapes fit `solver`."""
+    saved, own, state = content.get("solver", {}), described(solver), solver_state(content)
     if saved.get("class") != own["class"]:
         raise ValueError(f"expected a checkpoint of {own['class']}, got one of {saved.get('class', 'another program')}")
-    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, own_state))
+    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, solver.state_dict()))
     if shapes != own_shapes:
         told = ", ".join(differences(saved, own)) or "other weights"
         raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")
+    return state

@@ -16,13 +16,8 @@ from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.composition import AnyModule, chosen, described
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.weights import (
-    TrainedNet,
-    check_solver,
-    read_checkpoint,
-    solver_state,
-)
-from bpnp.training.supervision import (
+from bpnp.models.weights import TrainedNet, fitting_state, read_checkpoint
+from bpnp.training.losses import (
     Losses,
     MatchingLoss,
     correspondence_losses,
@@ -80,7 +75,7 @@ class BlindPnPTask(LightningModule):
         super().__init__()
         self.solver = chosen(solver, BPnPNet)
         if weights is not None:
-            start_from(weights, self.solver)
+            self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver))
         self.loss = None if loss is None else chosen(loss, nn.Module)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         if matching_loss != "correspondence" and correspondence_angle is not None:
@@ -172,8 +167,7 @@ class BlindPnPTask(LightningModule):
         checkpoint["seed"] = os.environ.get("PL_GLOBAL_SEED")  # where `lightning.seed_everything` leaves it
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        saved, weights = checkpoint.get("solver", {}), solver_state(checkpoint["state_dict"])
-        check_solver(saved, weights, described(self.solver), self.solver.state_dict())
+        fitting_state(checkpoint, self.solver)  # one clear error before any state is loaded
         self.training_seed = checkpoint.get("seed")
         self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
 
@@ -233,14 +227,6 @@ class BlindPnPTask(LightningModule):
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
             loss.reset()
-
-
-def start_from(weights: str, solver: nn.Module) -> None:
-    """Load packaged weights, by their name, or a checkpoint of `bpnp fit`. Raises ValueError if they do not fit."""
-    content = read_checkpoint(weights)
-    state = solver_state(content["state_dict"])
-    check_solver(content.get("solver", {}), state, described(solver), solver.state_dict())
-    solver.load_state_dict(state)
 
 
 def _wait(device: torch.device) -> None:

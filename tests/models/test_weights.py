@@ -15,7 +15,7 @@ from bpnp.models import Refinement, TrainedNet
 from bpnp.models.composition import built, described, differences
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.older_checkpoints import brought_up_to_date
-from bpnp.models.weights import PARTS, check_solver
+from bpnp.models.weights import PARTS, fitting_state
 
 OLD = {  # settings of a checkpoint that was written when BPnPNet had one constructor
     "channels": 16, "blocks": 2, "batch_norm": True, "centre_features": True, "image_scale": 4.0,
@@ -49,9 +49,13 @@ def pair() -> Batch:
     return padded([plant(1, 10, outliers2d=2, seed=10, dtype=torch.float32)])
 
 
-def save(net: nn.Module, path: Path, **more: Any) -> Path:
+def content(net: nn.Module, **more: Any) -> dict[str, Any]:
     state = {f"solver.{name}": value for name, value in net.state_dict().items()}
-    torch.save({"solver": described(net), "state_dict": state | more}, path)
+    return {"solver": described(net), "state_dict": state | more}
+
+
+def save(net: nn.Module, path: Path, **more: Any) -> Path:
+    torch.save(content(net, **more), path)
     return path
 
 
@@ -121,10 +125,10 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     saved, own = small_net(8, 1, normalise=True), small_net(16, 2)
     told = r"features2d.channels=8, features2d.depth=1, features3d.channels=8, .*features3d.normalise=True; try"
     with pytest.raises(ValueError, match=told):
-        check_solver(described(saved), saved.state_dict(), described(own), own.state_dict())
-    check_solver(described(own), own.state_dict(), described(small_net(normalise=True)), own.state_dict())
+        fitting_state(content(saved), own)
+    assert fitting_state(content(own), small_net(normalise=True)).keys() == own.state_dict().keys()
     with pytest.raises(ValueError, match="expected a checkpoint of BPnPNet, got one of another program"):
-        check_solver({}, {}, described(own), own.state_dict())
+        fitting_state({"state_dict": {}}, own)
     assert list(differences(described(Flat(2)), described(Flat(3)))) == ["coordinates=2"]
 
 

@@ -25,7 +25,7 @@ FILES = [
     *sorted((PACKAGE / "layers").glob("*.py")),
     *sorted((PACKAGE / "models/nets").glob("*.py")),
     *(PACKAGE / f"models/{name}.py" for name in ("bpnpnet", "matcher", "pose_head")),
-    *(PACKAGE / f"training/{name}.py" for name in ("losses", "supervision")),
+    *(PACKAGE / f"training/{name}.py" for name in ("losses",)),
 ]
 # Calls that may read a value back, by function.
 READS = {

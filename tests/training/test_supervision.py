@@ -8,8 +8,7 @@ from small_data import small_net
 
 from bpnp import Batch, Pose, Prediction, SolveStats
 from bpnp.models import Matcher
-from bpnp.training.losses import matching_likelihood_loss, self_supervised_loss
-from bpnp.training.supervision import matching_losses
+from bpnp.training.losses import matching_likelihood_loss, matching_losses, self_supervised_loss
 from bpnp.training.task import BlindPnPTask
 
 
