@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.solving.priors import Prior
+from bpnp.solving.arguments import Prior
 
 Vector = tuple[float, float, float]
 

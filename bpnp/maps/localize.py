@@ -14,7 +14,7 @@ from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
-from bpnp.solving.priors import checked_prior
+from bpnp.solving.arguments import checked_prior
 from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of

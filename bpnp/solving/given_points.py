@@ -1,4 +1,7 @@
-"""A user's arrays of points, checked: each function raises ValueError for unusable ones; `where` names the pair."""
+"""A user's arrays of points and of what is known of them, checked: each function raises ValueError for unusable ones.
+
+`where` names the pair in the errors.
+"""
 
 from typing import Any
 
@@ -7,12 +10,12 @@ import numpy.typing as npt
 import torch
 
 from bpnp.cameras import Camera
-from bpnp.solving.annotations import UNIT_NORM
 
 Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
+UNIT_NORM = 1e-3  # largest error of a length
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
-
 WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
 
 
@@ -84,3 +87,58 @@ def normalised(given: Array, camera: Camera | None, where: str) -> Array:
             "try without the camera"
         )
     return camera.normalise(given)
+
+
+def checked_normals(values: Any, count: int, where: str) -> Array | None:
+    """Unit normals (n, 3) of `count` 3D points."""
+    if values is None:
+        return None
+    normals = _one_each("normals3d", numbers("normals3d", values, where), (count, 3), where)
+    length = np.linalg.norm(normals, axis=-1)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_NORM))
+    if len(bad):
+        raise ValueError(
+            f"expected unit vectors in `normals3d`{where}, got {normals[bad[0]].tolist()} at point {bad[0]}; "
+            "try to divide by the lengths"
+        )
+    return np.asarray(normals / length[:, None])
+
+
+def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where: str) -> tuple[Labels, Labels] | None:
+    """Integer labels of the 2D and the 3D points, -1 for any; both or neither."""
+    if labels2d is None and labels3d is None:
+        return None
+    for name, values in (("labels2d", labels2d), ("labels3d", labels3d)):
+        if values is None:
+            raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
+    return _labels("labels2d", labels2d, counts[0], where), _labels("labels3d", labels3d, counts[1], where)
+
+
+def _labels(name: str, values: Any, count: int, where: str) -> Labels:
+    host = values.detach().cpu() if isinstance(values, torch.Tensor) else values
+    labels = _one_each(name, np.asarray(host), (count,), where)
+    if labels.dtype.kind not in "iu":
+        raise ValueError(f"expected integers in `{name}`{where}, got {labels.dtype}; try .astype(int)")
+    if labels.min(initial=0) < -1:
+        raise ValueError(f"expected labels of 0 or more, or -1 for any, in `{name}`{where}, got {labels.min()}")
+    return labels.astype(np.int64)
+
+
+def checked_scores(name: str, values: Any, count: int, where: str) -> Array | None:
+    """Probabilities (count,) that a point has a partner, in (0, 1]."""
+    if values is None:
+        return None
+    scores = _one_each(name, numbers(name, values, where), (count,), where)
+    bad = np.flatnonzero(~((scores > 0) & (scores <= 1)))
+    if len(bad):
+        raise ValueError(
+            f"expected probabilities above 0 and up to 1 in `{name}`{where}, got {scores[bad[0]]} at point {bad[0]}; "
+            "try to divide by the largest"
+        )
+    return scores
+
+
+def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...], where: str) -> npt.NDArray[Any]:
+    if values.shape != shape:
+        raise ValueError(f"expected `{name}` of shape {shape} as `points{name[-2:]}`{where}, got {values.shape}")
+    return values

@@ -11,9 +11,18 @@ from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.point_sets import PointSets, faces
 from bpnp.search.starts import GravityPrior, PosePrior
-from bpnp.solving.annotations import checked_labels, checked_normals, checked_scores
-from bpnp.solving.given_points import check_points, keypoints, normalised, numbers, one_row_each, unit_bearings
-from bpnp.solving.priors import Prior
+from bpnp.solving.arguments import Prior
+from bpnp.solving.given_points import (
+    check_points,
+    checked_labels,
+    checked_normals,
+    checked_scores,
+    keypoints,
+    normalised,
+    numbers,
+    one_row_each,
+    unit_bearings,
+)
 
 Array = npt.NDArray[np.float64]
 Unit = Literal["px", "normalised", "rad"]

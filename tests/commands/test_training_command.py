@@ -14,8 +14,7 @@ import bpnp.commands.training_help as training_help
 from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
 from bpnp.models.weights import TrainedNet
-from bpnp.solving.arguments import source_from
-from bpnp.solving.priors import checked_prior
+from bpnp.solving.arguments import checked_prior, source_from
 
 MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 SHORT = ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1"]
