@@ -158,6 +158,8 @@ def shared_lights(
     The pair with the fewest false alarms keeps its matches. A later one that claimed one of their points is solved
     again, by `solve_again`, without these; its `stats.taken2d` says how many points that are. A failed pose keeps none.
     """
+    if len(problems) < 2:
+        return
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
         if problem.degenerate is None and is_few(problem.sets):
