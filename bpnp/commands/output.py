@@ -4,7 +4,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bpnp.report.fitted_table import WIDTH
+from bpnp.report.tables.fitted_table import WIDTH
 
 
 def console() -> Console:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from bpnp.commands.output import console, say
-from bpnp.report.published import Paper
+from bpnp.report.tables.published import Paper
 
 if TYPE_CHECKING:
     from bpnp.report.figures import Lines
@@ -39,7 +39,7 @@ def report(
     from bpnp.report.figures import recall_curve, save_figure
     from bpnp.report.page.write import write_page
     from bpnp.report.runs import named_runs
-    from bpnp.report.tables import report as print_tables
+    from bpnp.report.tables.result_tables import report as print_tables
 
     paths = list(named_runs(runs).values())
     if html is not None:

@@ -10,7 +10,7 @@ from bpnp.commands.output import console, say
 from bpnp.commands.parser import at_least
 from bpnp.configs import packaged_config
 from bpnp.files import claimed
-from bpnp.report.published import Paper
+from bpnp.report.tables.published import Paper
 
 if TYPE_CHECKING:
     from bpnp.table.run import Block

@@ -15,9 +15,9 @@ from bpnp.maps.keypoints import detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.figures import save_figure
-from bpnp.report.fitted_table import FittedTable
 from bpnp.report.pictures import VERDICTS, read_photo, solution_picture
-from bpnp.report.tables import number
+from bpnp.report.tables.fitted_table import FittedTable
+from bpnp.report.tables.result_tables import number
 from bpnp.solving.solution import Solution
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}

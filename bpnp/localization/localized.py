@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.colmap.reconstruction import ImagePoints
 from bpnp.metrics.errors import centre_error, rotation_error
-from bpnp.report.fitted_table import FittedTable
 from bpnp.report.pictures import VERDICTS
-from bpnp.report.tables import number
+from bpnp.report.tables.fitted_table import FittedTable
+from bpnp.report.tables.result_tables import number
 from bpnp.solving.solution import Solution
 from bpnp.types import Batch
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from bpnp.report.runs import table
     from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
     from bpnp.report.solutions import view_of
-    from bpnp.report.tables import learning_table, recall_table, report, results_table
+    from bpnp.report.tables.result_tables import learning_table, recall_table, report, results_table
     from bpnp.report.training_log import TrainingLog, read_training_log
 
 __all__ = [
@@ -73,7 +73,7 @@ __getattr__, __dir__ = lazy_names(
             "write_views",
         ),
         "bpnp.report.solutions": ("view_of",),
-        "bpnp.report.tables": (
+        "bpnp.report.tables.result_tables": (
             "learning_table",
             "recall_table",
             "report",

@@ -6,8 +6,8 @@ from typing import Any
 
 from bpnp.files import written_whole
 from bpnp.report.figures import save_figure
-from bpnp.report.published import Paper
 from bpnp.report.runs import mean_and_spread
+from bpnp.report.tables.published import Paper
 from bpnp.table.layout import Line, as_csv, as_latex, as_markdown
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs, with_outlier_ratio, with_setting

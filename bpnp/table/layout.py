@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 from rich.text import Text
 
-from bpnp.report.fitted_table import FittedTable
-from bpnp.report.published import NAMES, PUBLISHED, Paper, published_rows
-from bpnp.report.tables import QUARTILES, RESULT_COLUMNS, Column, cell
+from bpnp.report.tables.fitted_table import FittedTable
+from bpnp.report.tables.published import NAMES, PUBLISHED, Paper, published_rows
+from bpnp.report.tables.result_tables import QUARTILES, RESULT_COLUMNS, Column, cell
 
 CAPTION = (
     "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of pairs with "

@@ -13,7 +13,7 @@ from bpnp.files import claimed
 from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_results, read_views
 from bpnp.report.folder import append_rows, finished_rows
-from bpnp.report.published import PUBLISHED
+from bpnp.report.tables.published import PUBLISHED
 from bpnp.table.layout import Line, as_latex, as_markdown
 from bpnp.table.methods import parse_methods
 from bpnp.table.pairs import TestPairs, read_data

@@ -10,7 +10,8 @@ import numpy as np
 from bpnp.report.palette import DASHES, styles
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
 from bpnp.report.runs import seed_groups, with_spread
-from bpnp.report.tables import RESULT_COLUMNS, Paper, best_texts, cell, published_rows
+from bpnp.report.tables.published import Paper, published_rows
+from bpnp.report.tables.result_tables import RESULT_COLUMNS, best_texts, cell
 
 # Options of the data that change no result.
 LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}

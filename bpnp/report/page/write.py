@@ -25,7 +25,7 @@ from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import CAUSES, PairRow, Results
 from bpnp.report.runs import named_runs, trained_only
 from bpnp.report.samples import read_views
-from bpnp.report.tables import Paper
+from bpnp.report.tables.published import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log
 
 SCRIPTS = ("results.js", "pairs.js", "viewer.js")

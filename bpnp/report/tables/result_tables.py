@@ -11,11 +11,11 @@ from rich.table import Table
 from rich.text import Text
 
 from bpnp.metrics import RecallThresholds, pose_recalls
-from bpnp.report.fitted_table import WIDTH, FittedTable
 from bpnp.report.folder import read_results
-from bpnp.report.published import Paper, published_rows
 from bpnp.report.results import Results
 from bpnp.report.runs import named_runs, read_runs, seed_groups, trained_only, with_spread
+from bpnp.report.tables.fitted_table import WIDTH, FittedTable
+from bpnp.report.tables.published import Paper, published_rows
 from bpnp.report.training_log import TrainingLog, read_training_log
 
 Values = Mapping[str, float]

@@ -9,10 +9,10 @@ from rich.console import Console
 from rich.table import Table
 
 from bpnp.report import PairRow, Results, learning_table, recall_table, report, results_table, write_results
-from bpnp.report.fitted_table import FittedTable
 from bpnp.report.page.text import quartiles_html
 from bpnp.report.runs import seed_groups
-from bpnp.report.tables import number
+from bpnp.report.tables.fitted_table import FittedTable
+from bpnp.report.tables.result_tables import number
 
 
 def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
