@@ -20,6 +20,7 @@ from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser
 from bpnp.commands.training_help import GROUPS
 from bpnp.files import claimed
+from bpnp.training.monitor import OfflineWandbLogger
 from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
@@ -72,13 +73,17 @@ class BpnpCLI(LightningCLI):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A CSV log always, whatever else the configuration logs to; a progress bar unless it is not wanted."""
+        """A CSV log always, whatever else the configuration logs to, all in the run's folder; a progress bar unless it
+        is not wanted."""
         if self._get(self.config, "trainer.enable_progress_bar") is False:
             self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         plugins = self._get(self.config_init, "trainer.plugins") or []
         own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
         trainer = super().instantiate_trainer(**{"plugins": own} | kwargs)
+        for logger in trainer.loggers:
+            if isinstance(logger, OfflineWandbLogger):
+                logger.keep_in(trainer.default_root_dir)
         wanted = self._get(self.config, "trainer.logger") is not False
         if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
             trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]

@@ -21,13 +21,25 @@ class OfflineWandbLogger(WandbLogger):
 
     Args:
         project, name: of the run.
-        save_dir: where the folder of an offline run goes, for `wandb sync`.
+        save_dir: where the folder of an offline run goes, for `wandb sync`; none for the run's folder in `bpnp fit`,
+            else the working directory.
     """
 
-    def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str = "runs") -> None:
-        os.makedirs(save_dir, exist_ok=True)
+    def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str | None = None) -> None:
         mode = os.environ.get("WANDB_MODE") or "offline"  # as an argument too: wandb reads its variables only once
-        super().__init__(project=project, name=name, save_dir=save_dir, offline=mode == "offline", mode=mode)
+        super().__init__(project=project, name=name, offline=mode == "offline", mode=mode)
+        self._placed = save_dir is not None
+        if save_dir is not None:
+            self._place(save_dir)
+
+    def keep_in(self, folder: str) -> None:
+        """Put the run that is to begin below `folder`, unless a `save_dir` was given."""
+        if not self._placed:
+            self._place(folder)
+
+    def _place(self, folder: str) -> None:
+        os.makedirs(folder, exist_ok=True)
+        self._save_dir = self._wandb_init["dir"] = folder
 
 
 class TrainingMonitor(Callback):

@@ -151,3 +151,18 @@ def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
     assert "train/loss:" in printed
     for name in ("best", "last"):
         assert f"wrote {tmp_path}/run/checkpoints/{name}.ckpt" in printed.replace("\n", " ")
+
+
+def test_the_log_of_weights_and_biases_is_in_the_folder_of_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wandb = pytest.importorskip("wandb", reason="needs wandb")
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    monkeypatch.setenv("WANDB_SILENT", "true")
+    monkeypatch.chdir(tmp_path)
+    wandb.finish()  # a run that another test left would be joined
+    main(["fit", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path), "--trainer.logger=bpnp.training.OfflineWandbLogger"])
+    wandb.finish()
+    assert len(list((tmp_path / "run" / "wandb").glob("offline-run-*"))) == 1
+    assert not (tmp_path / "wandb").exists()
+    assert (tmp_path / "run" / "logs").is_dir()
