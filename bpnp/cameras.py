@@ -129,7 +129,12 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
         raise ValueError(f"expected {counts[model]} parameters of a {model} camera, got {values.tolist()}")
     if not np.isfinite(values).all():
         raise ValueError(f"expected finite parameters of a {model} camera, got {values.tolist()}")
-    width, height = map(int, size)
+    try:
+        width, height = (int(value) for value in size)
+    except (TypeError, ValueError, OverflowError):
+        width, height = -1, -1
+    if min(width, height) < 0:
+        raise ValueError(f"expected width and height of a {model} camera in pixels, got {tuple(size)}")
     lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
     return _checked(lens, f"{values.tolist()}")
 

@@ -1,12 +1,14 @@
 """Pixels and rays of every kind of camera, against pycolmap and OpenCV."""
 
+import json
+
 import cv2
 import numpy as np
 import pycolmap
 import pytest
 import torch
 
-from bpnp.cameras import camera_from
+from bpnp.cameras import camera_from, plain_camera
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
@@ -68,6 +70,8 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
         (("PINHOLE", [500.0, 500.0, np.inf, 240.0]), "finite parameters"),
         (("PINHOLE", [0.0, 0.0, 320.0, 240.0]), "positive focal length"),
         (("PINHOLE", 640, [1.0]), "got 3 values"),
+        (("PINHOLE", -640, 480, [500.0, 500.0, 320.0, 240.0]), r"width and height of a PINHOLE camera .*\(-640, 480\)"),
+        (("PINHOLE", np.nan, 480, [500.0, 500.0, 320.0, 240.0]), "width and height of a PINHOLE camera"),
         (("PINHOLE", "wide"), "as numbers"),
         ({"model": "PINHOLE"}, "`model` and `params`"),
     ],
@@ -75,3 +79,11 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
 def test_a_broken_camera_is_refused(given: object, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         camera_from(given)
+
+
+@pytest.mark.parametrize("given", [K, OPENCV, ("OPENCV", 800, 600, OPENCV[1])])
+def test_a_plain_camera_is_read_as_the_same(given: object) -> None:
+    camera = camera_from(given)
+    again = camera_from(json.loads(json.dumps(plain_camera(camera))))
+    np.testing.assert_array_equal(again.project(RAYS), camera.project(RAYS))
+    assert plain_camera(again) == plain_camera(camera)

@@ -15,6 +15,7 @@ def solve(
     points3d: Path,
     *,
     camera: str | None = None,
+    image: str | None = None,
     output: Path | None = None,
     picture: Path | None = None,
     photo: Path | None = None,
@@ -45,6 +46,7 @@ def solve(
             COLMAP model (its folder, or points3D.bin or .txt).
         camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
             one camera (its folder, or cameras.bin or .txt).
+        image: name of the image whose camera to take, where the --camera model has several.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
         photo: the photo, under the points of --picture; needs --camera.
@@ -73,7 +75,9 @@ def solve(
     image_points, labels2d = read_image(points2d)
     scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
     known = known_pose(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
-    lens = None if camera is None else read_camera(camera)
+    if image is not None and camera is None:
+        raise ValueError(f"expected --image with a COLMAP model as --camera, got {image!r} alone")
+    lens = None if camera is None else read_camera(camera, image)
     _prepare(output, picture)
     if photo is not None and (picture is None or lens is None):
         raise ValueError("expected --photo with --picture and --camera, got it without")

@@ -107,16 +107,19 @@ def _annotated(
     return points, normals, labels.astype(np.int64)
 
 
-def read_camera(text: str) -> Any:
+def read_camera(text: str, image: str | None = None) -> Any:
     """The camera that `--camera` names: a file with a 3x3 matrix, or a COLMAP model with its parameters.
 
-    Also the only camera of a COLMAP model, named by its folder or by its file of cameras.
+    Also a camera of a COLMAP reconstruction, named by its folder or by its file of cameras: its only one, or that of
+    an `image`.
     "PINHOLE 500 500 320 240" and "PINHOLE,640,480,500,500,320,240" (with width and height, as in cameras.txt) are both
     understood. Raises ValueError for anything else.
     """
     path = Path(text)
     if (text and path.is_dir()) or (path.stem == COLMAP_CAMERAS and path.is_file()):
-        return _only_camera(path)
+        return _camera_of(path, image)
+    if image is not None:
+        raise ValueError(f"expected --image with a COLMAP model as --camera, got it with {text!r}")
     if path.is_file():
         return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)[0]
     words = text.replace(",", " ").split()
@@ -140,12 +143,17 @@ def _colmap(path: Path) -> "ModelRecords":
     return read_records(path if path.is_dir() else path.parent, camera_models=camera_models())
 
 
-def _only_camera(path: Path) -> tuple[Any, ...]:
-    cameras = list(_colmap(path).cameras.values())
-    if len(cameras) != 1:
-        shown = "; ".join(f"{c.model},{','.join(f'{value:g}' for value in c.params)}" for c in cameras[:4])
-        raise ValueError(f"expected one camera in {path}, got {len(cameras)}; try --camera with one of {shown}")
-    return cameras[0].model, *cameras[0].size, cameras[0].params
+def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
+    """The camera of an image of a COLMAP model, or the only one that it has."""
+    model = _colmap(path)
+    used = {own.name: own.camera_id for own in sorted(model.images, key=lambda own: own.name)}
+    some = ", ".join([*used][:8])
+    if image is not None and used.get(image) not in model.cameras:
+        raise ValueError(f"expected an image of {path}, got {image!r}; try one of {some}")
+    if image is None and len(model.cameras) != 1:
+        raise ValueError(f"expected one camera in {path}, got {len(model.cameras)}; try --image with one of {some}")
+    camera = next(iter(model.cameras.values())) if image is None else model.cameras[used[image]]
+    return camera.model, *camera.size, camera.params
 
 
 def _described(model: str, numbers: list[float]) -> tuple[Any, ...]:

@@ -93,7 +93,9 @@ def log_to_rerun(solution: Any, entity: str, *, camera: Any, size: tuple[int, in
     rerun.log(f"{entity}/points", rerun.Points3D(solution.points3d, colors=colours))
     rerun.log(f"{entity}/camera", rerun.Transform3D(translation=solution.centre, mat3x3=solution.rotation.T))
     seen = _pixels(solution, lens)
-    rerun.log(f"{entity}/camera/image", rerun.Pinhole(focal_length=lens.focal, width=width, height=height))
+    (centre,) = lens.project(np.array([[0.0, 0.0, 1.0]])).tolist()  # principal point
+    pinhole = rerun.Pinhole(focal_length=lens.focal, principal_point=centre, width=width, height=height)
+    rerun.log(f"{entity}/camera/image", pinhole)
     rerun.log(f"{entity}/camera/image/keypoints", rerun.Points2D(seen[np.isfinite(seen).all(-1)]))
 
 

@@ -115,6 +115,20 @@ def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
     assert read_camera("PINHOLE 640 480 500 510 320 240") == ("PINHOLE", 640.0, 480.0, params)
 
 
+def test_of_several_cameras_of_a_colmap_model_that_of_an_image_is_taken(tmp_path: Path) -> None:
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 640 480 500 320 240\n7 PINHOLE 100 80 90 91 50 40\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 1 1 a.jpg\n3 4 1\n2 1 0 0 0 0 0 2 7 b.jpg\n5 6 1\n")
+    (tmp_path / "points3D.txt").write_text("1 0 0 5 0 0 0 0 1 0 2 0\n")
+    model, *size, params = read_camera(str(tmp_path), "b.jpg")
+    assert (model, size, list(params)) == ("PINHOLE", [100, 80], [90, 91, 50, 40])
+    with pytest.raises(ValueError, match="expected one camera in .*, got 2; try --image with one of a.jpg, b.jpg"):
+        read_camera(str(tmp_path / "cameras.txt"))
+    with pytest.raises(ValueError, match="expected an image of .*, got 'c.jpg'; try one of a.jpg, b.jpg"):
+        read_camera(str(tmp_path), "c.jpg")
+    with pytest.raises(ValueError, match="expected --image with a COLMAP model as --camera, got it with 'PINHOLE"):
+        read_camera("PINHOLE,500,510,320,240", "a.jpg")
+
+
 @pytest.mark.parametrize("text", ["k.npy", "PINHOLE", "500,500,320,240", "PINHOLE,wide", ""])
 def test_what_is_no_camera_is_refused(text: str) -> None:
     with pytest.raises(ValueError, match="expected --camera as a file"):

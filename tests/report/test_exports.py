@@ -70,7 +70,9 @@ def test_rerun_is_told_points_and_camera(monkeypatch: pytest.MonkeyPatch) -> Non
     SOLUTION.to_rerun("scene", camera=EXAMPLE.camera, size=(1280, 960))
     assert len(logged["scene/points"]) == 200
     np.testing.assert_allclose(logged["scene/camera"], SOLUTION.centre)
-    assert logged["scene/camera/image"] == {"focal_length": 800.0, "width": 1280, "height": 960}
+    pinhole = logged["scene/camera/image"]
+    assert (pinhole["focal_length"], pinhole["width"], pinhole["height"]) == (800.0, 1280, 960)
+    np.testing.assert_allclose(pinhole["principal_point"], EXAMPLE.camera[:2, 2])
     np.testing.assert_allclose(logged["scene/camera/image/keypoints"], EXAMPLE.points2d, atol=1e-6)
 
 
