@@ -4,21 +4,27 @@ import importlib
 import json
 import sys
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import roma
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bpnp import SceneMap
+from bpnp.cameras import camera_from
 from bpnp.geometry import bearings, project, rotation_angle, transform
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
+from bpnp.maps.views import View
 
 FOLDER = Path(__file__).parents[1] / "benchmarks"
 MODULES = (
-    "bench_constellation", "bench_layers", "bench_scaling", "exact", "gpu", "layer_rows", "paper_layers", "problems",
-    "steps", "timing",
+    "bench_constellation", "bench_layers", "bench_scaling", "descriptor_poses", "exact", "gpu", "layer_rows",
+    "paper_layers", "problems", "rebuilt_maps", "steps", "timing",
 )  # fmt: skip
 
 
@@ -222,3 +228,34 @@ def test_constellation_command_writes_what_it_measured(bench: SimpleNamespace, t
     assert names <= {row["name"] for row in rows}
     assert all(row["wrong"] == 0 for row in rows if not row["name"].startswith("RandomRansac"))
     assert 0 < out.with_suffix(".png").stat().st_size < 200_000
+
+
+def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:
+    """Another frame and unit, and views that only one of the models has."""
+    rng, lens, seen = np.random.default_rng(0), camera_from(np.eye(3)), np.arange(4, dtype=np.int32)
+    turn = Rotation.random(random_state=9).as_matrix()
+    views = [
+        View(str(k), lens, Rotation.random(random_state=k).as_matrix(), rng.normal(size=3), seen) for k in range(6)
+    ]
+    moved = [
+        replace(v, rotation=v.rotation @ turn.T, translation=-v.rotation @ turn.T @ (0.3 * turn @ v.centre + [1, 2, 3]))
+        for v in views
+    ]
+    here, there = (SceneMap(np.zeros((4, 3)), np.arange(4), seen, tuple(v)) for v in (views[:5], moved[1:]))
+    found = bench.rebuilt_maps.aligned(here, there)
+    rotation, centre = found.pose(views[0].rotation, views[0].translation)
+    np.testing.assert_allclose(rotation, moved[0].rotation, atol=1e-12)
+    np.testing.assert_allclose(centre, moved[0].centre, atol=1e-12)
+
+
+def test_descriptors_are_matched_to_points_seen_from_several_views(bench: SimpleNamespace) -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(300, 64))
+    seen = np.concatenate([points + 0.1 * rng.normal(size=points.shape) for _ in range(3)])
+    photo = np.concatenate([points[:100] + 0.1 * rng.normal(size=(100, 64)), rng.normal(size=(500, 64))])
+    theirs, own = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (seen, photo))
+    keypoints, ids = bench.descriptor_poses.descriptor_matches(own, theirs, np.tile(np.arange(300) + 7, 3))
+    true = keypoints < 100
+    assert true.sum() == 100
+    np.testing.assert_array_equal(ids[true], keypoints[true] + 7)
+    assert (~true).sum() < 25

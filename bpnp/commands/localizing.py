@@ -44,7 +44,7 @@ def localize(
         photos: photos, or folders of them.
         camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; EXIF by default.
         views: text file of pairs "photo view", the views of the map to try; the whole map by default.
-        keypoints: hloc's HDF5 file of features; SIFT is detected by default.
+        keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map, and each is taken out of it first.
         model: COLMAP model whose images are solved again, such as sparse/0.
         image: one image, or all.

@@ -11,7 +11,8 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from bpnp.localization.solved import write_text
-from bpnp.maps.keypoints import detected_keypoints, read_features
+from bpnp.maps.colmap_database import is_database, read_database
+from bpnp.maps.keypoints import Keypoints, detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.figures import save_figure
@@ -27,8 +28,8 @@ POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 @dataclass(frozen=True)
 class PhotoOptions:
     """What applies to all photos. camera: as for `bpnp.solve`, None for that of EXIF. pairs: views to try by the name
-    of the photo, None for the whole map. features: hloc's HDF5 file, None to detect keypoints. leave_one_out: the
-    photos are views of the map and are taken out of it."""
+    of the photo, None for the whole map. features: hloc's HDF5 file or COLMAP's database, None to detect keypoints.
+    leave_one_out: the photos are views of the map and are taken out of it."""
 
     camera: Any = None
     pairs: Mapping[str, Sequence[str]] | None = None
@@ -55,7 +56,7 @@ def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOption
     if options.leave_one_out:
         scene = scene.without([name])
     camera = camera_from_exif(photo) if options.camera is None else options.camera
-    found = detected_keypoints(photo) if options.features is None else read_features(options.features, name, size)
+    found = detected_keypoints(photo) if options.features is None else _read_keypoints(options.features, name, size)
     views = None if options.pairs is None else options.pairs.get(name)
     if options.pairs is not None and not views:
         raise ValueError(f"expected views for {name} among the pairs, got none; try without --views")
@@ -110,6 +111,10 @@ def photos_table(solutions: Mapping[str, Solution]) -> FittedTable:
         times = (f"{solution.log10_false_alarms:.0f}", number(solution.seconds))
         rows.append((Text(name), [Text(solution.verdict, VERDICTS[solution.verdict]), *map(Text, (*cells, *times))]))
     return FittedTable("", ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec"), [rows])
+
+
+def _read_keypoints(file: Path, name: str, size: tuple[int, int]) -> Keypoints:
+    return read_database(file, name, size) if is_database(file) else read_features(file, name, size)
 
 
 def _expanded(given: Iterable[Path]) -> Iterator[Path]:

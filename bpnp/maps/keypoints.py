@@ -60,7 +60,7 @@ def read_features(file: Path, photo: str, size: tuple[int, int] | None = None) -
             scores = np.asarray(group["scores"], np.float64) if "scores" in group else np.ones(len(pixels))
             own = tuple(int(value) for value in group["image_size"]) if "image_size" in group else None
     except OSError as error:
-        raise ValueError(f"expected an HDF5 file of keypoints, got {file}: {error}") from error
+        raise ValueError(f"expected an HDF5 file of keypoints or a database of COLMAP, got {file}: {error}") from error
     if pixels.ndim != 2 or pixels.shape[1] != 2 or scores.shape != (len(pixels),):
         raise ValueError(
             f"expected keypoints (m, 2) and scores (m,) of {photo} in {file}, got {pixels.shape} and {scores.shape}"

@@ -87,5 +87,5 @@ def test_features_of_hloc(tmp_path: Path) -> None:
     ):
         read_features(path, "query/a.jpg", (80, 50))
     path.write_bytes(b"something else")
-    with pytest.raises(ValueError, match="expected an HDF5 file of keypoints"):
+    with pytest.raises(ValueError, match="expected an HDF5 file of keypoints or a database of COLMAP"):
         read_features(path, "query/a.jpg")

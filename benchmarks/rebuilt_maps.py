@@ -1,0 +1,104 @@
+"""Maps of a folder of photos built without one of them: features and matches once, then a reconstruction for each.
+
+SIFT and exhaustive matching by pycolmap with its defaults, one thread, one known camera. Kept for another run:
+features.db, full/sparse and without-<photo>/sparse.
+"""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class PhotoScene:
+    """The photos of a folder, one camera for all (COLMAP's PINHOLE: fx, fy, cx, cy), and where its maps are kept."""
+
+    photos: Path
+    kept: Path
+    camera: tuple[float, float, float, float]
+
+    @property
+    def database(self) -> Path:
+        """Features and verified matches of all photos."""
+        path = self.kept / "features.db"
+        if not path.is_file():
+            self.kept.mkdir(parents=True, exist_ok=True)
+            temporary = path.with_suffix(".part")
+            temporary.unlink(missing_ok=True)
+            reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
+            reader.camera_model, reader.camera_params = "PINHOLE", ",".join(map(str, self.camera))
+            extraction.num_threads = 1
+            pycolmap.extract_features(
+                temporary, self.photos, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+                extraction_options=extraction,
+            )  # fmt: skip
+            matching = pycolmap.FeatureMatchingOptions()
+            matching.num_threads = 1
+            pycolmap.match_exhaustive(temporary, matching_options=matching)
+            temporary.rename(path)
+        return path
+
+    def names(self) -> list[str]:
+        """The photos."""
+        return sorted(path.name for path in self.photos.iterdir() if path.suffix.lower() in {".jpg", ".png"})
+
+    def full(self) -> Path:
+        """The model of all photos."""
+        return self._model("full", self.names())
+
+    def without(self, photo: str) -> Path:
+        """The model of all photos but one."""
+        return self._model(f"without-{photo}", [name for name in self.names() if name != photo])
+
+    def _model(self, what: str, names: Sequence[str]) -> Path:
+        folder = self.kept / what / "sparse"
+        if not folder.is_dir():
+            options = pycolmap.IncrementalPipelineOptions()
+            options.num_threads, options.random_seed, options.image_names = 1, 0, list(names)
+            options.ba_refine_focal_length = options.ba_refine_extra_params = False
+            temporary = folder.with_name("part")
+            shutil.rmtree(temporary, ignore_errors=True)
+            temporary.mkdir(parents=True)
+            models = pycolmap.incremental_mapping(self.database, self.photos, temporary, options)
+            if not models:
+                raise ValueError(f"expected a model of {len(names)} photos of {self.photos}, got none")
+            largest = max(models, key=lambda number: models[number].num_reg_images())
+            (temporary / str(largest)).rename(folder)
+            shutil.rmtree(temporary)
+        return folder
+
+
+@dataclass(frozen=True, eq=False)
+class Alignment:
+    """A similarity between the frames of two models of the same views: p in `there` is scale * turn p + shift."""
+
+    scale: float
+    turn: Array
+    shift: Array
+
+    def pose(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
+        """A pose of the first frame, and its camera's centre, in the second one."""
+        centre = -rotation.T @ translation
+        return rotation @ self.turn.T, self.scale * self.turn @ centre + self.shift
+
+
+def aligned(here: SceneMap, there: SceneMap) -> Alignment:
+    """From the poses of the views that both have: mean rotation between their cameras, then their centres."""
+    names = [view.name for view in here.views if view.name in there.view_numbers]
+    ours, theirs = here.named(names), there.named(names)
+    turns = [b.rotation.T @ a.rotation for a, b in zip(ours, theirs, strict=True)]
+    turn = Rotation.from_matrix(np.array(turns)).mean().as_matrix()
+    a, b = (np.array([view.centre for view in views]) for views in (ours, theirs))
+    a0, b0 = a - a.mean(0), b - b.mean(0)
+    scale = float(((a0 @ turn.T) * b0).sum() / (a0**2).sum())
+    return Alignment(scale, turn, b.mean(0) - scale * turn @ a.mean(0))

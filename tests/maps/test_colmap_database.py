@@ -1,0 +1,85 @@
+"""Keypoints come out of a database as COLMAP itself wrote them; damaged, unknown and other photos are refused."""
+
+import sqlite3
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from bpnp.maps.colmap_database import is_database, read_database
+
+ROWS = np.array([[0.5, 0.5, 2.0, 0.1], [99.25, 49.75, 4.0, 0.2], [0.5, 0.5, 2.0, 1.7]], np.float32)
+
+
+def write_database(path: Path, keypoints: dict[str, np.ndarray]) -> Path:
+    """By COLMAP's own library: photos of 100 x 50 pixels."""
+    with pycolmap.Database.open(path) as content:
+        camera = content.write_camera(
+            pycolmap.Camera(camera_id=0, model="PINHOLE", width=100, height=50, params=[80.0, 80, 50, 25])
+        )
+        for name, rows in keypoints.items():
+            content.write_keypoints(content.write_image(pycolmap.Image(name=name, camera_id=camera)), rows)
+    return path
+
+
+@pytest.fixture
+def database(tmp_path: Path) -> Path:
+    shapes = np.column_stack([ROWS[:2, :2], [[0, -3, 3, 0], [2, 0, 0, 4]]]).astype(np.float32)
+    return write_database(
+        tmp_path / "database.db",
+        {"a.jpg": ROWS, "b.jpg": ROWS[:, :2], "c.jpg": shapes, "out.jpg": ROWS + 60, "none.jpg": ROWS[:0]},
+    )
+
+
+def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
+    assert is_database(database)
+    found = read_database(database, "a.jpg", (100, 50))
+    np.testing.assert_array_equal(found.pixels, [[0.5, 0.5], [99.25, 49.75]])
+    np.testing.assert_array_equal(found.scores, [2, 4])
+    assert found.size == (100, 50)
+    np.testing.assert_array_equal(read_database(database, "b.jpg").scores, [1, 1])
+    np.testing.assert_array_equal(read_database(database, "c.jpg").scores, [3, 3])  # a turn by 90 deg times 3; 2 and 4
+
+
+def test_what_is_wrong_is_one_clear_error(database: Path, tmp_path: Path) -> None:
+    for photo, size, message in (
+        ("d.jpg", None, r"expected keypoints of d\.jpg in .*database\.db, got none, but a\.jpg, b\.jpg"),
+        ("none.jpg", None, r"expected keypoints of none\.jpg in .*, got none$"),
+        ("a.jpg", (200, 100), r"at its size \(200, 100\) in .*, got them at \(100, 50\)"),
+        ("out.jpg", None, r"inside the 100 x 50 pixels of out\.jpg .*, got 2 outside"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            read_database(database, photo, size)
+    other = tmp_path / "other.db"
+    other.write_bytes(b"something else, longer than the header of a database")
+    assert not is_database(other)
+    with pytest.raises(ValueError, match=r"expected a database of COLMAP, got .*other\.db: file is not a database"):
+        read_database(other, "a.jpg")
+    (tmp_path / "cut.db").write_bytes(database.read_bytes()[:5000])
+    with pytest.raises(ValueError, match=r"expected a database of COLMAP, got .*cut\.db"):
+        read_database(tmp_path / "cut.db", "a.jpg")
+    with sqlite3.connect(tmp_path / "empty.db") as content:
+        content.execute("CREATE TABLE other (number INTEGER)")
+    with pytest.raises(ValueError, match="no such table: images"):
+        read_database(tmp_path / "empty.db", "a.jpg")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("rows = 4", "got 4 rows of 4 in 48 bytes"),
+        ("rows = -3", "got -3 rows of 4 in 48 bytes"),
+        ("cols = 3", "got 3 rows of 3 in 48 bytes"),
+        ("data = NULL", "got 3 rows of 4 in 0 bytes"),
+        ("data = 'text'", "got 3 rows of 4 in 0 bytes"),
+        ("rows = 'x'", "got x rows of 4 in 48 bytes"),
+        ("data = x'0000c07f00000000', cols = 2, rows = 1", "expected finite keypoints of .*, got 1 that"),
+    ],
+)
+def test_damaged_rows_are_refused(database: Path, change: str, message: str) -> None:
+    with sqlite3.connect(database) as content:
+        content.execute(f"UPDATE keypoints SET {change} WHERE image_id = 1")
+    with pytest.raises(ValueError, match=message) as error:
+        read_database(database, "a.jpg")
+    assert f"a.jpg in {database}" in str(error.value)
