@@ -9,8 +9,7 @@ from bpnp.metrics.errors import (
     translation_error,
 )
 from bpnp.metrics.per_pair import MeanOverPairs
-from bpnp.metrics.quartiles import PoseQuartiles, pose_quartiles
-from bpnp.metrics.recall import PoseRecall, RecallThresholds, pose_recalls
+from bpnp.metrics.pose_metrics import PoseQuartiles, PoseRecall, RecallThresholds, pose_quartiles, pose_recalls
 
 __all__ = [
     "MeanOverPairs", "PoseErrors", "PoseQuartiles", "PoseRecall", "RecallThresholds", "centre_error", "pose_errors",

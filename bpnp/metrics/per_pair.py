@@ -2,7 +2,6 @@
 
 import math
 import warnings
-from collections.abc import Iterator
 from typing import Any
 
 import torch
@@ -11,22 +10,7 @@ from torch import Tensor
 from torchmetrics import Metric
 from torchmetrics.utilities.data import dim_zero_cat
 
-from bpnp.metrics.errors import PoseErrors
-
 NO_PAIR = "expected at least one pair, got none; try update() before compute()"
-
-
-def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
-    """Name, unit and values of each error that at least one pair has."""
-    if len(errors.rotation_deg) == 0:
-        raise ValueError(NO_PAIR)
-    for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
-        error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
-        known = error[~error.isnan()].double()
-        if len(known) < len(error) and name != "reprojection":
-            raise ValueError(f"expected a {name} error for each pair, got NaN; a pair without a pose is 180 deg or inf")
-        if len(known):
-            yield name, unit, known
 
 
 class PairMetric(Metric):
@@ -67,22 +51,6 @@ class PairMetric(Metric):
         keep = torch.ones_like(index, dtype=torch.bool)
         keep[repeat] = False
         return values[keep].unbind(-1)
-
-
-class PoseMetric(PairMetric):
-    """The four errors of every pair's pose."""
-
-    width = 4
-
-    def update(self, errors: PoseErrors) -> None:
-        """Add the errors of a batch; all of them are counted if their index is None."""
-        self._append(
-            errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg, index=errors.index
-        )
-
-    def errors(self) -> PoseErrors:
-        """The errors so far, each pair once."""
-        return PoseErrors(*self._columns())
 
 
 class MeanOverPairs(PairMetric):

@@ -74,14 +74,15 @@ def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
     """L_c per sample (paper Eq. 9); None if there is no assignment, or nothing to compare it with.
 
-    angle: None for the true pairs; else all pairs within it, radians, under the true pose.
+    angle: None for the true pairs; else all pairs within it, radians, under the true pose: supervision by the pose
+        alone, with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], of which several may be of one point.
     """
     if prediction.assignment is None:
         return None
     if angle is None:
         return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-    points = batch.points2d, batch.points3d
-    return correspondence_loss_from_pose(prediction.assignment, *points, *_true_pose(batch), angle=angle)
+    true = pairs_within(batch.points2d, batch.points3d, *_true_pose(batch), angle)
+    return (prediction.assignment * (1.0 - 2.0 * true)).sum((-2, -1))
 
 
 def pose_losses(pose: Pose, batch: Batch) -> Float[Tensor, " b"]:
@@ -139,22 +140,6 @@ def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tens
 
 def _log(probability: Tensor) -> Tensor:
     return probability.clamp_min(SMALLEST).log()
-
-
-def correspondence_loss_from_pose(
-    assignment: Float[Tensor, "b m n"],
-    points2d: Float[Tensor, "b m 2"],
-    points3d: Float[Tensor, "b n 3"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
-    *,
-    angle: float,
-) -> Float[Tensor, " b"]:
-    """Eq. 9 as it is written: C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], angle in radians.
-
-    Supervision by the pose alone. Several pairs of a point may count as correspondences.
-    """
-    return (assignment * (1.0 - 2.0 * pairs_within(points2d, points3d, rotation, translation, angle))).sum((-2, -1))
 
 
 def pairs_within(

@@ -16,7 +16,7 @@ from bpnp.models.baselines.branch_and_bound.boxes import (
     split,
     translation_uncertainty,
 )
-from bpnp.models.baselines.branch_and_bound.gopac import maximise_inliers
+from bpnp.models.baselines.branch_and_bound.gopac import best_rotation, count_inliers, maximise_inliers
 from bpnp.models.baselines.branch_and_bound.gosma import align_mixtures, polish
 from bpnp.models.baselines.branch_and_bound.mixtures import (
     RayMixture,
@@ -29,7 +29,6 @@ from bpnp.models.baselines.branch_and_bound.mixtures import (
     scene_mixture,
     squared_norm,
 )
-from bpnp.models.baselines.branch_and_bound.rotation_search import best_rotation, count_inliers
 
 
 def normal(*shape: int) -> Tensor:

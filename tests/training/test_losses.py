@@ -10,7 +10,7 @@ from bpnp import Batch
 from bpnp.geometry import bearings, rotation_angle, transform
 from bpnp.training.losses import (
     correspondence_loss,
-    correspondence_loss_from_pose,
+    correspondence_losses,
     matching_likelihood_loss,
     pairs_within,
     pose_loss,
@@ -57,9 +57,8 @@ def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: fl
     planted = plant(2, 12, noise=0.01, outliers2d=3)
     assignment = random_assignment(planted)
     within = pairs_within(planted.points2d, planted.points3d, *planted.pose, threshold)
-    found = correspondence_loss_from_pose(
-        assignment, planted.points2d, planted.points3d, *planted.pose, angle=threshold
-    )  # fmt: skip
+    found = correspondence_losses(Prediction(assignment), planted.batch(), angle=threshold)
+    assert found is not None
     for b in range(2):
         expected = 0.0
         for i, j in torch.cartesian_prod(torch.arange(15), torch.arange(12)).tolist():

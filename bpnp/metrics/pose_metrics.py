@@ -1,0 +1,136 @@
+"""Quartiles and recall of pose errors over many pairs, as functions and as metrics.
+
+A pair without a pose counts as 180 deg and infinity: it is right at no threshold. A pair without a true match has no
+reprojection error: it is left out of what is said of that error, and counted as "without_true_pairs".
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from bpnp.metrics.errors import PoseErrors
+from bpnp.metrics.per_pair import NO_PAIR, PairMetric
+
+Limits = Sequence[float | int]
+
+
+@dataclass(frozen=True)
+class RecallThresholds:
+    """Errors up to which a pose counts as right; `joint` holds pairs (rotation in deg, translation)."""
+
+    rotation_deg: Limits = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0)
+    translation: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
+    centre: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
+    reprojection_deg: Limits = (0.25, 0.5, 1.0, 2.0)
+    joint: Sequence[tuple[float | int, float | int]] = ((15.0, 0.5), (10.0, 1.0))
+
+    def __post_init__(self) -> None:
+        given = (self.rotation_deg, self.translation, self.centre, self.reprojection_deg, *self.joint)
+        if not all(0 <= limit < math.inf for limits in given for limit in limits):
+            raise ValueError(f"expected finite thresholds >= 0, got {self}")
+
+
+def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
+    """First, second (median) and third quartile of each error, as float64 scalars.
+
+    Keys: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on; "found", the share of pairs
+    with a pose; "without_true_pairs", the number of pairs without a reprojection error. Linear interpolation between
+    order statistics (numpy's default); a quartile that leans on an infinite neighbour is infinite. The reprojection
+    quartiles are absent if no pair has that error. Raises ValueError if there is no pair.
+    """
+    values: dict[str, Tensor] = {}
+    for name, unit, error in known_errors(errors):
+        ordered = error.sort().values
+        for number in (1, 2, 3):
+            position = number / 4 * (len(ordered) - 1)
+            below, above = ordered[math.floor(position)], ordered[math.ceil(position)]
+            # Between two infinities the interpolation is NaN.
+            value = torch.lerp(below, above, position % 1).where(above.isfinite(), above)
+            values[f"{name}_q{number}_{unit}".rstrip("_")] = value
+    values["found"] = errors.translation.isfinite().double().mean()
+    values["without_true_pairs"] = errors.reprojection_deg.isnan().double().sum()
+    return values
+
+
+def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None) -> dict[str, Tensor]:
+    """Share of pairs in [0, 1] with error <= threshold, for every threshold, as float64 scalars.
+
+    Keys: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5", "recall_reprojection_1deg", and
+    "recall_joint_15deg_0.5" for rotation and translation both. Raises ValueError if there is no pair.
+    """
+    thresholds = thresholds or RecallThresholds()
+    values: dict[str, Tensor] = {}
+    for name, unit, error in known_errors(errors):
+        for limit in getattr(thresholds, f"{name}_{unit}".rstrip("_")):
+            values[f"recall_{name}_{limit:g}{unit}"] = (error <= limit).double().mean()
+    for degrees, length in thresholds.joint:
+        right = (errors.rotation_deg <= degrees) & (errors.translation <= length)
+        values[f"recall_joint_{degrees:g}deg_{length:g}"] = right.double().mean()
+    return values
+
+
+def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
+    """Name, unit and values of each error that at least one pair has."""
+    if len(errors.rotation_deg) == 0:
+        raise ValueError(NO_PAIR)
+    for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
+        error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
+        known = error[~error.isnan()].double()
+        if len(known) < len(error) and name != "reprojection":
+            raise ValueError(f"expected a {name} error for each pair, got NaN; a pair without a pose is 180 deg or inf")
+        if len(known):
+            yield name, unit, known
+
+
+class PoseMetric(PairMetric):
+    """The four errors of every pair's pose."""
+
+    width = 4
+
+    def update(self, errors: PoseErrors) -> None:
+        """Add the errors of a batch; all of them are counted if their index is None."""
+        self._append(
+            errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg, index=errors.index
+        )
+
+    def errors(self) -> PoseErrors:
+        """The errors so far, each pair once."""
+        return PoseErrors(*self._columns())
+
+
+class PoseQuartiles(PoseMetric):
+    """`pose_quartiles` over all pairs.
+
+    >>> metric = PoseQuartiles()
+    >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
+    >>> float(metric.compute()["rotation_q1_deg"])
+    2.0
+    """
+
+    higher_is_better = False
+
+    def compute(self) -> dict[str, Tensor]:
+        return pose_quartiles(self.errors())
+
+
+class PoseRecall(PoseMetric):
+    """`pose_recalls` over all pairs.
+
+    >>> metric = PoseRecall(RecallThresholds(rotation_deg=(4,)))
+    >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
+    >>> round(float(metric.compute()["recall_rotation_4deg"]), 3)
+    0.667
+    """
+
+    higher_is_better = True
+
+    def __init__(self, thresholds: RecallThresholds | None = None, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.thresholds = thresholds
+
+    def compute(self) -> dict[str, Tensor]:
+        return pose_recalls(self.errors(), self.thresholds)
