@@ -1,7 +1,6 @@
 """Entropic optimal transport from a cost matrix to a joint probability (paper Eqs. 4 and 8), to convergence.
 
-P = argmin <P, M> + mu sum P (log P - 1)  over P >= 0, P 1 = r, P^T 1 = c.
-`bpnp.layers.transport` finds the optimum, `bpnp.layers.adjoint` its gradient, by the theorem in `bpnp.layers.implicit`.
+`layers.transport` finds the optimum, `layers.laplacian` its gradient, by the theorem in `layers.implicit`.
 """
 
 import math
@@ -11,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.checks import checked_shapes
-from bpnp.layers.adjoint import solve_multipliers
 from bpnp.layers.implicit import BackwardStats, entropic_plan, record
+from bpnp.layers.laplacian import solve_multipliers
 from bpnp.layers.transport import solve_plan
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats

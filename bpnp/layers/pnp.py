@@ -1,8 +1,4 @@
-"""The weighted blind PnP layer (paper Eq. 7): from a start to the pose that best explains a soft assignment.
-
-The solver is Newton's method on the aggregated objective, or the paper's L-BFGS on the dense one. Both end at the same
-optimum; its gradient (`bpnp.layers.implicit`) does not depend on the solver.
-"""
+"""The weighted blind PnP layer (paper Eq. 7): from a start to the pose that best explains a soft assignment."""
 
 from typing import Literal
 
@@ -14,9 +10,8 @@ from torch import Tensor, nn
 from bpnp.checks import checked_shapes
 from bpnp.geometry import hat, is_finite
 from bpnp.layers.implicit import at_optimum
-from bpnp.layers.lbfgs import lbfgs
-from bpnp.layers.newton import newton
 from bpnp.layers.objective import Columns, Derivatives, Rotations, Translations, aggregate, derivatives, pose_gradient
+from bpnp.layers.pose_solvers import lbfgs, newton
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 

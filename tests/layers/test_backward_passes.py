@@ -23,7 +23,7 @@ def too_few_iterations(monkeypatch: pytest.MonkeyPatch) -> None:
     """Three conjugate gradient steps, and no factorisation that is good enough."""
     monkeypatch.setattr(f"{SHARED}.ITERATIONS", 3)
     monkeypatch.setattr(f"{SHARED}.FACTORISED", 0.0)
-    monkeypatch.setattr("bpnp.layers.adjoint.ROUNDING", 0.0)
+    monkeypatch.setattr("bpnp.layers.laplacian.ROUNDING", 0.0)
 
 
 @pytest.mark.parametrize("compiled", [True, False])

@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from bpnp.layers import laplacian
-from bpnp.layers.adjoint import solve_multipliers
 from bpnp.layers.compiled import conjugate_gradients
+from bpnp.layers.laplacian import solve_multipliers
 from bpnp.layers.plan import Plan
 
 LIMIT = 200

@@ -29,16 +29,16 @@ FILES = [
 ]
 # Calls that may read a value back, by function.
 READS = {
-    "layers/adjoint.py:_solve": 1,  # float64: whether anything stalled
-    "layers/adjoint.py:solve_multipliers": 2,  # whether a sample needs float64, and which
+    "layers/laplacian.py:_solve": 1,  # float64: whether anything stalled
+    "layers/laplacian.py:solve_multipliers": 2,  # whether a sample needs float64, and which
     "layers/assignment.py:_check_mu": 1,  # in an error
     "layers/assignment.py:sinkhorn": 1,  # whether a given mask has a real point in every sample
     "layers/compiled.py:conjugate_gradients": 1,  # on the CPU only
     "layers/implicit.py:record": 1,  # unconverged backward passes
     "layers/laplacian.py:conjugate_gradients": 1,  # the end, every eighth iteration
     "layers/laplacian.py:solve_laplacian": 2,  # float64: what to factorise
-    "layers/lbfgs.py:lbfgs": 1,  # the paper's solver, an option
-    "layers/newton.py:newton": 1,  # the end, each iteration
+    "layers/pose_solvers.py:lbfgs": 1,  # the paper's solver, an option
+    "layers/pose_solvers.py:newton": 1,  # the end, each iteration
     "layers/plan.py:degree": 1,  # whether differences have lost their digits
     "layers/ransac.py:top_pairs": 1,  # of numbers of the host
     "layers/transport.py:_absorb": 3,
