@@ -11,6 +11,7 @@ import argparse
 import json
 import warnings
 from collections.abc import Iterator
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -33,22 +34,22 @@ SHUFFLED = ("castle-P30", "fountain-P11", "south_building", "statue_of_liberty",
 SHUFFLED_SIZES = (8, 15, 40, 120, 400, 1000)
 KINDS = ("noise", "shuffled", "twins", "surfaces")
 CLAIMS = (0.0, -1.0, -2.0, -3.0)  # log10 of false alarms
-# Pairs of points up to which this share of the trials is made.
-SIZES = ((70, 1.0), (200, 0.2), (1000, 0.03), (np.inf, 0.005))
+# Points of the larger side up to which this share of the trials is made.
+SIZES = ((50, 1.0), (400, 0.2), (np.inf, 0.01))
 SURFACES = 0.1  # share of the trials
 MESH_VERTICES, SAMPLES = (100, 2000), 400
 WRONG_DEG = 3.0
 
 
-def trials_of(pairs: int, trials: int) -> int:
+def trials_of(points: int, trials: int) -> int:
     """Fewer trials of large sets, each of which takes seconds."""
-    return max(int(next(share for most, share in SIZES if pairs <= most) * trials), 3)
+    return max(int(next(share for most, share in SIZES if points <= most) * trials), 3)
 
 
 def noise(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
     """Each size's name, a solution, and NaN: nothing is right."""
     for m, n in NOISE_SIZES:
-        for _ in range(trials_of(m * n, trials)):
+        for _ in range(trials_of(max(m, n), trials)):
             points2d = rng.uniform((0, 0), (WIDTH, HEIGHT), (m, 2))
             yield f"{m} x {n}", solve(points2d, rng.uniform(-1, 1, (n, 3)), CAMERA), np.nan
 
@@ -56,7 +57,7 @@ def noise(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution
 def shuffled(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
     sources = {name: source(name, data, 8) for name in SHUFFLED}
     for size in SHUFFLED_SIZES:
-        for _ in range(trials_of(size**2, trials)):
+        for _ in range(trials_of(size, trials)):
             first, second = (sources[name] for name in rng.choice(SHUFFLED, 2, replace=False))
             image = first.pair(int(rng.integers(len(first)))).points2d[0].double().numpy()
             scene = second.pair(int(rng.integers(len(second)))).points3d[0].double().numpy()
@@ -101,23 +102,20 @@ def degrees(found: Solution, rotation: Array) -> float:
     return float(np.degrees(Rotation.from_matrix(found.rotation.T @ rotation).magnitude())) if found.found else 180.0
 
 
-def table(rows: list[tuple[str, Solution, float]]) -> dict[str, dict[str, float]]:
-    """Per name: trials, the share with false alarms up to each claim, and the shares confident and wrongly so."""
-    results = {}
-    for name in dict.fromkeys(name for name, _, _ in rows):
-        own = [(solution, error) for key, solution, error in rows if key == name]
-        alarms = np.array([solution.log10_false_alarms for solution, _ in own])
-        sure = np.array([solution.verdict == "confident" for solution, _ in own])
-        wrong = sure & ~(np.array([error for _, error in own]) <= WRONG_DEG)
-        results[name] = {
-            "trials": len(own),
-            **{f"at or below 1e{claim:g}": float((alarms <= claim).mean()) for claim in CLAIMS},
-            "lowest": float(alarms.min()),
-            "confident": float(sure.mean()),
-            "confident and wrong": int(wrong.sum()),
-            "failed": float(np.mean([solution.verdict == "failed" for solution, _ in own])),
-        }
-    return results
+def summary(found: list[tuple[Solution, float]]) -> dict[str, float]:
+    """Of the solutions and errors of a row: trials, the share with false alarms up to each claim, and the shares
+    confident and wrongly so."""
+    alarms = np.array([solution.log10_false_alarms for solution, _ in found])
+    sure = np.array([solution.verdict == "confident" for solution, _ in found])
+    wrong = sure & ~(np.array([error for _, error in found]) <= WRONG_DEG)
+    return {
+        "trials": len(found),
+        **{f"at or below 1e{claim:g}": float((alarms <= claim).mean()) for claim in CLAIMS},
+        "lowest": float(alarms.min()),
+        "confident": float(sure.mean()),
+        "confident and wrong": int(wrong.sum()),
+        "failed": float(np.mean([solution.verdict == "failed" for solution, _ in found])),
+    }
 
 
 def draw(alarms: dict[str, list[float]], path: Path) -> None:
@@ -167,17 +165,19 @@ def main() -> None:
         record = json.loads(options.output.read_text())
     for kind in options.kinds:
         rng = np.random.default_rng([options.seed, KINDS.index(kind)])
-        found = list(rows_of(kind, options.data, options.trials, rng))
-        if not found:
-            continue
-        record["results"][kind] = {"seed": options.seed, **table(found)}
-        for name, row in table(found).items():
-            print(kind, name, " ".join(f"{key}: {value:.4g}" for key, value in row.items()), flush=True)
-        if kind in ("noise", "shuffled"):
-            record["alarms"][kind] = sorted(round(solution.log10_false_alarms, 2) for _, solution, _ in found)
-        if options.output:
-            options.output.parent.mkdir(parents=True, exist_ok=True)
-            options.output.write_text(json.dumps(record) + "\n")
+        results: dict[str, Any] = {"seed": options.seed}
+        alarms: list[float] = []
+        for name, rows in groupby(rows_of(kind, options.data, options.trials, rng), key=lambda row: row[0]):
+            found = [(solution, error) for _, solution, error in rows]
+            results[name] = summary(found)
+            print(kind, name, " ".join(f"{key}: {value:.4g}" for key, value in results[name].items()), flush=True)
+            alarms += [round(solution.log10_false_alarms, 2) for solution, _ in found]
+            record["results"][kind] = results
+            if kind in ("noise", "shuffled"):
+                record["alarms"][kind] = sorted(alarms)
+            if options.output:
+                options.output.parent.mkdir(parents=True, exist_ok=True)
+                options.output.write_text(json.dumps(record) + "\n")
     if options.picture:
         draw(record["alarms"], options.picture)
 
