@@ -35,6 +35,8 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
     # Only points of a near pair take part. Column `count + i` stands for leaving row i out.
     rows, row = np.unique(pairs[:, 0], return_inverse=True)
     columns, column = np.unique(pairs[:, 1], return_inverse=True)
+    if len(rows) == len(pairs) == len(columns):
+        return pairs  # no point has a choice
     count, every = len(columns), np.arange(len(rows))
     cost = (distance / radius) ** 2 + 1e-9  # zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))

@@ -72,7 +72,7 @@ class Problem:
         """The 3D points around `origin`."""
         return self.points3d - self.origin
 
-    @property
+    @cached_property
     def per_radian(self) -> float:
         """Units of `image` a radian, at the median point: a plane stretches by (1 + r^2)^(3/4) at the distance r."""
         if self.unit == "rad":
@@ -207,7 +207,9 @@ def _origin(points3d: Array) -> Array:
 
 def _degenerate(bearings: Array, points3d: Array, fewest: int) -> str | None:
     for name, points in (("2D", bearings), ("3D", points3d)):
-        count = len(np.unique(points, axis=0))
+        count, others = 0, points
+        while len(others) and count < fewest:
+            count, others = count + 1, others[(others != others[0]).any(-1)]
         if count < fewest:
             return f"only {count} different {name} point{'s' if count > 1 else ''}: {fewest} or more fix a pose"
     extents = np.linalg.svd(points3d - points3d.mean(0), compute_uv=False)

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.image_statistics import solid_angle
 from bpnp.search.few.knowledge import predicted_pose
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
 from bpnp.search.point_sets import PointSets
@@ -30,29 +29,29 @@ def is_few(sets: PointSets) -> bool:
 
 
 def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
-    """Candidates in the user's coordinates, likeliest first, and whether every hypothesis was tried.
+    """Candidates in the user's coordinates, best first, and whether every hypothesis was tried.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
     """
 
-    certain = False
+    certain: Candidates | None = None
     if sets.cosines3d is not None:
         sets = replace(sets, normals3d=None, cosines3d=None)
 
     def is_safe(found: FewPoses) -> bool:
         nonlocal certain
         candidates = weighed(_candidates(found, sets, settings), sets, settings.evidence)
-        certain = is_certain(candidates, sets, settings.evidence, exhaustive=True)
-        return certain
+        certain = candidates if is_certain(candidates, sets, settings.evidence, exhaustive=True) else None
+        return certain is not None
 
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
     chosen = SETTINGS._replace(stages=()) if near else SETTINGS
     found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
-    candidates = _candidates(found, sets, settings)
-    if certain or not tracked or not (near or margin(found) < 0):
+    candidates = _candidates(found, sets, settings) if certain is None else certain
+    if certain is not None or not tracked or not (near or margin(found) < 0):
         return candidates, found.exhausted
     free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
     candidates = Candidates.concatenated([candidates, _candidates(free, sets, settings)])
@@ -87,4 +86,4 @@ def _log_likelihood(sets: PointSets, rotation: Array, translation: Array, scale:
     variance = (scale**2)[:, None, None]
     exponent = (np.einsum("mk,cnk->cmn", sets.bearings, seen) - 1) / variance
     density = (np.exp(exponent) / (2 * math.pi * variance)).sum(-1) * (1 - outliers) / len(sets.points3d)
-    return np.asarray(np.log(density + outliers / solid_angle(sets.bearings)).mean(-1))
+    return np.asarray(np.log(density + outliers / sets.image.solid_angle).mean(-1))
