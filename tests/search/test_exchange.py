@@ -36,7 +36,7 @@ def test_a_wrong_match_that_holds_the_pose_is_exchanged() -> None:
         rays = directions(directions(points @ rotation.T + translation) + 3e-4 * rng.standard_normal((7, 3)))
         decoy = points[:1] + [*rng.uniform(-0.15, 0.15, 2), 0]
         sets = PointSets(rays, np.concatenate([points, decoy]))
-        scene = scene_arrays(sets.points3d, None, None, SETTINGS.witnesses)
+        scene = scene_arrays(sets.points3d, None, None)
         image = ImageArrays(rays, 6e-3, None, 2.0)
         run = Enumeration(scene, image, knowledge_of(sets, scene, image), SETTINGS.kept, 2.0)
         taken = np.concatenate([decoy, points[1:]])

@@ -271,6 +271,17 @@ def test_what_is_known_of_the_pose_finds_it_among_few_points(kind: str) -> None:
             assert off < 4.5
 
 
+def test_the_few_seen_of_many_points_are_found_wherever_they_lie() -> None:
+    """Five points of 34 are seen, which are seldom near one another, and the vertical is 0.6 degrees off."""
+    rng, up, right = np.random.default_rng(16), np.array([0.0, 0, 1]), 0
+    for _ in range(20):
+        rays, points, rotation, _, _ = planted(rng, 5, hidden=29)
+        tilt = Rotation.from_rotvec(0.01 * unit(rng)).as_matrix()
+        poses = solved(rays, points, prior=GravityPrior(tilt @ rotation @ up, up, 1.0))
+        right += any(degrees(r, rotation) < 3 for r in poses.rotation)
+    assert right >= 19
+
+
 def test_three_points_and_gravity_fix_a_pose() -> None:
     rng = np.random.default_rng(14)
     rays, points, rotation, _, _ = planted(rng, 3, noise=0.0)

@@ -26,7 +26,7 @@ class SceneArrays:
     arrays: points (n, 3), normals (n, 3) or (0, 3), labels (n,); writable, since the loops are compiled for such.
     """
 
-    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Labels | None, witnesses: int) -> None:
+    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Labels | None) -> None:
         self.centre = points3d.mean(0)
         local = points3d - self.centre
         self.size = max(float(np.sqrt((local**2).sum(-1).mean())), 1e-300)
@@ -35,7 +35,6 @@ class SceneArrays:
         labels = np.full(len(points), -1) if labels3d is None else np.array(labels3d, np.int64)
         self.arrays = points, normals, labels
         self.order, self.rank = neighbours_of(points, normals)
-        self.witnesses = np.ascontiguousarray(self.order[:, :witnesses])
         self._tables: tuple[NDArray[Any], ...] | None = None
         self._within: dict[int, int] = {0: 0, 1: 0}
         self._pairs: dict[int, NDArray[np.int64]] = {}
@@ -114,18 +113,17 @@ def pairs_within(order: NDArray[np.int64], rank: NDArray[np.int64], near: int) -
     return np.ascontiguousarray(np.concatenate(parts))
 
 
-def scene_arrays(points3d: Array, normals3d: Array | None, labels3d: Labels | None, witnesses: int) -> SceneArrays:
+def scene_arrays(points3d: Array, normals3d: Array | None, labels3d: Labels | None) -> SceneArrays:
     """The arrays of a scene; those of the last few are remembered, for a device is seen in frame after frame."""
-    return _remembered(_packed(points3d), _packed(normals3d), _packed(labels3d), witnesses)
+    return _remembered(_packed(points3d), _packed(normals3d), _packed(labels3d))
 
 
 @functools.lru_cache(maxsize=SCENES)
-def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None, witnesses: int) -> SceneArrays:
+def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None) -> SceneArrays:
     return SceneArrays(
         np.frombuffer(points3d).reshape(-1, 3),
         None if normals3d is None else np.frombuffer(normals3d).reshape(-1, 3),
         None if labels3d is None else np.frombuffer(labels3d, np.int64),
-        witnesses,
     )
 
 

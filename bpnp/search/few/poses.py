@@ -28,11 +28,11 @@ class FewSettings(NamedTuple):
     """Constants of the enumeration.
 
     stages: what is tried, one after the other; those of two pairs only where a prior lets two pairs fix a pose.
-    kept: distinct poses. witnesses: near points that reject a pose first. other_deg: poses farther apart answer
-    differently. safe: nats beyond chance and ahead of any other pose at which the search ends at once; after
-    `patience` hypotheses none are asked for, and after twice as many it ends with any pose that exceeds chance. look,
-    chunk: hypotheses between looks at the best pose, when it exceeds chance and before. most: hypotheses in all.
-    widest: radii within which points are matched to a predicted pose.
+    kept: distinct poses. other_deg: poses farther apart answer differently. safe: nats beyond chance and ahead of
+    any other pose at which the search ends at once; after `patience` hypotheses none are asked for, and after twice
+    as many it ends with any pose that exceeds chance. look, chunk: hypotheses between looks at the best pose, when
+    it exceeds chance and before. most: hypotheses in all. widest: radii within which points are matched to a
+    predicted pose.
     """
 
     stages: tuple[Stage, ...] = (
@@ -42,7 +42,6 @@ class FewSettings(NamedTuple):
         Stage(3, 63, 63, 0.5), Stage(3, 63, 63, 2.0),
     )  # fmt: skip
     kept: int = 16
-    witnesses: int = 10
     other_deg: float = 10.0
     safe: float = math.log(1e6)
     patience: int = 25_000
@@ -107,7 +106,7 @@ def enumerate_poses(
     (True, [0, 1, 2, 3, 4, 5])
     """
     prior = sets.prior
-    scene = scene_arrays(sets.points3d, sets.normals3d, sets.labels3d, settings.witnesses)
+    scene = scene_arrays(sets.points3d, sets.normals3d, sets.labels3d)
     lookup = _lookup(prior, scene, radius, settings)
     image = ImageArrays(sets.bearings, radius, sets.labels2d, lookup)
     symmetries = near_symmetries(sets.points3d)

@@ -15,6 +15,8 @@ from bpnp.search.few.pairs import sweep_pairs
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+SEEN_WITNESSES = 3.0  # of those that check a hypothesis, if the image points are spread evenly over the scene
+FEWEST_WITNESSES, MOST_WITNESSES = 10, 32
 
 
 class Stage(NamedTuple):
@@ -45,6 +47,8 @@ class Enumeration:
             np.empty(6), np.empty(6), np.empty((2, 12)), known.place,
         )  # fmt: skip
         self.used, k = known.pairs, known.pairs
+        near = int(np.clip(SEEN_WITNESSES * n / max(m - k, 1), FEWEST_WITNESSES, MOST_WITNESSES))
+        self._witnesses = np.ascontiguousarray(scene.order[:, :near])
         problems = _log_choose(m, k) + _log_choose(n, k) + math.lgamma(k + 1) + known.log_share
         self.tests = math.log(RADII) + max(problems, 0.0)
         self.solved = 0
@@ -67,7 +71,7 @@ class Enumeration:
         self._before = self._done.get((stage.pairs, stage.reach), (0, 0))
         self._done[stage.pairs, stage.reach] = len(self._image), self._count
         # How many witnesses make a hypothesis worth a look depends on what chance gives it.
-        chance = self.scene.witnesses.shape[1] * m * self.image.density * stage.reach**2
+        chance = self._witnesses.shape[1] * m * self.image.density * stage.reach**2
         need = (1 if chance < 0.05 else 2 if chance < 0.3 else 3) + (stage.pairs == 2)
         self._need = min(need, m - stage.pairs, n - stage.pairs)
         self.found[6][1] = 0.0
@@ -77,7 +81,7 @@ class Enumeration:
         """The image triple, or pair, after about `chunk` hypotheses, or after the best pose has become better."""
         stop = max(self.best + 1e-9, self.tests)
         rest = (
-            self.scene.witnesses, self._need, self.scene.arrays, self.image.arrays, self.stage.reach, self.used,
+            self._witnesses, self._need, self.scene.arrays, self.image.arrays, self.stage.reach, self.used,
             self.image.density, self.known.directions,
         )  # fmt: skip
         block = place, len(self._image), *self._before, self._count, stop, chunk, self.image.rays, self._image
