@@ -85,21 +85,25 @@ class ImageArrays:
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
         self.arrays = (flat, gain, labels, *grid_of(flat, gain, reach))
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
-        self.order, self.rank = neighbours_of(rays, np.empty((0, 3)))
         self._triples = np.empty((0, 3), np.int64)
         self._near = 1
 
+    @functools.cached_property
+    def _neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        return neighbours_of(self.rays[:, :3], np.empty((0, 3)))
+
     def triples(self, near: int) -> NDArray[np.int64]:
         """Triples (t, 3) of an image point and two of its `near` nearest, nearest first."""
-        near = min(near, self.order.shape[1])
+        order, rank = self._neighbours
+        near = min(near, order.shape[1])
         if near > self._near:
-            more = triples_between(self.order, self.rank, self._near + 1, near)
+            more = triples_between(order, rank, self._near + 1, near)
             self._triples, self._near = np.concatenate([self._triples, more]), near
         return self._triples
 
     def pairs(self, near: int) -> NDArray[np.int64]:
         """Pairs (s, 2) of an image point and one of its `near` nearest, nearest first."""
-        return pairs_within(self.order, self.rank, near)
+        return pairs_within(*self._neighbours, near)
 
 
 def pairs_within(order: NDArray[np.int64], rank: NDArray[np.int64], near: int) -> NDArray[np.int64]:
