@@ -61,7 +61,7 @@ def sinkhorn(
     for name, scalar in (("mu", mu), ("dustbin", dustbin)):
         if isinstance(scalar, Tensor) and scalar.ndim:
             raise ValueError(f"expected `{name}` as a number or a scalar tensor, got shape {tuple(scalar.shape)}")
-    _check_mu(mu)
+    check_mu(mu)
     for name, mask in (("mask2d", mask2d), ("mask3d", mask3d)):
         if mask is not None and not bool(mask.any(-1).all()):
             raise ValueError(f"expected at least one real point on each side of every sample, got an empty `{name}`")
@@ -106,7 +106,8 @@ def dustbin_marginals(
     return torch.cat([rows * share2d, share3d], -1), torch.cat([cols * share3d, share2d], -1)
 
 
-def _check_mu(mu: float | Tensor) -> None:
+def check_mu(mu: float | Tensor) -> None:
+    """Raise ValueError for an entropy weight that is not above zero, NaN included."""
     if not mu > 0:
         raise ValueError(f"expected `mu` > 0, got {float(mu)}; try 0.1")
 
@@ -140,7 +141,7 @@ class Sinkhorn(nn.Module):
         max_iterations: int = 1000,
     ) -> None:
         super().__init__()
-        _check_mu(mu)
+        check_mu(mu)
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu))) if learn_mu else None
         self.mu, self.learn_mu, self.dustbin = mu, learn_mu, dustbin
         self.tolerance, self.max_iterations = tolerance, max_iterations

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.layers.assignment import dustbin_marginals, sinkhorn, uniform_marginal
+from bpnp.layers.assignment import check_mu, dustbin_marginals, sinkhorn, uniform_marginal
 from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
@@ -15,8 +15,7 @@ from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.composition import AnyModule, chosen
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
-from bpnp.models.nets.frames import principal_axes, robust_frame
-from bpnp.models.nets.normalisation import centred
+from bpnp.models.nets.normalisation import centred, principal_axes, robust_frame
 from bpnp.models.nets.pointwise import Pointwise
 from bpnp.models.pose_head import pnp_pose, ransac_pose
 from bpnp.models.weights import TrainedNet
@@ -66,8 +65,7 @@ class Matcher(TrainedNet):
         refinement: Refinement | None = None,
     ) -> None:
         super().__init__()
-        if not mu > 0:
-            raise ValueError(f"expected `mu` > 0, got {mu}; try 0.1")
+        check_mu(mu)
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
         self.principal, self.mu, self.tolerance = principal, mu, tolerance
         self.backward_stats = BackwardStats()

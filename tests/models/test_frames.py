@@ -6,7 +6,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from bpnp.models.nets.frames import principal_axes, robust_frame
+from bpnp.models.nets.normalisation import principal_axes, robust_frame
 
 SIZES = torch.tensor([0.3, 1.0, 3.0], dtype=torch.float64)
 

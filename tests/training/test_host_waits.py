@@ -31,7 +31,7 @@ FILES = [
 READS = {
     "layers/laplacian.py:_solve": 1,  # float64: whether anything stalled
     "layers/laplacian.py:solve_multipliers": 2,  # whether a sample needs float64, and which
-    "layers/assignment.py:_check_mu": 1,  # in an error
+    "layers/assignment.py:check_mu": 1,  # in an error
     "layers/assignment.py:sinkhorn": 1,  # whether a given mask has a real point in every sample
     "layers/compiled.py:conjugate_gradients": 1,  # on the CPU only
     "layers/implicit.py:record": 1,  # unconverged backward passes
@@ -52,7 +52,7 @@ READS = {
 }
 ATEN = torch.ops.aten
 WAITING = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal}
-IMPLICIT = {"layers/assignment.py:_check_mu"}  # `not mu > 0`, of a mu on the device
+IMPLICIT = {"layers/assignment.py:check_mu"}  # `not mu > 0`, of a mu on the device
 
 
 class Waits(TorchDispatchMode):
