@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.models.baselines.single_pairs import Answer
+
 
 class Boxes(NamedTuple):
     """Centres and half sides. The cubes of rotation vectors cover the ball of radius pi."""
@@ -27,6 +29,25 @@ class Boxes(NamedTuple):
 
     def pick(self, index: Tensor) -> "Boxes":
         return Boxes(*(values[index] for values in self))
+
+
+class Found(NamedTuple):
+    """The best pose, camera = R (p - c), and its number of inliers or its distance; `certified`: no pose of the domain
+    has more than `bound` inliers, or falls below `bound`, and this is as good or within the gap that is asked for."""
+
+    rotation: Float[Tensor, "3 3"] | None
+    place: Float[Tensor, "3"]
+    value: float
+    bound: float
+    boxes: int
+    certified: bool
+
+    def answer(self, centre: Float[Tensor, "3"], radius: float, residual: float) -> Answer:
+        """The pose in the coordinates of the scene that `unit_scene` centred and scaled."""
+        if self.rotation is None:
+            return Answer(iterations=self.boxes)
+        translation = -self.rotation @ (radius * self.place + centre)
+        return Answer((self.rotation, translation), self.boxes, residual, self.certified)
 
 
 def whole_domain(like: Tensor, half: float) -> Boxes:

@@ -15,6 +15,7 @@ from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
+    Found,
     join,
     rotation_uncertainty,
     split,
@@ -31,16 +32,6 @@ ROUNDING = 1e-9  # of a cosine
 SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
 
 
-class MostInliers(NamedTuple):
-    """A pose, camera = R (p - c), and the number of its inliers; no pose of the domain has more than `bound`."""
-
-    rotation: Float[Tensor, "3 3"] | None
-    place: Float[Tensor, "3"]
-    inliers: int
-    bound: int
-    boxes: int
-
-
 def maximise_inliers(
     rays: Float[Tensor, "m 3"],
     points: Float[Tensor, "n 3"],
@@ -49,7 +40,7 @@ def maximise_inliers(
     angle: float,
     max_boxes: int | None = None,
     deadline: Deadline = NEVER,
-) -> MostInliers:
+) -> Found:
     """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
 
     Outer search over the camera centre c in the one box of the domain, most promising box first; for each box two inner
@@ -83,7 +74,8 @@ def maximise_inliers(
                 else:
                     heapq.heappush(queue, (-there.bound, next(order), child))
     left = -queue[0][0] if queue else 0
-    return MostInliers(rotation, place, count, max(count, left, unresolved), done)
+    bound = max(count, left, unresolved)
+    return Found(rotation, place, count, bound, done, count >= bound)
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
@@ -188,13 +180,7 @@ class GOPAC(PairSolver):
 
     estimates = ("gopac",)
 
-    def __init__(
-        self,
-        *,
-        angle: float = 0.005,
-        max_boxes: int | None = None,
-        time_limit: float | None = 30.0,
-    ) -> None:
+    def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
         super().__init__(time_limit)
         check_positive(angle=angle)
         self.angle, self.max_boxes = angle, max_boxes
@@ -205,8 +191,4 @@ class GOPAC(PairSolver):
         found = maximise_inliers(
             bearings(pair.points2d), points, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline
         )
-        if found.rotation is None:
-            return Answer(iterations=found.boxes)
-        translation = -found.rotation @ (radius * found.place + centre)
-        residual = 1 - found.inliers / len(pair.points2d)
-        return Answer((found.rotation, translation), found.boxes, residual, found.inliers >= found.bound)
+        return found.answer(centre, radius, residual=1 - found.value / len(pair.points2d))

@@ -1,7 +1,6 @@
 """GOSMA: globally optimal alignment of two mixtures on the sphere, by branch and bound (Campbell et al., CVPR 2019)."""
 
 import math
-from typing import NamedTuple
 
 import roma
 import torch
@@ -13,6 +12,7 @@ from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import bearings, retract
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
+    Found,
     distance_range,
     join,
     root_mean_square,
@@ -42,18 +42,6 @@ DESCENTS = 32  # best box centres of an iteration, from which Adam descends
 DESCENT_STEPS = 30
 
 
-class Aligned(NamedTuple):
-    """The best pose, camera = R (p - c), its distance and a number that no pose of the domain falls below, both as
-    shares of the image mixture's squared norm. `certified`: they differ by the gap or less."""
-
-    rotation: Float[Tensor, "3 3"]
-    place: Float[Tensor, "3"]
-    value: float
-    bound: float
-    boxes: int
-    certified: bool
-
-
 def align_mixtures(
     scene: SceneMixture,
     rays: RayMixture,
@@ -64,13 +52,14 @@ def align_mixtures(
     batch: int = 512,
     max_boxes: int | None = None,
     deadline: Deadline = NEVER,
-) -> Aligned:
+) -> Found:
     """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
     squared norm.
 
     Best first: the `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the
     less certain; Adam descends from the best centres, and L-BFGS polishes a better pose. Ends with the certificate, or
-    with the best pose so far after about `max_boxes` boxes or at the deadline.
+    with the best pose so far after about `max_boxes` boxes or at the deadline. Value and bound are shares of the image
+    mixture's squared norm.
     """
     norm = float(squared_norm(rays))
     pending, bounds = domain, lower_bound(scene, rays, domain)
@@ -95,7 +84,7 @@ def align_mixtures(
         pending, bounds = pending.pick(promising), bounds[promising]
     certified = len(bounds) == 0 or float(bounds.min()) >= best - gap * norm
     bound = best - gap * norm if certified else float(bounds.min())
-    return Aligned(rotation, place, best / norm + 1, bound / norm + 1, done, certified)
+    return Found(rotation, place, best / norm + 1, bound / norm + 1, done, certified)
 
 
 def _best_centre(
@@ -204,5 +193,4 @@ class GOSMA(PairSolver):
             whole_domain(points, DOMAIN * away), closest=CLOSEST * away, batch=self.batch, max_boxes=self.max_boxes,
             deadline=deadline,
         )  # fmt: skip
-        translation = -found.rotation @ (radius * found.place + centre)
-        return Answer((found.rotation, translation), found.boxes, found.value, found.certified)
+        return found.answer(centre, radius, residual=found.value)
