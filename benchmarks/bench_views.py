@@ -22,6 +22,7 @@ from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, sce
 
 from bpnp import PosePrior, solve
 from bpnp.cameras import camera_from
+from bpnp.maps.localize import localize
 from bpnp.models import TrainedNet
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
@@ -50,8 +51,16 @@ def plain(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 
 def view_prior(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
-    rotation, translation = pair.views[0]
-    return by_search(pair, prior_at(pair, rotation, translation, VIEW_DEGREES, VIEW_SHARE), seed, time_limit)
+    (view,) = pair.scene.named(pair.views[:1])
+    return by_search(pair, prior_at(pair, view.rotation, view.translation, VIEW_DEGREES, VIEW_SHARE), seed, time_limit)
+
+
+def in_map(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
+    camera = np.diag([pair.focal, pair.focal, 1.0])
+    found = localize(
+        pair.scene, pair.focal * pair.points2d, camera, views=pair.views or None, seed=seed, time_limit=time_limit
+    )  # fmt: skip
+    return found.rotation, found.translation, found.verdict
 
 
 def rough_prior(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
@@ -99,7 +108,7 @@ def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 
 METHODS: dict[str, Callable[[ViewPair, int, float | None], Answer]] = {
-    "solve": plain, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned, "bpnpnet": bpnpnet,
+    "solve": plain, "localize": in_map, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned, "bpnpnet": bpnpnet,
     "matcher": matcher, "oracle": oracle,
 }  # fmt: skip
 
@@ -157,7 +166,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", metavar="SCENE")
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--methods", nargs="+", choices=tuple(METHODS), default=["solve"])
-    parser.add_argument("--views", type=int, default=1, help="k (default: 1)")
+    parser.add_argument("--views", type=int, default=1, help="k, 0 for the whole map (default: 1)")
     parser.add_argument(
         "--outliers", type=float, nargs="+", default=[0.5, 0.75, 1.0], help="largest share of each side"
     )

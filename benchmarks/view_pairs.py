@@ -6,13 +6,16 @@ Zhou, Agostinho, Osep, Leal-Taixe, "Is geometry enough for matching in visual lo
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
-from bpnp.maps.cones import Cones, seen_again, viewing_cones
+from bpnp.maps.cones import Cones, seen_again
+from bpnp.maps.views import View, ViewedPoints
 
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024
@@ -24,9 +27,9 @@ Array = NDArray[np.float64]
 class ViewPair:
     """A photo's keypoints (m, 2), normalised, and the points (n, 3) of its views; match3d (n,), -1 for no partner.
 
-    rotation, translation: of the photo. views: poses of the k views, most overlap first. focal: pixels.
+    rotation, translation: of the photo. views: names of the k views in `scene`, most overlap first. focal: pixels.
     outliers: share of the points without a partner, of the 2D and of the 3D side.
-    cones, scores3d: from the tracks in the map without the photo.
+    scene: the map without the photo, of these points alone, in this order.
     """
 
     name: str
@@ -35,10 +38,9 @@ class ViewPair:
     match3d: NDArray[np.int64]
     rotation: Array
     translation: Array
-    views: tuple[tuple[Array, Array], ...]
+    views: tuple[str, ...]
     focal: float
-    cones: Cones
-    scores3d: Array
+    scene: ViewedPoints
 
     @property
     def true_pairs(self) -> int:
@@ -47,6 +49,15 @@ class ViewPair:
     @property
     def outliers(self) -> tuple[float, float]:
         return 1 - self.true_pairs / len(self.points2d), 1 - self.true_pairs / len(self.points3d)
+
+    @property
+    def cones(self) -> Cones:
+        return self.scene.cones
+
+    @property
+    def scores3d(self) -> Array:
+        """Probability that another photo of the place sees a point."""
+        return seen_again(self.scene.track_lengths)
 
     def reprojection_error(self, rotation: Array, translation: Array) -> float:
         """Mean error of the true points, pixels; infinite for no pose, points behind it, or too few true pairs."""
@@ -82,27 +93,32 @@ def view_pair(
     outliers: float,
     seed: int = 0,
     most: int | None = MOST_POINTS,
+    best: bool = False,
 ) -> ViewPair:
-    """One photo against the points that `views` views see.
+    """One photo against the points that `views` views see, or, for 0, all points of the map.
 
     outliers: of each side at most this share of all points is without a partner; 1 for all that there are.
-    most: points of the larger side; true pairs and outliers are thinned alike, so that their ratio stays. None for all.
-    For one view it is drawn among those that overlap enough, for more they are the ones that overlap most.
+    most: keypoints, and points that one view sees; true pairs and outliers are thinned alike, so that their ratio stays.
+    None for all.
+    For one view it is drawn among those that overlap enough; for more, and if `best`, they are the ones that overlap
+    most.
     """
     rng = np.random.default_rng([seed, query.image_id])
     candidates = [view for _, view in overlapping(scene, query)]
-    chosen = [candidates[rng.integers(len(candidates))]] if views == 1 else candidates[:views]
+    chosen = [candidates[rng.integers(len(candidates))]] if views == 1 and not best else candidates[:views]
+    shown = chosen or [view for view in scene.images if view is not query]
     # Points that the photo alone holds together with one view would not be in the map without it.
     tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
     tracks[query.observed] -= 1
-    in_map = np.unique(np.concatenate([view.seen for view in chosen]))
+    in_map = np.unique(np.concatenate([view.seen for view in shown]))
     in_map = in_map[tracks[in_map] >= 2]
     true, place, _ = np.intersect1d(query.seen, in_map, assume_unique=True, return_indices=True)
     others2d = np.concatenate([np.delete(query.points2d, place, 0), query.clutter2d])
     others3d = np.setdiff1d(in_map, query.observed)
     allowed = np.inf if outliers >= 1 else len(true) * outliers / (1 - outliers)
     counts = [len(true), min(len(others2d), allowed), min(len(others3d), allowed)]
-    larger = counts[0] + max(counts[1:])
+    of_one = len(true) + len(others3d) if len(shown) == 1 else max(np.isin(view.seen, in_map).sum() for view in shown)
+    larger = max(counts[0] + counts[1], min(counts[0] + counts[2], of_one))
     share = 1.0 if most is None else min(1.0, most / max(larger, 1))
     kept, extra2d, extra3d = (int(count * share) for count in counts)
     pick = rng.choice(len(true), kept, replace=False)
@@ -111,31 +127,41 @@ def view_pair(
     ).astype(np.float64)
     index3d = np.concatenate([true[pick], rng.choice(others3d, extra3d, replace=False)]).astype(np.int64)
     order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
-    others = ((-view.rotation.T @ view.translation, view.observed) for view in scene.images if view is not query)
-    cones = viewing_cones(scene.points3d, others)
-    chosen3d = index3d[order3d]
     match3d = np.full(len(index3d), -1)
     match3d[:kept] = np.argsort(order2d)[:kept]
     return ViewPair(
         name=f"{scene.name}/{query.name}",
         points2d=points2d[order2d],
-        points3d=scene.points3d[chosen3d],
+        points3d=scene.points3d[index3d[order3d]],
         match3d=match3d[order3d],
         rotation=query.rotation,
         translation=query.translation,
-        views=tuple((view.rotation, view.translation) for view in chosen),
+        views=tuple(view.name for view in chosen),
         focal=query.focal,
-        cones=Cones(cones.axes[chosen3d], cones.cosines[chosen3d]),
-        scores3d=seen_again(tracks[chosen3d]),
+        scene=map_of(scene, query, index3d[order3d]),
     )
 
 
+def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64]) -> ViewedPoints:
+    """The map of some points, in their order, and of all views but the photo."""
+    place = np.full(len(scene.points3d), -1, np.int32)
+    place[points] = np.arange(len(points))
+    camera = camera_from(np.eye(3))
+    views = tuple(
+        View(view.name, camera, view.rotation, view.translation, np.sort(place[view.observed[place[view.observed] >= 0]]))
+        for view in scene.images
+        if view is not query
+    )
+    return ViewedPoints(scene.points3d[points], points, np.zeros(len(points), np.int32), views).seen_by(1)
+
+
 def scene_pairs(
-    data: Path, name: str, *, limit: int, views: int, outliers: float, seed: int = 0, most: int | None = MOST_POINTS
+    data: Path, name: str, *, limit: int, **chosen: Any
 ) -> Iterator[ViewPair]:
+    """Pairs of at most `limit` photos of a scene. chosen: options of `view_pair`."""
     scene = read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
     for query in photos(scene, limit):
-        yield view_pair(scene, query, views=views, outliers=outliers, seed=seed, most=most)
+        yield view_pair(scene, query, **chosen)
 
 
 def disturbed(pair: ViewPair, degrees: float, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
