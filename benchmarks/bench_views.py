@@ -1,10 +1,11 @@
 """Photos against the points of k map views, by the protocol of GoMatch (ECCV 2022): AUC at 1, 5 and 10 px and more.
 
 python benchmarks/bench_views.py --data ../shared/data --methods solve view-prior --outliers 0.5 0.75 1 castle-P30
-Methods: solve; view-prior (the first view's pose as `PosePrior`); rough-prior (4 degrees and 4 % of the distance off,
-2 s); bpnpnet, matcher and learned (the packaged networks); oracle (RANSAC on the true pairs). Photos are left out of
-their map.
-The first three use the cones from which the points are seen; --known: these, and the lengths of the tracks, or nothing.
+Methods: solve; localize (a map's `localize` with the names of the k views, or none); view-prior (the first view's pose
+as `PosePrior`); rough-prior (4 degrees and 4 % of the distance off, 2 s); bpnpnet, matcher and learned (the packaged
+networks); oracle (RANSAC on the true pairs). Photos are left out of their map.
+solve, view-prior and rough-prior use the cones from which the points are seen; --known: these, and the lengths of the
+tracks, or nothing.
 """
 
 import argparse
@@ -108,8 +109,8 @@ def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 
 METHODS: dict[str, Callable[[ViewPair, int, float | None], Answer]] = {
-    "solve": plain, "localize": in_map, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned, "bpnpnet": bpnpnet,
-    "matcher": matcher, "oracle": oracle,
+    "solve": plain, "localize": in_map, "view-prior": view_prior, "rough-prior": rough_prior, "learned": learned,
+    "bpnpnet": bpnpnet, "matcher": matcher, "oracle": oracle,
 }  # fmt: skip
 
 
@@ -171,6 +172,7 @@ def main() -> None:
         "--outliers", type=float, nargs="+", default=[0.5, 0.75, 1.0], help="largest share of each side"
     )
     parser.add_argument("--all-points", action="store_true", help="do not thin to 1,024")
+    parser.add_argument("--best", action="store_true", help="for k = 1 the view that overlaps most, not a random one")
     parser.add_argument("--limit", type=int, default=12, help="photos of a scene (default: 12)")
     parser.add_argument(
         "--known", nargs="*", choices=sorted(KNOWN), default=["cones"], help="of the points (default: cones)"
@@ -183,7 +185,8 @@ def main() -> None:
     KNOWN.intersection_update(options.known)
     results = []
     for outliers in options.outliers:
-        chosen = {"limit": options.limit, "views": options.views, "most": None if options.all_points else MOST_POINTS}
+        chosen = {"limit": options.limit, "views": options.views, "best": options.best}
+        chosen |= {"most": None if options.all_points else MOST_POINTS}
         pairs = [
             pair
             for name in options.scenes

@@ -98,8 +98,8 @@ def view_pair(
     """One photo against the points that `views` views see, or, for 0, all points of the map.
 
     outliers: of each side at most this share of all points is without a partner; 1 for all that there are.
-    most: keypoints, and points that one view sees; true pairs and outliers are thinned alike, so that their ratio stays.
-    None for all.
+    most: keypoints, and points that one view sees; true pairs and outliers are thinned alike, so that their ratio
+    stays. None for all.
     For one view it is drawn among those that overlap enough; for more, and if `best`, they are the ones that overlap
     most.
     """
@@ -148,16 +148,16 @@ def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64])
     place[points] = np.arange(len(points))
     camera = camera_from(np.eye(3))
     views = tuple(
-        View(view.name, camera, view.rotation, view.translation, np.sort(place[view.observed[place[view.observed] >= 0]]))
+        View(
+            view.name, camera, view.rotation, view.translation, np.sort(place[view.observed[place[view.observed] >= 0]])
+        )
         for view in scene.images
         if view is not query
     )
     return ViewedPoints(scene.points3d[points], points, np.zeros(len(points), np.int32), views).seen_by(1)
 
 
-def scene_pairs(
-    data: Path, name: str, *, limit: int, **chosen: Any
-) -> Iterator[ViewPair]:
+def scene_pairs(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewPair]:
     """Pairs of at most `limit` photos of a scene. chosen: options of `view_pair`."""
     scene = read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
     for query in photos(scene, limit):

@@ -1,4 +1,4 @@
-"""Many starts around a rough pose, of which those go on whose points fall on bearings more often than chance lets them.
+"""Many starts around a rough pose; those go on whose points fall on bearings more often than chance lets them.
 
 Annealing on clusters loses a pose among many outliers even if it begins there: at scales at which 64 clusters stand for
 a thousand points the true pose is no optimum. At a scale of a few hundredths of the view it is one, in a basin so
@@ -9,6 +9,10 @@ looked up, not annealed: a point that falls at x adds
 
 d_s the density of the bearings smoothed by the small scale s, d_b by a larger one, w the share of outliers. So a point
 adds nothing in the mean if it falls where it does by chance, wherever the bearings are dense, and nothing outside.
+
+The scale s then shrinks by steps. At each the poses that are left are copied, each copy moved about as far as s, and
+all are looked up again: an annealed particle filter (Deutscher, Blake, Reid, CVPR 2000). At a smaller scale a point
+that falls on a bearing tells more, and the copies find the narrower optimum within the wide one.
 """
 
 import math
@@ -46,11 +50,19 @@ def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> 
     rule: None for that of the settings.
     """
     rule = rule or scene.settings.nearby
-    poses, raster = drawn_around(scene, prior, starts_of(scene, prior, rule)), raster_of(scene, rule)
+    poses, scale = drawn_around(scene, prior, starts_of(scene, prior, rule)), rule.first_scale
+    raster = raster_of(scene, rule, scale)
     for points, kept in zip(rule.points, rule.kept, strict=True):
         poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
+    again = scene.sides(points=rule.points_again)[1]
+    for step in range(1, rule.steps + 1):
+        if scene.deadline.passed():
+            break
+        scale = rule.first_scale * (rule.last_scale / rule.first_scale) ** (step / rule.steps)
+        raster = raster_of(scene, rule, scale)
+        poses = looked_up(scene, moved(scene, poses, scale, rule.copies), raster, again, rule.kept[-1])
     outliers = max(scene.settings.outliers, rule.outliers)
-    return anneal_on_points(scene, poses, rule.scale * scene.spread, outliers=outliers)
+    return anneal_on_points(scene, poses[: rule.annealed], scale * scene.spread, outliers=outliers)
 
 
 def beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
@@ -82,6 +94,18 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
     return Candidates.unscored(rotation, translation.astype(np.float32), hits=1)
 
 
+def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
+    """Each pose and copies of it whose points fall about `scale`, in spreads of the bearings, beside its own."""
+    middle, count = scene.bulk3d.mean(0), len(poses) * copies
+    rotation = np.repeat(poses.rotation, copies, 0)
+    centre = rotation @ middle + np.repeat(poses.translation, copies, 0)
+    vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, count, 3), np.float32)
+    shifts *= np.linalg.norm(centre, axis=-1, keepdims=True) * np.array([scene.spread, scene.spread, 1], np.float32)
+    vectors[::copies], shifts[::copies] = 0, 0
+    rotation = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
+    return Candidates.unscored(rotation, (centre + shifts - rotation @ middle).astype(np.float32), hits=1)
+
+
 def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int) -> Candidates:
     """The `kept` poses under which the points fall best, best first."""
     side, score = tuple(points), poses.score.copy()
@@ -93,11 +117,11 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
 
 
-def raster_of(scene: Scene, rule: Nearby) -> Raster:
-    """The raster of a scene's bearings."""
+def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:
+    """The raster of a scene's bearings, smoothed by a scale in spreads of them."""
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / (2 + d[:, 2:])
-    scale = rule.scale * scene.spread
+    scale *= scene.spread
     half = float(np.abs(at).max()) + 3 * scale
     cells = min(math.ceil(2 * half * rule.cells / scale), rule.most_cells)
     per_cell = cells / (2 * half)

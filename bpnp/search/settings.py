@@ -75,21 +75,28 @@ class Nearby:
 
     starts: a batch for a prior of `wide_deg` and `wide_shift` (of the distance) or more; these leave few gaps over the
     width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
-    points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each;
-    the last of them are annealed on all points.
-    scale: of the smoothed bearings and of the first iteration, in spreads of the bearings; at twice as much chance
-        fills the view, at half as much the gaps between starts are wider than the basins.
+    points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each.
+    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
+        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other; with
+        factors below 0.7 the narrower optimum is lost more often.
+    copies: of a pose at each step. points_again: 3D points that are looked up there.
+    annealed: poses that are annealed on all points from the last scale.
     background: scale of the density that is chance, in scales. cells: of the raster, a scale; most_cells: a side.
     outliers: share of the points without a partner, at least. starts_a_check: between two looks at the clock.
     """
 
-    starts: int = 2**19
+    starts: int = 2**17
     wide_deg: float = 12.0
     wide_shift: float = 0.12
     least_starts: int = 2**15
-    points: tuple[int, ...] = (150, 600, 5000)
-    kept: tuple[int, ...] = (2**16, 2**12, 300)
-    scale: float = 0.04
+    points: tuple[int, ...] = (300, 5000)
+    kept: tuple[int, ...] = (2**14, 2**11)
+    first_scale: float = 0.06
+    last_scale: float = 0.011
+    steps: int = 5
+    copies: int = 16
+    points_again: int = 1500
+    annealed: int = 40
     background: float = 8.0
     cells: float = 2.0
     most_cells: int = 1024
@@ -186,10 +193,7 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
-    beside: tuple[Nearby, ...] = (
-        Nearby(2**18, 8.0, 0.08, kept=(2**15, 2**11, 150), scale=0.025),
-        Nearby(kept=(2**16, 2**12, 200)),
-    )
+    beside: tuple[Nearby, ...] = (Nearby(wide_deg=8.0, wide_shift=0.08), Nearby())
     beside_poses: int = 2
     facing: Facing = Facing()
     evidence: Evidence = Evidence()

@@ -60,7 +60,7 @@ def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
 def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
     bearings, points, rotation, translation = cluttered(0, outliers=1500)
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
-    raster = raster_of(scene, DEFAULT.nearby)
+    raster = raster_of(scene, DEFAULT.nearby, 0.04)
     inside = raster.values != 0
     assert abs(raster.values[inside].mean()) < 0.1 * raster.values[inside].std()
     right = scene.enter(rotation, translation)
