@@ -1,8 +1,7 @@
 """Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU: `bpnp.layers.laplacian` in one pass.
 
 A row of the plan is used for both products of a step while it is in the cache, so that a step reads the plan once where
-torch reads it twice; sums of float32 are added up in float64 in short parts. Samples are divided among torch's threads;
-each stops by itself.
+torch reads it twice. Samples are divided among torch's threads; each stops by itself.
 """
 
 from typing import Any

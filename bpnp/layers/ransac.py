@@ -22,7 +22,6 @@ class PairList(NamedTuple):
 
     index2d: Int[Tensor, "b k"]
     index3d: Int[Tensor, "b k"]
-    probability: Float[Tensor, "b k"]
     mask: Bool[Tensor, "b k"]
 
 
@@ -43,9 +42,9 @@ def top_pairs(
     if mask2d is not None or mask3d is not None:
         scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
     k = min(max(1, int(pairs_factor * min(m, n))), m * n)
-    probability, flat = scores.flatten(1).topk(k, dim=-1)
+    flat = scores.flatten(1).topk(k, dim=-1).indices
     mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
-    return PairList(flat // n, flat % n, probability, mask)
+    return PairList(flat // n, flat % n, mask)
 
 
 @checked_shapes

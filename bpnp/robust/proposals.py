@@ -1,7 +1,6 @@
 """Poses proposed by a soft assignment: P3P on triples of pairs drawn in proportion to their probability.
 
-An assignment that is only roughly right has few true pairs among its most probable ones, and a consensus on these is
-often wrong. Some of the poses of triples drawn from it are near the true pose all the same: initial poses for a search.
+Where an assignment has few true pairs among its most probable ones, some of these are near the true pose all the same.
 """
 
 import math

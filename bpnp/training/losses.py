@@ -39,10 +39,8 @@ class Losses:
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
-    """The loss of each sample's assignment.
+    """The loss of each sample's assignment; reprojection is under the pose "pnp". angle: as in `correspondence_losses`.
 
-    kind: correspondence (`correspondence_losses`, with `angle`), likelihood (`matching_likelihood_loss`), or
-        reprojection, which looks at no label (`self_supervised_loss` under the pose "pnp").
     Raises ValueError for a prediction without an assignment, or a batch without the labels that the kind needs.
     """
     if prediction.assignment is None:
