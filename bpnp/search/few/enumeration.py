@@ -15,8 +15,8 @@ SKIPPED = 5  # matches of the best pose from which its own triples are not solve
 @compiled
 def sweep(
     first: int, last: int, old_image: int, old_scene: int, new_scene: int, stop: float, budget: int,
-    rays: Any, triples2d: Any, scene_triples: Any, witnesses: Any, need: int,
-    scene: Any, image: Any, reach: float, used: int, density: float, prior: Any, found: Any, work: Any,
+    rays: Any, triples2d: Any, scene_triples: Any, witnesses: Any, need: int, reach: float,
+    scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any,
 ) -> tuple[int, int]:  # fmt: skip
     """Solve image triples `first` to `last` against scene triples below `new_scene`; those below `old_image` only
     against scene triples from `old_scene` on.
@@ -49,7 +49,7 @@ def sweep(
                     fits(labels2d[i], labels3d[a]) and fits(labels2d[j], labels3d[b]) and fits(labels2d[k], labels3d[c])
                 ):
                     continue
-                known, pairs = found[3][best[0]], found[2][best[0], 0]
+                known, pairs = found[3][best[0]], found[2][best[0]]
                 if pairs >= SKIPPED and known[i] == a and known[j] == b and known[k] == c:
                     continue
                 solved += 1
@@ -61,7 +61,7 @@ def sweep(
                     if not allowed(pose, prior, work[9]):
                         continue
                     if witnessed(pose, a, b, c, i, j, k, witnesses, need, reach, scene, image):
-                        consider(pose, rays, scene, image, reach, used, density, prior, found, work)
+                        consider(pose, reach, rays, scene, image, used, density, prior, found, work)
         place += 1
     return place, solved
 

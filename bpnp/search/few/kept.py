@@ -1,9 +1,8 @@
 """The distinct poses that an enumeration keeps: which are refined, and how they compare. Compiled.
 
-`found`: poses (c, 12), evidence (c,), counts (c, 3) of matches, points in sight and points expected, matches (c, m),
-squared distances (c, m), the place of the best (1,), and (2,) numbers of the sweep. `work`: depths (4, 3), axes (3, 3),
-the pose at hand (12,), its matches (m,) and squared distances (m,), a 6 x 6 system, poses (2, 12) of two pairs, and
-the place (4,) that a prior allows.
+`found`: poses (c, 12), evidence (c,), numbers of matches (c,), matches (c, m), squared distances (c, m), the place of
+the best (1,), and (2,) numbers of the sweep. `work`: depths (4, 3), axes (3, 3), the pose at hand (12,), its matches
+(m,) and squared distances (m,), a 6 x 6 system, poses (2, 12) of two pairs, and the place (4,) that a prior allows.
 """
 
 import math
@@ -33,7 +32,7 @@ def copy(values: Any, to: Any) -> None:
 
 @compiled
 def consider(
-    pose: Any, rays: Any, scene: Any, image: Any, reach: float, used: int, density: float, prior: Any, found: Any,
+    pose: Any, reach: float, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any,
     work: Any,
 ) -> None:  # fmt: skip
     """Refine a pose that matches about as many points as any hypothesis did at this reach."""
@@ -41,12 +40,12 @@ def consider(
     count, _, expected = match(pose, reach, scene, image, work[3], work[4])
     ahead[1] = max(ahead[1], count - LACKING * max(expected - count, 0))
     if count > used and count - LACKING * max(expected - count, 0) >= ahead[1] - BEHIND:
-        try_pose(rays, scene, image, reach, used, density, prior, found, work)
+        try_pose(reach, rays, scene, image, used, density, prior, found, work)
 
 
 @compiled
 def try_pose(
-    rays: Any, scene: Any, image: Any, reach: float, used: int, density: float, prior: Any, found: Any, work: Any
+    reach: float, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any
 ) -> None:
     """Refine the pose in `work`, on matches within a radius that shrinks to the one that exceeds chance most, and keep
     it."""
@@ -65,7 +64,7 @@ def settle(
         if count <= used:
             return
         value, radius = evidence(count, visible, expected, distance2, matched, used, density)
-        keep(pose, value, count, visible, expected, found, work)
+        keep(pose, value, count, found, work)
         if turn or radius == 1 or not tightened(pose, rays, scene, image, 2 * radius, radius, prior, work):
             return
 
@@ -107,7 +106,7 @@ def allowed(pose: Any, prior: Any, place: Any) -> bool:
 
 
 @compiled
-def keep(pose: Any, value: float, count: int, visible: int, expected: int, found: Any, work: Any) -> None:
+def keep(pose: Any, value: float, count: int, found: Any, work: Any) -> None:
     """Put a pose among the kept ones: in the place of the same pose, of an empty one, or of the worst."""
     poses, values, counts, matches, distances2, best, _ = found
     place = -1
@@ -128,7 +127,7 @@ def keep(pose: Any, value: float, count: int, visible: int, expected: int, found
         return
     values[place] = value
     copy(pose, poses[place])
-    counts[place, 0], counts[place, 1], counts[place, 2] = count, visible, expected
+    counts[place] = count
     copy(work[3], matches[place])
     copy(work[4], distances2[place])
     for c in range(len(values)):

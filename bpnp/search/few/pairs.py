@@ -107,8 +107,8 @@ def p2p_turned(f: Any, g: Any, p: Any, q: Any, known: Any, most: float, noise: f
 @compiled
 def sweep_pairs(
     first: int, last: int, old_image: int, old_scene: int, new_scene: int, stop: float, budget: int, rays: Any,
-    pairs2d: Any, pairs3d: Any, witnesses: Any, need: int, scene: Any, image: Any, reach: float, used: int,
-    density: float, prior: Any, upright: Any, known: Any, found: Any, work: Any,
+    pairs2d: Any, pairs3d: Any, upright: Any, known: Any, witnesses: Any, need: int, reach: float, scene: Any,
+    image: Any, used: int, density: float, prior: Any, found: Any, work: Any,
 ) -> tuple[int, int]:  # fmt: skip
     """As `enumeration.sweep`, but image pairs (s, 2), in both orders, against scene pairs (t, 2).
 
@@ -141,7 +141,7 @@ def sweep_pairs(
                     if not (faces(pose, scene, rays, a, i, b, j) and allowed(pose, prior, work[9])):
                         continue
                     if witnessed(pose, a, b, b, i, j, j, witnesses, need, reach, scene, image):
-                        consider(pose, rays, scene, image, reach, used, density, prior, found, work)
+                        consider(pose, reach, rays, scene, image, used, density, prior, found, work)
         place += 1
     return place, solved
 

@@ -59,9 +59,8 @@ class FewPoses(NamedTuple):
 
     rotation: (c, 3, 3). translation: (c, 3). evidence: (c,) nats beyond chance, before the number of tests counts.
     match: (c, m) the scene point that each image point is, -1 for none. residual: (c, m) its angle, radians, infinite
-    where there is none. visible: (c,) scene points that could be seen among the image points; expected: (c,) that
-    should be seen, by their normals. used: matches that fix the pose. tests: log of the number of minimal problems that
-    these points hold, times the radii that were looked at. solved: how many were solved. exhausted: whether all were.
+    where there is none. used: matches that fix the pose. tests: log of the number of minimal problems that these points
+    hold, times the radii that were looked at. solved: how many were solved. exhausted: whether all were.
     """
 
     rotation: Array
@@ -69,16 +68,10 @@ class FewPoses(NamedTuple):
     evidence: Array
     match: Labels
     residual: Array
-    visible: Labels
-    expected: Labels
     used: int
     tests: float
     solved: int
     exhausted: bool
-
-    def matches_within(self, radius: float) -> Labels:
-        """Matches of each pose within `radius`, radians (c,)."""
-        return np.asarray((self.residual <= radius).sum(-1))
 
 
 def enumerate_poses(
@@ -164,15 +157,14 @@ def _lookup(prior: Prior | None, scene: SceneArrays, radius: float | Array, sett
 
 def _found(run: Enumeration, *, exhausted: bool) -> FewPoses:
     """The kept poses, likeliest first."""
-    poses, values, counts, matches, distances2, *_ = run.found
+    poses, values, _, matches, distances2, *_ = run.found
     order = np.argsort(-values, kind="stable")
     order = order[np.isfinite(values[order])]
     rotation, translation = run.leave(poses[order])
     residual = np.where(matches[order] >= 0, np.sqrt(distances2[order]) / run.image.rays[:, 3], math.inf)
     return FewPoses(
-        rotation, translation, values[order], matches[order], residual, counts[order, 1], counts[order, 2], run.used,
-        run.tests, run.solved, exhausted,
-    )  # fmt: skip
+        rotation, translation, values[order], matches[order], residual, run.used, run.tests, run.solved, exhausted
+    )
 
 
 def margin(found: FewPoses, settings: FewSettings = SETTINGS) -> float:

@@ -39,7 +39,7 @@ class Enumeration:
         self.scene, self.image, self.known, self.widest = scene, image, known, reach
         m, n = len(image.rays), len(scene.arrays[0])
         self.found = (
-            np.zeros((kept, 12)), np.full(kept, -math.inf), np.zeros((kept, 3), np.int64), np.full((kept, m), -1),
+            np.zeros((kept, 12)), np.full(kept, -math.inf), np.zeros(kept, np.int64), np.full((kept, m), -1),
             np.zeros((kept, m)), np.zeros(1, np.int64), np.zeros(2),
         )  # fmt: skip
         self.work = (
@@ -47,6 +47,7 @@ class Enumeration:
             np.empty(6), np.empty(6), np.empty((2, 12)), known.place,
         )  # fmt: skip
         self.used, k = known.pairs, known.pairs
+        self._data = image.rays, scene.arrays, image.arrays, k, image.density, known.directions, self.found, self.work
         near = int(np.clip(SEEN_WITNESSES * n / max(m - k, 1), FEWEST_WITNESSES, MOST_WITNESSES))
         self._witnesses = np.ascontiguousarray(scene.order[:, :near])
         problems = _log_choose(m, k) + _log_choose(n, k) + math.lgamma(k + 1) + known.log_share
@@ -80,17 +81,12 @@ class Enumeration:
     def sweep(self, place: int, chunk: int) -> int:
         """The image triple, or pair, after about `chunk` hypotheses, or after the best pose has become better."""
         stop = max(self.best + 1e-9, self.tests)
-        rest = (
-            self._witnesses, self._need, self.scene.arrays, self.image.arrays, self.stage.reach, self.used,
-            self.image.density, self.known.directions,
-        )  # fmt: skip
         block = place, len(self._image), *self._before, self._count, stop, chunk, self.image.rays, self._image
+        rest = self._witnesses, self._need, self.stage.reach, *self._data[1:]
         if self.stage.pairs == 3:
-            place, solved = sweep(*block, self._scene, *rest, self.found, self.work)
+            place, solved = sweep(*block, self._scene, *rest)
         else:
-            place, solved = sweep_pairs(
-                *block, self._pairs, *rest, self.known.upright, self.known.turned, self.found, self.work
-            )  # fmt: skip
+            place, solved = sweep_pairs(*block, self._pairs, self.known.upright, self.known.turned, *rest)
         self.solved += solved
         return int(place)
 
@@ -102,10 +98,7 @@ class Enumeration:
         for reach in (0.5 * self.widest, self.widest):
             self.refine(self.found[0][int(self.found[1].argmax())], reach)
         best = int(self.found[1].argmax())
-        exchange(
-            self.found[0][best].copy(), self.found[3][best].copy(), self.image.rays, self.scene.arrays,
-            self.image.arrays, self.used, self.image.density, self.known.directions, self.found, self.work,
-        )  # fmt: skip
+        exchange(self.found[0][best].copy(), self.found[3][best].copy(), *self._data)
         best = int(self.found[1].argmax())
         matched = self.found[3][best]
         seen = self.scene.arrays[0][matched[matched >= 0]]
@@ -122,10 +115,7 @@ class Enumeration:
     def refine(self, pose: Array, reach: float) -> None:
         """Refine a pose (12,) of these frames from matches within `reach` radii, and keep it."""
         self.work[2][:] = pose
-        try_pose(
-            self.image.rays, self.scene.arrays, self.image.arrays, reach, self.used, self.image.density,
-            self.known.directions, self.found, self.work,
-        )  # fmt: skip
+        try_pose(reach, *self._data)
 
     def best_pose(self) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) of the best pose, of the given points."""
