@@ -170,26 +170,21 @@ def exchange(
     for i in range(len(own)):
         if own[i] < 0 or count - 1 <= used:
             continue
-        copy(best, pose)
-        copy(own, matched)
-        matched[i] = -1
-        if not _stepped(pose, rays, scene, prior, work):
-            continue
-        other = _nearest_other(pose, i, own[i], scene, image)
-        if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
-            settle(rays, scene, image, used, density, prior, found, work)
-        if other < 0:
-            continue
-        copy(best, pose)
-        copy(own, matched)
-        for k in range(len(own)):
-            if own[k] == other:
-                matched[k] = -1
-        matched[i] = other
-        if not _stepped(pose, rays, scene, prior, work):
-            continue
-        if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
-            settle(rays, scene, image, used, density, prior, found, work)
+        other = -1
+        for turn in range(2):
+            copy(best, pose)
+            copy(own, matched)
+            for k in range(len(own)):
+                if turn and own[k] == other:
+                    matched[k] = -1
+            matched[i] = other
+            if not _stepped(pose, rays, scene, prior, work):
+                break
+            other = _nearest_other(pose, i, own[i], scene, image)
+            if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
+                settle(rays, scene, image, used, density, prior, found, work)
+            if other < 0:
+                break
 
 
 @compiled

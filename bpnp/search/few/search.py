@@ -67,16 +67,9 @@ def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> C
     free = np.maximum(2 * count - 2 * found.used, 1)  # numbers that were measured, less those that were fitted
     scale = np.sqrt(np.where(np.isfinite(residual), residual, 0.0) ** 2 @ np.ones(len(sets.bearings)) / free)
     scale = np.maximum(scale, sets.floor or 1e-5)
-    return Candidates(
-        rotation=rotation,
-        translation=translation,
-        score=_log_likelihood(sets, rotation, translation, scale, settings.outliers),
-        matched=count / min(len(sets.bearings), len(sets.points3d)),
-        scale=scale,
-        hits=np.zeros(len(rotation), np.int64),
-        log10_false_alarms=np.full(len(rotation), math.nan),
-        log10_rough=np.full(len(rotation), math.nan),
-    )
+    score = _log_likelihood(sets, rotation, translation, scale, settings.outliers)
+    matched = count / min(len(sets.bearings), len(sets.points3d))
+    return replace(Candidates.unscored(rotation, translation), score=score, matched=matched, scale=scale)
 
 
 def _log_likelihood(sets: PointSets, rotation: Array, translation: Array, scale: Array, outliers: float) -> Array:
