@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import product
 
 import numpy as np
@@ -11,11 +12,10 @@ import numpy as np
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
-from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import beside, cooled, nearby_batch
 from bpnp.search.point_sets import PointSets
-from bpnp.search.refine import score_poses
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
 from bpnp.search.starts import PosePrior, Prior
@@ -63,10 +63,15 @@ def search_poses(
     """
     settings = settings if clutter is None else settings.expecting(clutter)
     start, rule, few = time.monotonic(), settings.evidence, Candidates.none()
+
+    @cache
+    def entered() -> Scene:
+        return Scene(sets, seed, settings, deadline)
+
     if is_few(sets) and not deadline.passed():
         few, exhausted = search_few(sets, deadline, settings)
         result = judged(few, sets, batches=0, exhaustive=True, rule=rule)
-        result = _against_repetitions(result, sets, deadline, exhaustive=True, rule=rule)
+        result = _against_repetitions(result, sets, entered, rule, exhaustive=True)
         if progress is not None:
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
@@ -76,7 +81,7 @@ def search_poses(
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
-    scene = Scene(sets, seed, settings, deadline)
+    scene = entered()
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
     candidates = few
     if len(few):
@@ -88,7 +93,7 @@ def search_poses(
     def finished(poses: Candidates, annealed: int) -> SearchResult:
         poses = finish(scene, poses, annealed) if len(poses) else poses
         result = judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
-        return _against_repetitions(result, sets, deadline, rule=rule)
+        return _against_repetitions(result, sets, entered, rule)
 
     def certain(leaders: Candidates) -> SearchResult | None:
         """The result, if it holds on all bearings too."""
@@ -136,24 +141,27 @@ def search_poses(
 
 
 def _against_repetitions(
-    result: SearchResult, sets: PointSets, deadline: Deadline, *, exhaustive: bool = False, rule: Evidence
+    result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence, *, exhaustive: bool = False
 ) -> SearchResult:
-    """A confident result once more, beside the poses that a repeated structure would confuse with it."""
+    """A confident result once more, beside the poses that a repeated structure would confuse with it; if one of these
+    is better, so is that one."""
     if result.verdict != "confident":
         return result
-    best = result.best
-    rotation, translation = repeated_poses(sets, *best, result.residual)
-    if not len(rotation):
+    best, scale = result.best, max(result.residual, sets.image.scales[0])
+    repeated = repeated_poses(sets, *best, scale, rule)
+    if not len(repeated[0]):
         return result
-    rotation, translation = np.concatenate([best[0][None], rotation]), np.concatenate([best[1][None], translation])
-    rivals = score_poses(sets, rotation, translation, deadline, result.residual).candidates
-    if not len(rivals):
-        return result
-    # The density of the scene around them, which false alarms count, does not say which of equal things is seen.
-    behind = len(sets.bearings) * (rivals.score[0] - rivals.score) / math.log(10)
-    alarms = np.minimum(rivals.log10_false_alarms, rivals.log10_false_alarms[0] + np.maximum(behind, 0))
+    scene = entered()
+    starts = Candidates.unscored(*scene.enter(*repeated))
+    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
+    rivals = with_false_alarms(in_user_frame(finish(scene, starts), scene), sets)
+    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
+    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + np.maximum(behind, 0))
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    return judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
+    beside = judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
+    if np.array_equal(beside.best[1], best[1]):
+        return beside
+    return _against_repetitions(beside, sets, entered, rule, exhaustive=exhaustive)
 
 
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import turned_by
+from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.search.evidence.image_statistics import ImageStatistics
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
@@ -59,6 +59,12 @@ class PointSets:
     def middle(self) -> Array:
         """The median of the scene points (3,)."""
         return np.median(self.points3d, 0)
+
+    def same_pose(self, rotation: Array, translation: Array, degrees: float, share: float) -> NDArray[np.bool_]:
+        """Which poses (c, 3, 3), (c, 3) are the first one: turned by `degrees` at most, and the middle of the scene
+        moved by this share of its distance."""
+        middle = rotation @ self.middle + translation
+        return same_pose(rotation, middle, 0, degrees, share * float(np.linalg.norm(middle[0])))
 
     @property
     def pairs_that_fix(self) -> int:

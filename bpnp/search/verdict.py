@@ -14,10 +14,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import same_pose, turned_by
+from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.image_statistics import solid_angle
 from bpnp.search.evidence.uncertainty import rotation_bound
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
@@ -87,9 +86,8 @@ def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evide
     Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
     distance. Infinite and -1 if there is none.
     """
-    middle = candidates.rotation @ sets.middle + candidates.translation
-    shift = rule.other_shift * float(np.linalg.norm(middle[0]))
-    others = np.flatnonzero(~same_pose(candidates.rotation, middle, 0, rule.other_deg, shift))
+    same = sets.same_pose(candidates.rotation, candidates.translation, rule.other_deg, rule.other_shift)
+    others = np.flatnonzero(~same)
     if not len(others):
         return math.inf, -1
     nearest = int(others[np.argmin(candidates.log10_false_alarms[others])])
@@ -129,7 +127,7 @@ def is_unique(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.
 
     A pose at which a part of the scene is aligned is no coincidence, but its residuals are too large for this.
     """
-    by_chance = len(sets.points3d) / solid_angle(sets.bearings) * math.pi * (2 * float(candidates.scale[0])) ** 2
+    by_chance = len(sets.points3d) / sets.image.solid_angle * math.pi * (2 * float(candidates.scale[0])) ** 2
     return bool(candidates.matched[0] > max(rule.matched, rule.over_chance * by_chance))
 
 

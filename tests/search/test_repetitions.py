@@ -6,8 +6,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
-from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.point_sets import PointSets
+from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
 CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -64,10 +65,49 @@ def test_a_facade_with_a_door_in_view_stays_confident() -> None:
     assert np.degrees(Rotation.from_matrix(found.rotation.T @ rotation).magnitude()) < 1
 
 
+def test_a_facade_whose_map_ends_early_is_not_called_confident() -> None:
+    """The image shows the columns 4 to 9 and the map has 1 to 6: shifted by three they agree, and so do all others."""
+    rng = np.random.default_rng(6)
+    window = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0], [0.25, 0.9, 0.15]])
+    column = np.repeat(np.arange(9), 10)
+    for _ in range(4):
+        scene = np.concatenate([window + (i, 1.5 * j, 0) for i in range(9) for j in range(2)])
+        scene += 0.002 * rng.standard_normal(scene.shape)
+        pixels, _ = part_of(scene[column >= 3], 7.0, rng)
+        assert solve(pixels, scene[column < 6], CAMERA).verdict != "confident"
+
+
+def test_points_that_do_not_repeat_count_against_a_shift_and_those_that_do_not_where_the_map_ends() -> None:
+    motif = np.random.default_rng(7).uniform(0, 1, (12, 3))
+    scene = np.concatenate([motif + [2 * k, 0, 8] for k in range(3)])
+    door = np.random.default_rng(8).uniform(0, 1, (6, 3)) + [2, 1.5, 8]
+
+    def behind(points: Array) -> Array:
+        sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+        best = np.eye(3), np.zeros(3)
+        shifts = np.eye(3)[None], np.array([[-2.0, 0, 0]])
+        return decades_behind(sets, best, shifts, shifts, 1e-3)
+
+    # Shifted by a period a third of the points has no partner: beyond the end of the map, where nothing is known.
+    assert behind(scene) == pytest.approx([0], abs=0.5)
+    assert behind(np.concatenate([scene, door]))[0] > 6
+
+
+def test_only_different_poses_are_rivals() -> None:
+    """A step of a fine lattice is no different pose, in the sense of the verdict."""
+    points = lattice(16, 16) * (1 / 6) + (0, 0, 2)
+    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    rotations, translations = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+    moved = np.linalg.norm(rotations @ sets.middle + translations - sets.middle, axis=-1)
+    turned = Rotation.from_matrix(rotations).magnitude()
+    assert len(rotations)
+    assert ((moved > 0.05 * np.linalg.norm(sets.middle)) | (turned > np.radians(2))).all()
+
+
 def test_the_half_turn_of_a_lattice_is_found() -> None:
     points = lattice(5, 4) + (0, 0, 6)
     sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
-    rotations, translations = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3)
+    rotations, translations = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
     angles = np.degrees(Rotation.from_matrix(rotations).magnitude())
     best = int(np.argmax(angles))
     assert angles[best] == pytest.approx(180)
@@ -78,4 +118,4 @@ def test_the_half_turn_of_a_lattice_is_found() -> None:
 def test_scattered_points_have_none() -> None:
     points = np.random.default_rng(5).uniform(-1, 1, (200, 3)) + (0, 0, 6)
     sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
-    assert len(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3)[0]) == 0
+    assert len(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())[0]) == 0

@@ -82,7 +82,7 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
     result = Alarms(none, none.copy())
     if len(sets.bearings) > FIXING:
         for k in range(len(none)):
-            seen = _directions(sets, rotations[k], translations[k])
+            seen = directions_of(sets, rotations[k], translations[k])
             if int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
                 continue
             evidence, ladder = _log_evidence(sets, seen), sets.image.scales
@@ -103,7 +103,7 @@ def _log10_tests(sets: PointSets) -> float:
     return math.log10(2 * max(choices, 1.0))
 
 
-def _directions(sets: PointSets, rotation: Array, translation: Array) -> Array:
+def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array:
     """Unit directions (n, 3) in the camera's frame; NaN for a point in the camera or facing away."""
     camera = sets.points3d @ rotation.T + translation
     length = np.linalg.norm(camera, axis=-1, keepdims=True)
@@ -116,17 +116,28 @@ def _directions(sets: PointSets, rotation: Array, translation: Array) -> Array:
 def _log_evidence(sets: PointSets, seen: Array) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), the largest x_i left out, at each of S scales, of points seen in
     directions (n, 3)."""
+    logs = point_evidence(sets, seen, sets.image.scales, SHARES)
+    fixing = np.partition(logs, len(logs) - FIXING, 0)[-FIXING:]
+    evidence = (logs / sets.image.together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
+    return np.asarray(np.logaddexp.reduce(evidence, 1)) - math.log(evidence.size)
+
+
+def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
+    """log x_i (k, S, W) of each chosen image point, at `scales` (S,) and `shares` (W,), of points seen in directions
+    (n, 3).
+
+    even: against scene points that are spread evenly over the view instead of as they are seen.
+    """
     image = sets.image
-    logs = np.zeros((len(image.chosen), len(image.scales), len(SHARES)))
+    logs = np.zeros((len(image.chosen), len(scales), len(shares)))
     for rows, columns in label_groups(image.chosen, sets.labels2d, sets.labels3d, len(seen)):
         used, bearings = seen[columns][np.isfinite(seen[columns, 0])], sets.bearings[image.chosen[rows]]
-        near2 = nearest(used, bearings, math.sqrt(FARTHEST) * float(image.scales[-1])) ** 2
+        near2 = nearest(used, bearings, math.sqrt(FARTHEST) * float(scales[-1])) ** 2
+        density = np.full(len(rows), len(columns) / image.solid_angle) if even else _density(image, bearings, used)
         part = np.empty((len(rows), *logs.shape[1:]))
-        _log_ratios(near2, _density(image, bearings, used), image.scales, SHARES, part)
+        _log_ratios(near2, density, scales, shares, part)
         logs[rows] = part
-    fixing = np.partition(logs, len(logs) - FIXING, 0)[-FIXING:]
-    evidence = (logs / image.together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
-    return np.asarray(np.logaddexp.reduce(evidence, 1)) - math.log(evidence.size)
+    return logs
 
 
 def _density(image: ImageStatistics, bearings: Array, directions: Array) -> Array:

@@ -33,7 +33,7 @@ class ImageStatistics:
         self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
         variance, axes = np.linalg.eigh(centred.T @ centred / max(m - 1, 1))
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
-        self.solid_angle = solid_angle(bearings)
+        self.solid_angle = _filled(variance[1:])
         smallest = max(floor or 0.0, FLOOR * self.spread)
         largest = max(COARSEST * math.sqrt(self.solid_angle / m), 2 * smallest)
         steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
@@ -50,6 +50,11 @@ def solid_angle(bearings: Array, *, ddof: int = 1) -> float:
     """
     centred = bearings - bearings.mean(0)
     variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - ddof, 1))[1:]
+    return _filled(variance)
+
+
+def _filled(variance: Array) -> float:
+    """Steradians of the rectangle with these two principal variances."""
     return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
 
 

@@ -1,13 +1,17 @@
 """Poses that a repeated structure confuses: a facade moved by a window, a lattice by a cell, a plane by half a turn."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.point_sets import PointSets
+from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
 NEAR = 3.0  # scales of the residuals within which an image point has a partner, and a moved point lies on another
 SHARE = 0.5  # of the points with a partner that must come to lie on others
 FEWEST = 6  # points with a partner; of fewer, three that fix a pose are too large a part
@@ -15,22 +19,26 @@ REFERENCES = 3  # points that are laid onto every other one; a motion may leave 
 AROUND = 4096  # scene points that they are laid onto
 FIRST, MOST = 4, 48  # points that are moved to find motions, and to confirm them
 CONFIRMED, WEIGHED, KEPT = 512, 24, 4  # motions, best first, that are confirmed, whose poses are weighed, and returned
+MOST_MISSING = 1 / 3  # share of its points that a map may lack, at most
 
 
-def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: float) -> tuple[Array, Array]:
+def repeated_poses(
+    sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence
+) -> Pose:  # fmt: skip
     """Poses (c, 3, 3), (c, 3) that see other scene points where this one sees those that have a partner in the image.
 
     If a motion p -> Q p + d takes these points onto other scene points, the pose (R Q^T, t - R Q^T d) sees the latter
     in the same directions. Q: none, half turns about the axes of the points, and quarter turns where they repeat. d:
     from one of three points in their middle to any of the 4096 nearest scene points. scale: of the residuals, radians.
-    The poses with the fewest false alarms come first.
+    Only poses that a verdict takes for different from this one (`Evidence.other_deg`); those with the fewest false
+    alarms come first.
 
     >>> import numpy as np
     >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
     >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
     >>> image = motif + [0, 0, 6]  # the first of three equal things
     >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-    >>> sorted(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3)[1][:, 0].round(6).tolist())
+    >>> sorted(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())[1][:, 0].round(6).tolist())
     [-4.0, -2.0]
     """
     none = np.empty((0, 3, 3)), np.empty((0, 3))
@@ -51,14 +59,61 @@ def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: 
     found = [(share, np.eye(3), shift) for share, shift in _shifts(tree, own, np.eye(3), tolerance)]
     for turn in _turns(own, found[0][2] if found else None):
         found += [(share, turn, shift) for share, shift in _shifts(tree, own, turn, tolerance)]
-    found = sorted(found, key=lambda motion: -motion[0])[:WEIGHED]
+    found = sorted(found, key=lambda motion: -motion[0])
     if not found:
         return none
-    rotations = np.array([rotation @ turn.T for _, turn, _ in found])
-    translations = np.array([translation - rotation @ turn.T @ shift for _, turn, shift in found])
-    alarms = alarms_of(sets, rotations, translations, np.full(len(found), scale)).own
+    rotations = np.array([rotation, *(rotation @ turn.T for _, turn, _ in found)])
+    translations = np.array([translation, *(translation - rotation @ turn.T @ shift for _, turn, shift in found)])
+    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))[:WEIGHED]
+    rotations, translations = rotations[other], translations[other]
+    alarms = alarms_of(sets, rotations, translations, np.full(len(other), scale)).own
     best = np.argsort(alarms, kind="stable")[:KEPT]
     return rotations[best], translations[best]
+
+
+def decades_behind(sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, scale: float) -> Array:
+    """Decades (c,) by which the poses `rivals` (c, 3, 3), (c, 3) explain the image points worse than the best one.
+
+    All at one scale of the residuals, radians, and against scene points that are evenly spread: their density does not
+    say which of equal things is seen. An image point does not count against a rival if the map may end there: if it
+    lies beyond the rival's projected points, and its scene point is one of those that the motions of the `repeated`
+    poses take onto others. Any point may be missing in the map, as is the share q of the image points that the best
+    pose does not explain: none counts for more than (1 - q) / q.
+    """
+    seen = [directions_of(sets, *best), *(directions_of(sets, r, t) for r, t in zip(*rivals, strict=True))]
+    logs = np.stack([point_evidence(sets, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
+    missing = min((int((logs[0] < 0).sum()) + 1) / (logs.shape[1] + 2), MOST_MISSING)
+    most = math.log((1 - missing) / missing)
+    counted = np.stack([_among(sets, one) for one in seen[1:]]) | ~_is_repeated(sets, best, repeated, scale)
+    return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
+
+
+def _is_repeated(sets: PointSets, best: Pose, repeated: Pose, scale: float) -> NDArray[np.bool_]:
+    """Of which of the chosen image points (k,) a motion p -> Q p + d, or its inverse, takes the scene point onto
+    another one; Q p + d is the point that a repeated pose sees where the best one sees p."""
+    points, (rotation, translation) = sets.points3d, best
+    camera = points @ rotation.T + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    _, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(sets.bearings[sets.image.chosen])
+    own, reach = points[nearest], NEAR * scale * float(np.median(depth[nearest]))
+    moved = [
+        target
+        for r, t in zip(*repeated, strict=True)
+        for target in ((own @ rotation.T + translation - t) @ r, (own @ r.T + t - translation) @ rotation)
+    ]
+    return np.asarray(np.isfinite(cKDTree(points).query(moved, distance_upper_bound=reach)[0]).any(0))
+
+
+def _among(sets: PointSets, seen: Array) -> NDArray[np.bool_]:
+    """Which of the chosen image points lie in the convex hull of the directions (n, 3) that a pose sees."""
+    image = sets.image
+    ahead = seen[seen @ image.centre > 0]  # none that is NaN
+    plane, points = (x @ image.axes / (x @ image.centre)[:, None] for x in (ahead, sets.bearings[image.chosen]))
+    try:
+        sides = ConvexHull(plane).equations
+    except (QhullError, ValueError):  # on a line, or too few
+        return np.zeros(len(points), bool)
+    return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1))
 
 
 def _turns(points: Array, shift: Array | None) -> list[Array]:
