@@ -154,7 +154,8 @@ def _against_repetitions(
     scene = entered()
     starts = Candidates.unscored(*scene.enter(*repeated))
     starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
-    rivals = with_false_alarms(in_user_frame(finish(scene, starts), scene), sets)
+    ends = finish(scene, starts)  # none after the deadline
+    rivals = with_false_alarms(in_user_frame(ends if len(ends) else starts, scene), sets)
     behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + np.maximum(behind, 0))
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])

@@ -1,14 +1,22 @@
 """Scenes with a repeated structure: a pose that sees one of several equal things is never called confident."""
 
+from dataclasses import replace
+from functools import partial
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
+from bpnp.compilation import Deadline
+from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.many import _against_repetitions
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Evidence
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT, Evidence
+from bpnp.search.verdict import SearchResult
 
 Array = NDArray[np.float64]
 CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -75,6 +83,17 @@ def test_a_facade_whose_map_ends_early_is_not_called_confident() -> None:
         scene += 0.002 * rng.standard_normal(scene.shape)
         pixels, _ = part_of(scene[column >= 3], 7.0, rng)
         assert solve(pixels, scene[column < 6], CAMERA).verdict != "confident"
+
+
+def test_after_the_deadline_repetitions_are_still_compared() -> None:
+    """Nothing is annealed then."""
+    scene = stairs(np.random.default_rng(9)) + (0, 0, 4)
+    seen = scene[24:72]
+    sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), scene, floor=2e-4)
+    found = replace(Candidates.unscored(np.eye(3)[None], np.zeros((1, 3)), hits=9), scale=np.array([1e-3]))
+    scene_of = partial(Scene, sets, 0, DEFAULT, Deadline.after(0.0))
+    sure = SearchResult(found, "confident", "", 9)
+    assert _against_repetitions(sure, sets, scene_of, Evidence()).verdict == "ambiguous"
 
 
 def test_points_that_do_not_repeat_count_against_a_shift_and_those_that_do_not_where_the_map_ends() -> None:
