@@ -148,7 +148,7 @@ def _against_repetitions(
     if result.verdict != "confident":
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
-    repeated = repeated_poses(sets, *best, scale, rule)
+    repeated, compared = repeated_poses(sets, *best, scale, rule)
     if not len(repeated[0]):
         return result
     scene = entered()
@@ -157,7 +157,8 @@ def _against_repetitions(
     ends = finish(scene, starts)  # none after the deadline
     rivals = with_false_alarms(in_user_frame(ends if len(ends) else starts, scene), sets)
     behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
-    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + np.maximum(behind, 0))
+    behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
+    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
     beside = judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.misfit import Misfit, systematic_misfit
 from bpnp.search.evidence.uncertainty import rotation_bound
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
@@ -158,7 +159,9 @@ def judged(
     pose = candidates.rotation[0], candidates.translation[0]
     off = math.degrees(rotation_bound(sets, *pose, float(candidates.scale[0]), count))
     certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches)
-    if certain and off <= rule.loose_deg:
+    misfit = systematic_misfit(sets, *pose, float(candidates.scale[0]), count) if certain else Misfit(0.0, 0.0)
+    bent = math.degrees(misfit.turn) > rule.other_deg or misfit.shift > rule.other_shift
+    if certain and off <= rule.loose_deg and not bent:
         return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
@@ -169,6 +172,11 @@ def judged(
         reason = f"{chance}: too many to be sure"
     elif is_rough(candidates):
         reason = f"{chance}, but the points agree with it better at residuals far larger than those of its matches"
+    elif bent:
+        reason = (
+            f"{chance}, but with another focal length or other proportions of the scene they fit significantly better, "
+            f"{math.degrees(misfit.turn):.0f} deg and {100 * misfit.shift:.0f} % of the distance away"
+        )
     elif certain:
         reason = f"{chance}, but so few and near matches leave its rotation loose: it may be {off:.1f} deg off"
     else:

@@ -19,29 +19,31 @@ REFERENCES = 3  # points that are laid onto every other one; a motion may leave 
 AROUND = 4096  # scene points that they are laid onto
 FIRST, MOST = 4, 48  # points that are moved to find motions, and to confirm them
 CONFIRMED, WEIGHED, KEPT = 512, 24, 4  # motions, best first, that are confirmed, whose poses are weighed, and returned
+COMPARED = 400  # motions of a structure beyond which a few cannot stand for all: some of them fits as well
 MOST_MISSING = 1 / 3  # share of its points that a map may lack, at most
 
 
 def repeated_poses(
     sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence
-) -> Pose:  # fmt: skip
+) -> tuple[Pose, bool]:  # fmt: skip
     """Poses (c, 3, 3), (c, 3) that see other scene points where this one sees those that have a partner in the image.
 
     If a motion p -> Q p + d takes these points onto other scene points, the pose (R Q^T, t - R Q^T d) sees the latter
     in the same directions. Q: none, half turns about the axes of the points, and quarter turns where they repeat. d:
     from one of three points in their middle to any of the 4096 nearest scene points. scale: of the residuals, radians.
-    Only poses that a verdict takes for different from this one (`Evidence.other_deg`); those with the fewest false
-    alarms come first.
+    Only poses that a verdict takes for different from this one (`Evidence.other_deg`), the four with the fewest false
+    alarms; and whether there are so few motions that these stand for all.
 
     >>> import numpy as np
     >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
     >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
     >>> image = motif + [0, 0, 6]  # the first of three equal things
     >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-    >>> sorted(repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())[1][:, 0].round(6).tolist())
+    >>> (_, translations), _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+    >>> sorted(translations[:, 0].round(6).tolist())
     [-4.0, -2.0]
     """
-    none = np.empty((0, 3, 3)), np.empty((0, 3))
+    none = (np.empty((0, 3, 3)), np.empty((0, 3))), True
     points = sets.points3d
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
@@ -64,11 +66,11 @@ def repeated_poses(
         return none
     rotations = np.array([rotation, *(rotation @ turn.T for _, turn, _ in found)])
     translations = np.array([translation, *(translation - rotation @ turn.T @ shift for _, turn, shift in found)])
-    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))[:WEIGHED]
-    rotations, translations = rotations[other], translations[other]
-    alarms = alarms_of(sets, rotations, translations, np.full(len(other), scale)).own
+    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
+    rotations, translations = rotations[other[:WEIGHED]], translations[other[:WEIGHED]]
+    alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
     best = np.argsort(alarms, kind="stable")[:KEPT]
-    return rotations[best], translations[best]
+    return (rotations[best], translations[best]), len(other) <= COMPARED
 
 
 def decades_behind(sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, scale: float) -> Array:

@@ -1,6 +1,7 @@
 """How well points fix a pose: the standard deviation of its rotation, and a bound that allows for few residuals."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -54,28 +55,14 @@ def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     H. White, Maximum likelihood estimation of misspecified models, Econometrica 1982.
     """
-    turned = sets.points3d @ rotation.T
-    camera = turned + translation
-    depth = np.linalg.norm(camera, axis=-1)
-    used = depth > 0
-    if sets.normals3d is not None:
-        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
-    places = np.flatnonzero(used)
-    if not len(places):
+    pairs = linearised(sets, rotation, translation, scale)
+    if pairs is None:
         return math.inf
-    turned, depth, seen = turned[places], depth[places], camera[places] / depth[places, None]
-    chosen = sets.image.chosen
-    i, j, probability = _partners(sets, seen, scale)
-    if not len(i):
-        return math.inf
-    p, u = turned[j] - np.median(turned, 0), seen[j]
-    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
-    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
-    score = np.einsum("kab,ka->kb", jacobian, (sets.bearings[chosen[i]] - u) / scale)
-    weighed = probability[:, None, None] * jacobian
-    complete = np.einsum("kab,kac->bc", weighed, jacobian)
+    chosen, probability = sets.image.chosen, pairs.probability
+    score = np.einsum("kab,ka->kb", pairs.jacobian, pairs.residual)
+    complete = np.einsum("k,kab,kac->bc", probability, pairs.jacobian, pairs.jacobian, optimize=True)
     expected = np.zeros((len(chosen), 6))
-    np.add.at(expected, i, probability[:, None] * score)
+    np.add.at(expected, pairs.image, probability[:, None] * score)
     between = expected.T @ expected
     share = len(sets.bearings) / len(chosen)
     known = _known(sets)
@@ -88,6 +75,43 @@ def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: 
     inverse = unit[:, None] * ((vectors / values) @ vectors.T) * unit
     sandwich = inverse @ (share * between + known) @ inverse
     return math.sqrt(max(float(np.linalg.eigvalsh(v[:3, :3])[-1]) for v in (inverse, sandwich)))
+
+
+class Pairs(NamedTuple):
+    """k pairs of image and scene points that may be partners, and how they depend on a pose.
+
+    image: (k,) places among the chosen image points. probability: (k,) of the pair. seen: (k, 3) direction in which the
+    pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from their median. residual: (k, 3) of
+    the image point, jacobian: (k, 3, 6) of `seen` by turn and shift of the points about that median; in scales.
+    """
+
+    image: NDArray[np.int64]
+    probability: Array
+    seen: Array
+    points: Array
+    residual: Array
+    jacobian: Array
+
+
+def linearised(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Pairs | None:
+    """The pairs that are within a few scales, radians, of each other; None if there is none."""
+    turned = sets.points3d @ rotation.T
+    camera = turned + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    used = depth > 0
+    if sets.normals3d is not None:
+        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
+    places = np.flatnonzero(used)
+    if not len(places):
+        return None
+    turned, depth, seen = turned[places], depth[places], camera[places] / depth[places, None]
+    i, j, probability = _partners(sets, seen, scale)
+    if not len(i):
+        return None
+    p, u = turned[j] - np.median(turned, 0), seen[j]
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
+    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
+    return Pairs(i, probability, u, p, (sets.bearings[sets.image.chosen[i]] - u) / scale, jacobian)
 
 
 def _partners(sets: PointSets, seen: Array, scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
