@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc
 
-from bpnp.search.evidence.uncertainty import EXCEEDED, Pairs, linearised
+from bpnp.search.evidence.uncertainty import EXCEEDED, linearised
 from bpnp.search.point_sets import PointSets
 
 Array = NDArray[np.float64]
@@ -21,6 +21,7 @@ STRAINS = np.array(
     ],
     np.float64,
 )
+FITTED = 6 + len(STRAINS)  # numbers
 
 
 class Misfit(NamedTuple):
@@ -45,37 +46,39 @@ def systematic_misfit(sets: PointSets, rotation: Array, translation: Array, scal
     >>> systematic_misfit(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4, 40.0)
     Misfit(turn=0.0, shift=0.0)
     """
+    if 2 * count <= FITTED:
+        return Misfit(0.0, 0.0)
     pairs = linearised(sets, rotation, translation, scale)
-    if pairs is None:
+    if pairs is None or 2 * pairs.probability.sum() <= FITTED:
         return Misfit(0.0, 0.0)
-    free = 2 * min(count, float(pairs.probability.sum())) - 6 - len(STRAINS)
-    if free <= 0:
-        return Misfit(0.0, 0.0)
-    u = pairs.seen
-    zoomed = np.column_stack([u[:, :2], np.zeros(len(u))]) / scale
-    zoomed -= (zoomed * u).sum(1, keepdims=True) * u
-    strained = np.einsum("kab,ekb->kae", pairs.jacobian[:, :, 3:], pairs.points @ STRAINS)
-    distance = float(np.linalg.norm(rotation @ sets.middle + translation))
-    moved = np.stack([_moved(pairs, columns, free) for columns in (zoomed[:, :, None], strained)])
+    free = 2 * min(count, float(pairs.probability.sum())) - FITTED
+    zoomed = pairs.seen * (1, 1, 0) / scale
+    zoomed -= (zoomed * pairs.seen).sum(1, keepdims=True) * pairs.seen
+    strained = (pairs.jacobian[:, None, :, 3:] @ (pairs.points @ STRAINS).transpose(1, 0, 2)[..., None])[..., 0]
+    columns = np.concatenate(
+        [pairs.jacobian, zoomed[..., None], strained.transpose(0, 2, 1), pairs.residual[..., None]], -1
+    )
+    weighed = (np.sqrt(pairs.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
+    products = weighed.T @ weighed
+    moved = np.stack([_moved(products, slice(6, 7), free), _moved(products, slice(7, 7 + len(STRAINS)), free)])
     turn, shift = (float(np.linalg.norm(part, axis=-1).max()) for part in (moved[:, :3], moved[:, 3:]))
-    return Misfit(turn, shift / max(distance, 1e-300))
+    return Misfit(turn, shift / max(float(np.linalg.norm(rotation @ sets.middle + translation)), 1e-300))
 
 
-def _moved(pairs: Pairs, columns: Array, free: float) -> Array:
-    """The step (6,) of the pose if the columns (k, 3, e) are fitted to the residuals beside it."""
-    both = np.concatenate([pairs.jacobian, columns], -1)
-    weighed = pairs.probability[:, None, None] * both
-    normal, gradient = np.einsum("kab,kac->bc", weighed, both), np.einsum("kab,ka->b", weighed, pairs.residual)
-    pose = np.linalg.pinv(normal[:6, :6], hermitian=True)
-    across = pose @ normal[:6, 6:]
-    values, directions = np.linalg.eigh(normal[6:, 6:] - normal[6:, :6] @ across)
-    known = values > 1e-9 * float(np.diag(normal)[6:].max())
+def _moved(products: Array, fitted: slice, free: float) -> Array:
+    """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it.
+
+    products: of the columns with each other; the first six are the pose's, the last one holds the residuals.
+    """
+    pose = np.linalg.pinv(products[:6, :6], hermitian=True)
+    across = pose @ products[:6, fitted]
+    values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :6] @ across)
+    known = values > 1e-9 * float(np.diag(products)[fitted].max())
     if not known.any():
         return np.zeros(6)
     values, directions = values[known], directions[:, known]
-    step = (gradient[6:] - across.T @ gradient[:6]) @ directions / values
-    total = float((pairs.probability * (pairs.residual**2).sum(-1)).sum()) - float(gradient[:6] @ pose @ gradient[:6])
+    step = (products[fitted, -1] - across.T @ products[:6, -1]) @ directions / values
     gain = step**2 * values
-    rest = max(total - float(gain.sum()), 1e-300) / free
-    significant = fdtrc(1, free, gain / rest) < EXCEEDED / len(values)
+    rest = products[-1, -1] - float(products[-1, :6] @ pose @ products[:6, -1]) - float(gain.sum())
+    significant = fdtrc(1, free, gain * free / max(rest, 1e-300)) < EXCEEDED / len(values)
     return np.asarray(across @ directions @ np.where(significant, step, 0.0))
