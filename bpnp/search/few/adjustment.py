@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from bpnp.compilation import compiler
+from bpnp.search.few.matching import turned
 from bpnp.search.kernels.dense import solve_normal_equations
 
 compiled = compiler(error_model="numpy", boundscheck=False)
@@ -22,10 +23,7 @@ def refine(pose: Any, rays: Any, points: Any, matched: Any, prior: Any, hessian:
         j = matched[i]
         if j < 0:
             continue
-        px, py, pz = points[j, 0], points[j, 1], points[j, 2]
-        x = pose[0] * px + pose[1] * py + pose[2] * pz
-        y = pose[3] * px + pose[4] * py + pose[5] * pz
-        z = pose[6] * px + pose[7] * py + pose[8] * pz
+        x, y, z = turned(pose, points[j, 0], points[j, 1], points[j, 2])
         ux, uy, uz = x + pose[9], y + pose[10], z + pose[11]
         inverse = 1 / math.sqrt(ux * ux + uy * uy + uz * uz)
         ux, uy, uz = ux * inverse, uy * inverse, uz * inverse
@@ -47,10 +45,7 @@ def refine(pose: Any, rays: Any, points: Any, matched: Any, prior: Any, hessian:
             step[3], step[4], step[5] = h * ex, h * ey, h * ez
             _add(hessian, gradient, step, residual)
     for k in range(len(prior)):
-        ax, ay, az = prior[k, 0], prior[k, 1], prior[k, 2]
-        x = pose[0] * ax + pose[1] * ay + pose[2] * az
-        y = pose[3] * ax + pose[4] * ay + pose[5] * az
-        z = pose[6] * ax + pose[7] * ay + pose[8] * az
+        x, y, z = turned(pose, prior[k, 0], prior[k, 1], prior[k, 2])
         w = prior[k, 6]
         step[3] = step[4] = step[5] = 0.0
         step[0], step[1], step[2] = 0.0, w * z, -w * y

@@ -4,7 +4,7 @@ from typing import Any
 
 from bpnp.compilation import compiler
 from bpnp.search.few.kept import allowed, consider
-from bpnp.search.few.matching import WIDEST_MATCHED, nearest, sight
+from bpnp.search.few.matching import WIDEST_MATCHED, nearest, sight, turned
 from bpnp.search.few.p3p import p3p_depths
 from bpnp.search.few.triangles import pose_of_triangle
 
@@ -96,11 +96,8 @@ def faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int) -> b
 
 @compiled
 def _cosine(pose: Any, normals: Any, a: int, rays: Any, i: int) -> float:
-    x, y, z = normals[a, 0], normals[a, 1], normals[a, 2]
-    nx = pose[0] * x + pose[1] * y + pose[2] * z
-    ny = pose[3] * x + pose[4] * y + pose[5] * z
-    nz = pose[6] * x + pose[7] * y + pose[8] * z
-    return -(nx * rays[i, 0] + ny * rays[i, 1] + nz * rays[i, 2])
+    x, y, z = turned(pose, normals[a, 0], normals[a, 1], normals[a, 2])
+    return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2])
 
 
 @compiled

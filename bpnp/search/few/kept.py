@@ -10,7 +10,7 @@ from typing import Any
 
 from bpnp.compilation import compiler
 from bpnp.search.few.adjustment import refine
-from bpnp.search.few.matching import WIDEST_MATCHED, evidence, match, sight
+from bpnp.search.few.matching import WIDEST_MATCHED, evidence, match, sight, turned
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 SAME = 1 + 2 * math.cos(math.radians(2.0))  # trace of the turn between two poses that are the same
@@ -96,10 +96,8 @@ def allowed(pose: Any, prior: Any, place: Any) -> bool:
     if shift2 > place[3]:
         return False
     for k in range(len(prior)):
-        x, y, z = prior[k, 0], prior[k, 1], prior[k, 2]
-        dx = pose[0] * x + pose[1] * y + pose[2] * z - prior[k, 3]
-        dy = pose[3] * x + pose[4] * y + pose[5] * z - prior[k, 4]
-        dz = pose[6] * x + pose[7] * y + pose[8] * z - prior[k, 5]
+        x, y, z = turned(pose, prior[k, 0], prior[k, 1], prior[k, 2])
+        dx, dy, dz = x - prior[k, 3], y - prior[k, 4], z - prior[k, 5]
         if dx * dx + dy * dy + dz * dz > prior[k, 7]:
             return False
     return True

@@ -59,19 +59,24 @@ def build_grid(flat: Any, gain: Any, reach: float, corner: Any, starts: Any, ite
 
 
 @compiled
+def turned(pose: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """R (x, y, z)."""
+    return (
+        pose[0] * x + pose[1] * y + pose[2] * z,
+        pose[3] * x + pose[4] * y + pose[5] * z,
+        pose[6] * x + pose[7] * y + pose[8] * z,
+    )
+
+
+@compiled
 def sight(pose: Any, points: Any, normals: Any, j: int) -> tuple[float, float, float]:
     """Where point j is seen on the plane, and the cosine of its normal to the line of sight (1 without normals)."""
-    x, y, z = points[j, 0], points[j, 1], points[j, 2]
-    cx = pose[0] * x + pose[1] * y + pose[2] * z + pose[9]
-    cy = pose[3] * x + pose[4] * y + pose[5] * z + pose[10]
-    cz = pose[6] * x + pose[7] * y + pose[8] * z + pose[11]
+    x, y, z = turned(pose, points[j, 0], points[j, 1], points[j, 2])
+    cx, cy, cz = x + pose[9], y + pose[10], z + pose[11]
     length = math.sqrt(cx * cx + cy * cy + cz * cz)
     cosine = 1.0
     if len(normals):
-        x, y, z = normals[j, 0], normals[j, 1], normals[j, 2]
-        nx = pose[0] * x + pose[1] * y + pose[2] * z
-        ny = pose[3] * x + pose[4] * y + pose[5] * z
-        nz = pose[6] * x + pose[7] * y + pose[8] * z
+        nx, ny, nz = turned(pose, normals[j, 0], normals[j, 1], normals[j, 2])
         cosine = -(nx * cx + ny * cy + nz * cz) / length
     scale = 1 / (length + cz)
     return cx * scale, cy * scale, cosine

@@ -6,6 +6,7 @@ from typing import Any
 from bpnp.compilation import compiler
 from bpnp.search.few.enumeration import faces, fits, witnessed
 from bpnp.search.few.kept import allowed, consider
+from bpnp.search.few.matching import turned
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 LEVEL = 1e-6  # sine of both rays' height, below which a known vertical says nothing about their depths
@@ -72,10 +73,7 @@ def p2p_turned(f: Any, g: Any, p: Any, q: Any, known: Any, most: float, noise: f
     if not sine > 2 * noise:
         return False
     n0, n1, n2 = n0 / sine, n1 / sine, n2 / sine
-    x, y, z = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    w0 = known[0] * x + known[1] * y + known[2] * z
-    w1 = known[3] * x + known[4] * y + known[5] * z
-    w2 = known[6] * x + known[7] * y + known[8] * z
+    w0, w1, w2 = turned(known, q[0] - p[0], q[1] - p[1], q[2] - p[2])
     length = math.sqrt(w0 * w0 + w1 * w1 + w2 * w2)
     off = (n0 * w0 + n1 * w1 + n2 * w2) / length
     if not abs(off) < math.sin(min(most + 2 * noise / sine, 1.5)):
@@ -98,9 +96,8 @@ def p2p_turned(f: Any, g: Any, p: Any, q: Any, known: Any, most: float, noise: f
         pose[k] = r0 + a0 + bend * (axis1 * a2 - axis2 * a1)
         pose[3 + k] = r1 + a1 + bend * (axis2 * a0 - axis0 * a2)
         pose[6 + k] = r2 + a2 + bend * (axis0 * a1 - axis1 * a0)
-    for k in range(3):
-        seen = pose[3 * k] * p[0] + pose[3 * k + 1] * p[1] + pose[3 * k + 2] * p[2]
-        pose[9 + k] = c * f[k] - seen
+    x, y, z = turned(pose, p[0], p[1], p[2])
+    pose[9], pose[10], pose[11] = c * f[0] - x, c * f[1] - y, c * f[2] - z
     return True
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.compilation import compiler
+from bpnp.search.few.matching import turned
 
 compiled = compiler(error_model="numpy", boundscheck=False)
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
@@ -90,10 +91,8 @@ def pose_of_triangle(
     for r in range(3):
         for c in range(3):
             pose[3 * r + c] = axes[0, r] * frame[0, c] + axes[1, r] * frame[1, c] + axes[2, r] * frame[2, c]
-    m0, m1, m2 = middle[0], middle[1], middle[2]
-    pose[9] = (x0 + x1 + x2) / 3 - (pose[0] * m0 + pose[1] * m1 + pose[2] * m2)
-    pose[10] = (y0 + y1 + y2) / 3 - (pose[3] * m0 + pose[4] * m1 + pose[5] * m2)
-    pose[11] = (z0 + z1 + z2) / 3 - (pose[6] * m0 + pose[7] * m1 + pose[8] * m2)
+    x, y, z = turned(pose, middle[0], middle[1], middle[2])
+    pose[9], pose[10], pose[11] = (x0 + x1 + x2) / 3 - x, (y0 + y1 + y2) / 3 - y, (z0 + z1 + z2) / 3 - z
     return True
 
 
