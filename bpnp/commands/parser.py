@@ -6,6 +6,7 @@ import math
 import re
 import types
 import typing
+from argparse import HelpFormatter
 from collections.abc import Callable, Sequence
 from typing import Any, NoReturn
 
@@ -24,7 +25,7 @@ class OneLineParser(ArgumentParser):
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
         text = " ".join(message.split())
-        wrong = re.search(r'Parser key "(\w+)": .*Given value: (.*)$', text)
+        wrong = re.search(r'Parser key "(\w+)".*(?:Given|Got) value: (.*)$', text)
         if wrong and wrong[1] in self.kinds:
             raise ValueError(f"expected {wrong[1]} as {self.kinds[wrong[1]]}, got {wrong[2]!r}") from ex
         raise ValueError(self.suggested(text)) from ex
@@ -52,12 +53,15 @@ def run_command(name: str, command: Callable[..., None], arguments: Sequence[str
 def command_parser(name: str, command: Callable[..., None]) -> ArgumentParser:
     """The parser of a function, its help from the docstring.
 
-    A list takes several words; a bool is a flag without a value; anything else is read as its annotation says.
+    A list takes several words, a tuple as many as it has; a bool is a flag without a value; anything else is read as
+    its annotation says.
     """
     told = parse_docstring(inspect.getdoc(command) or "")
     help_of = {parameter.arg_name: parameter.description for parameter in told.params}
     description = "\n".join(filter(None, (told.short_description, told.long_description)))
-    parser = OneLineParser(prog=f"bpnp {name}", description=description, allow_abbrev=False)
+    parser = OneLineParser(
+        prog=f"bpnp {name}", description=description, allow_abbrev=False, formatter_class=HelpFormatter
+    )
     hints = typing.get_type_hints(command)
     for parameter in inspect.signature(command).parameters.values():
         if parameter.name == OVERRIDES:
@@ -65,20 +69,24 @@ def command_parser(name: str, command: Callable[..., None]) -> ArgumentParser:
         option = parameter.kind is parameter.KEYWORD_ONLY
         required = parameter.default is parameter.empty
         kind = hints[parameter.name]
+        words = _words(kind)
         settings: dict[str, Any] = {"help": help_of.get(parameter.name)}
         if kind is bool:
             settings |= {"action": "store_true"}
-        elif _is_list(kind):
-            settings |= {"type": _element(kind), "nargs": "+" if option or required else "*"}
+        elif words:
+            several = "+" if option or required else "*"
+            settings |= {"type": words[0], "nargs": several if words[-1] is ... else len(words)}
         else:
             settings |= {"type": kind}
             if not option and not required:
                 settings |= {"nargs": "?"}
         if not required and kind is not bool:
             settings |= {"default": parameter.default}
+            if parameter.default is not None:
+                settings["help"] += f" Default: {parameter.default}."
         if option and required:
             settings |= {"required": True}
-        parser.kinds[parameter.name] = _described(kind)
+        parser.kinds[parameter.name] = _described(words[0] if words else kind)
         parser.add_argument(f"--{parameter.name}" if option else parameter.name, **settings)
     return parser
 
@@ -125,11 +133,11 @@ def _described(kind: Any) -> str:
     )
 
 
-def _is_list(kind: Any) -> bool:
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    return any(typing.get_origin(option) is list for option in options)
-
-
-def _element(kind: Any) -> Any:
-    options = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
-    return next(typing.get_args(option)[0] for option in options if typing.get_origin(option) is list)
+def _words(kind: Any) -> tuple[Any, ...]:
+    """What the words of a list or of a tuple are: (T, ...) or one type a word; empty for other kinds."""
+    for option in typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,):
+        if typing.get_origin(option) is list:
+            return (typing.get_args(option)[0], ...)
+        if typing.get_origin(option) is tuple:
+            return typing.get_args(option)
+    return ()

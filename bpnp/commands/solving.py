@@ -56,8 +56,8 @@ def solve(
         prior: rough pose, the JSON of a solution; or a checkpoint.
         prior_degrees: standard deviation of its rotation.
         prior_distance: standard deviation of its translation, scene units; unknown by default.
-        up_camera: direction up in the camera (x right, y down, z forward), if gravity is known.
-        up_scene: the same direction in the scene.
+        up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is known.
+        up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
         solver: search, or the checkpoint of a BPnPNet.

@@ -99,9 +99,16 @@ def test_a_rough_pose_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[
     np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-6)
 
 
+def test_gravity_is_three_numbers_of_either_side(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    up = PLANTED.rotation[0].numpy() @ [0.0, 0.0, 1.0]
+    main(["solve", *write(tmp_path), "--json", "--up_camera", *map(str, up), "--up-scene", "0", "0", "1"])
+    np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-4)
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        (lambda files: [*files, "--up_camera", "0", "-1", "x", "--up_scene", "0", "0", "1"], "up_camera as float, got"),
         (lambda files: files[::-1], "are the two files swapped?"),
         (lambda files: [files[0], "nowhere.npy"], "got no file nowhere.npy"),
         (lambda files: [*files, *CAMERA], "look normalised"),

@@ -205,7 +205,7 @@ def test_run_against_run_counts_the_better_pairs_and_opens_one(
     (text,) = texts(page, "#versus-text")
     shares = re.findall(r"([\d.]+) %", text)
     assert floats(shares) == pytest.approx([100 * (a < b).mean(), 100 * (a > b).mean()], abs=0.051)
-    points = page("const t = document.getElementById('versus').data[1]; return [t.x, t.y]")
+    points = page("const t = document.getElementById('versus').data[0]; return [t.x, t.y]")
     np.testing.assert_allclose(points, [a, b], rtol=1e-6)
     page("document.getElementById('versus').emit('plotly_click', {points: [{customdata: 5}]})")
     assert texts(page, "#pair-title") == ["scene/0005"]

@@ -33,18 +33,22 @@ def look() -> dict[str, Any]:
 
 def figures() -> dict[str, dict[str, Any]]:
     """By the id of their element: run against run, a pair in space, a pair in the image."""
-    degrees = {"type": "log", "tickformat": "~g"}
-    diagonal = {"x": [1e-4, 180], "y": [1e-4, 180], "mode": "lines", "hoverinfo": "skip"}
+    degrees = {"type": "log", "tickformat": "~g", "dtick": "D2"}
+    diagonal = {
+        "type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper",
+        "line": {"color": INK["quiet"], "width": 1, "dash": "dash"},
+    }  # fmt: skip
     versus = {
         "data": [
-            diagonal | {"line": {"color": INK["quiet"], "width": 1, "dash": "dash"}},
             {
                 "mode": "markers", "marker": {"size": 5, "color": INK["text"], "opacity": 0.5},
                 "hovertemplate": "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>",
             },
         ],
         "layout": {
-            "title": {"text": "Rotation error of each pair"}, "hovermode": "closest", "xaxis": degrees, "yaxis": degrees
+            "title": {"text": "Rotation error of each pair"}, "hovermode": "closest", "xaxis": degrees,
+            "yaxis": degrees | {"matches": "x"},  # so that the diagonal of the picture is x = y
+            "shapes": [diagonal],
         },
     }  # fmt: skip
     axes = {axis: {"title": {"text": direction}} for axis, direction in AXES_3D.items()}
@@ -56,7 +60,7 @@ def figures() -> dict[str, dict[str, Any]]:
         "layout": {
             "margin": dict.fromkeys("lrtb", 0), "hovermode": "closest",
             "scene": axes | {
-                "aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 0.9, "y": -1.5, "z": 0.7}}
+                "aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}
             },
         },
     }  # fmt: skip

@@ -100,7 +100,7 @@ function drawComparison() {
   const spread = pairs.filter((_, k) => k % Math.ceil((2 * pairs.length) / MOST) === 0);
   const drawn = pairs.length <= MOST ? pairs : [...[...pairs].sort((p, q) => gap(q) - gap(p)).slice(0, MOST / 2), ...spread];
   const figure = themed(DATA.figures.versus);
-  Object.assign(figure.data[1], { x: drawn.map(({ x }) => Math.max(x, 1e-4)), y: drawn.map(({ y }) => Math.max(y, 1e-4)),
+  Object.assign(figure.data[0], { x: drawn.map(({ x }) => Math.max(x, 1e-4)), y: drawn.map(({ y }) => Math.max(y, 1e-4)),
     text: drawn.map(({ id }) => id), customdata: drawn.map(({ i }) => i) });
   [figure.layout.xaxis, figure.layout.yaxis].forEach((axis, k) => { axis.title = { text: `${[a, b][k].name}, degrees` }; });
   draw("versus", figure);

@@ -106,7 +106,7 @@ function drawImage(view, camera) {
   draw("image", { data, layout }, { scrollZoom: true });
   const inside = ends.filter((p) => p && p[0] >= range[0][0] && p[0] <= range[0][1] && p[1] >= range[1][1] && p[1] <= range[1][0]);
   say("image", `○ ${view.points2d.length} image points, × ${inside.length} of ${ends.length} 3D points reprojected by ` +
-    `${camera?.name ?? "no pose"}; the others lie outside or behind the camera`, ". Dotted lines are wrong matches.");
+    `${camera?.name ?? "no pose"}${inside.length < ends.length ? "; the others lie outside or behind the camera" : ""}`, ". Dotted lines are wrong matches.");
 }
 
 // Point j of space and point i of the image, -1 for none.
