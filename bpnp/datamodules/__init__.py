@@ -15,16 +15,9 @@ if TYPE_CHECKING:
     from bpnp.datamodules.synthetic_maps.module import SfmSceneDataModule
 
 __all__ = [
-    "ColmapDataModule",
-    "MeshDataModule",
-    "Outliers",
-    "Pair",
-    "PairDataModule",
-    "PairSource",
-    "PreprocessedDataModule",
-    "SfmSceneDataModule",
-    "write_pairs",
-]
+    "ColmapDataModule", "MeshDataModule", "Outliers", "Pair", "PairDataModule", "PairSource", "PreprocessedDataModule",
+    "SfmSceneDataModule", "write_pairs",
+]  # fmt: skip
 
 __getattr__, __dir__ = lazy_names(
     __name__,
@@ -33,10 +26,7 @@ __getattr__, __dir__ = lazy_names(
         "bpnp.datamodules.colmap.module": ("ColmapDataModule",),
         "bpnp.datamodules.meshes.module": ("MeshDataModule",),
         "bpnp.datamodules.module": ("PairDataModule",),
-        "bpnp.datamodules.pair": (
-            "Pair",
-            "PairSource",
-        ),
+        "bpnp.datamodules.pair": ("Pair", "PairSource"),
         "bpnp.datamodules.released.module": ("PreprocessedDataModule",),
         "bpnp.datamodules.stored_pairs": ("write_pairs",),
         "bpnp.datamodules.synthetic_maps.module": ("SfmSceneDataModule",),

@@ -1,6 +1,7 @@
 """The data module of all sources: stages, loaders and the options that every source has."""
 
 from abc import abstractmethod
+from dataclasses import replace
 from typing import Any
 
 from lightning import LightningDataModule
@@ -57,15 +58,12 @@ class PairDataModule(LightningDataModule):
         self.batch_size = batch_size
         self.eval_batch_size = batch_size if eval_batch_size is None else eval_batch_size
         self.max_cells, self.num_workers, self.seed = max_cells, num_workers, seed
+        self.augmentations: dict[str, Augmentation] = {}  # of the parts, outliers apart; a child sets its own
         self.datasets: dict[str, PairDataset] = {}
 
     @abstractmethod
     def _source(self, part: str, seed: tuple[int, int]) -> PairSource | None:
         """The pairs of a part; None if there are none and the stage can do without them."""
-
-    def _augmentation(self, part: str) -> Augmentation:
-        """What is done to the pairs of a part."""
-        return Augmentation(outliers=self.outliers[part])
 
     def setup(self, stage: str | None = None) -> None:
         """Open the pairs of a stage (fit, validate, test, predict; none for all). Raises ValueError for bad data."""
@@ -73,7 +71,8 @@ class PairDataModule(LightningDataModule):
             seed = (self.seed, min(PARTS.index(part), PARTS.index("test")))  # prediction has the pairs of testing
             if (source := self._source(part, seed)) is not None:
                 fresh = self.fresh and part == "train"
-                self.datasets[part] = PairDataset(source, self._augmentation(part), seed=seed, fresh=fresh)
+                how = replace(self.augmentations.get(part, Augmentation()), outliers=self.outliers[part])
+                self.datasets[part] = PairDataset(source, how, seed=seed, fresh=fresh)
 
     def train_dataloader(self) -> DataLoader[Batch]:
         return self._loader("train")

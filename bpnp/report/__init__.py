@@ -16,72 +16,23 @@ if TYPE_CHECKING:
     from bpnp.report.training_log import TrainingLog, read_training_log
 
 __all__ = [
-    "PairRow",
-    "PairView",
-    "Results",
-    "TrainingLog",
-    "cause_shares",
-    "count_inliers",
-    "learning_table",
-    "plot_pair",
-    "read_results",
-    "read_training_log",
-    "read_views",
-    "recall_curve",
-    "recall_table",
-    "report",
-    "results_table",
-    "rows_from",
-    "save_figure",
-    "select_views",
-    "summarise",
-    "table",
-    "view_of",
-    "views_from",
-    "write_page",
-    "write_results",
-    "write_views",
-]
+    "PairRow", "PairView", "Results", "TrainingLog", "cause_shares", "count_inliers", "learning_table", "plot_pair",
+    "read_results", "read_training_log", "read_views", "recall_curve", "recall_table", "report", "results_table",
+    "rows_from", "save_figure", "select_views", "summarise", "table", "view_of", "views_from", "write_page",
+    "write_results", "write_views",
+]  # fmt: skip
 
 __getattr__, __dir__ = lazy_names(
     __name__,
     {
-        "bpnp.report.figures": (
-            "plot_pair",
-            "recall_curve",
-            "save_figure",
-        ),
-        "bpnp.report.folder": (
-            "read_results",
-            "write_results",
-        ),
+        "bpnp.report.figures": ("plot_pair", "recall_curve", "save_figure"),
+        "bpnp.report.folder": ("read_results", "write_results"),
         "bpnp.report.page.write": ("write_page",),
-        "bpnp.report.results": (
-            "PairRow",
-            "Results",
-            "cause_shares",
-            "count_inliers",
-            "rows_from",
-            "summarise",
-        ),
+        "bpnp.report.results": ("PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"),
         "bpnp.report.runs": ("table",),
-        "bpnp.report.samples": (
-            "PairView",
-            "read_views",
-            "select_views",
-            "views_from",
-            "write_views",
-        ),
+        "bpnp.report.samples": ("PairView", "read_views", "select_views", "views_from", "write_views"),
         "bpnp.report.solutions": ("view_of",),
-        "bpnp.report.tables.result_tables": (
-            "learning_table",
-            "recall_table",
-            "report",
-            "results_table",
-        ),
-        "bpnp.report.training_log": (
-            "TrainingLog",
-            "read_training_log",
-        ),
+        "bpnp.report.tables.result_tables": ("learning_table", "recall_table", "report", "results_table"),
+        "bpnp.report.training_log": ("TrainingLog", "read_training_log"),
     },
 )

@@ -70,8 +70,11 @@ class ColmapDataModule(PairDataModule):
         if not clutter < np.inf:
             raise ValueError(f"expected a finite `clutter`, got {clutter}; 0.5 adds half as many points")
         self.root, self.min_points, self.fresh = root, min_points, fresh_subsets
-        self.training = Augmentation(max_points, clutter, clutter_side, rotate)
-        self.evaluation = replace(self.training, max_points=eval_max_points)
+        training = Augmentation(max_points, clutter, clutter_side, rotate)
+        evaluation = replace(training, max_points=eval_max_points)
+        self.augmentations = {"train": training, "val": evaluation, "test": evaluation}
+        self.augmentations["predict"] = replace(evaluation, rotate=False)
+        self.clutter = clutter
         self._split = partial(
             split_scenes,
             train=_scene_list("train_scenes", train_scenes),
@@ -95,11 +98,10 @@ class ColmapDataModule(PairDataModule):
         self._store = open_store(self.root, PAIRS) if isinstance(self.root, str) and is_store(self.root) else None
         self._scenes = scene_rows(self._store) if self._store else find_scenes(self.root)
         self._parts = self._split(list(self._scenes))
-        clutter = self.training.clutter
-        if self._store and clutter > (kept := self._store.parameters.get("clutter", np.inf)):
+        if self._store and self.clutter > (kept := self._store.parameters.get("clutter", np.inf)):
             raise StoreError(
-                f"expected `clutter` of at most {kept}, what {self.root} was made with, got {clutter}; try that, or "
-                f"preparing again with --clutter {clutter}"
+                f"expected `clutter` of at most {kept}, what {self.root} was made with, got {self.clutter}; try that, "
+                f"or preparing again with --clutter {self.clutter}"
             )
         super().setup(stage)
         if stage is not None and STAGES[stage][0] not in self.datasets:
@@ -109,10 +111,6 @@ class ColmapDataModule(PairDataModule):
                 "*_scenes arguments, or other fractions"
             )
 
-    def _augmentation(self, part: str) -> Augmentation:
-        how = self.training if part == "train" else self.evaluation
-        return replace(how, rotate=how.rotate and part != "predict", outliers=self.outliers[part])
-
     def _source(self, part: str, seed: tuple[int, int]) -> PairSource | None:
         """The pairs of a part's scenes; None if it has no scenes."""
         scenes = [self._scenes[scene] for scene in self._parts["test" if part == "predict" else part]]
@@ -121,8 +119,7 @@ class ColmapDataModule(PairDataModule):
         if self._store is not None:
             return StoredPairs(self._store, np.sort(np.concatenate(scenes)), min_points=self.min_points)
         models = {name: folder for models in scenes for name, folder in models.items()}
-        clutter = self.training.clutter
-        return ColmapSource(self._models(models), min_points=self.min_points, clutter=clutter, seed=seed)
+        return ColmapSource(self._models(models), min_points=self.min_points, clutter=self.clutter, seed=seed)
 
     def _models(self, folders: Mapping[str, Path]) -> list[Reconstruction]:
         found, failures = [], []

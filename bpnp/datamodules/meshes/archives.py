@@ -5,7 +5,7 @@ import re
 import zipfile
 import zlib
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.meshes.surfaces import (
     SUFFIXES,
+    Mesh,
     MeshError,
     Normalisation,
     normalise,
     parse_mesh,
     read_mesh,
     sample_surface,
-)
+)  # fmt: skip
 from bpnp.files import files_as_they_are, fingerprint
 
 SPLITS = ("train", "test")
@@ -50,61 +51,42 @@ class MeshArchive(Protocol):
 
 @dataclass(frozen=True)
 class MeshFiles:
-    """Mesh files, in a folder or (`archive`) in a zip: `entries` gives the path of each name."""
+    """Meshes in files: each in its own (`place` None), as an entry of a zip, or as a row of an HDF5 file of sampled
+    points (``modelnet40_ply_hdf5_2048``). places: (file, place) of each name."""
 
-    entries: dict[str, str]
-    archive: Path | None = None
+    places: dict[str, tuple[Path, str | int | None]]
 
     @property
     def names(self) -> Sequence[str]:
-        return list(self.entries)
+        return list(self.places)
 
     @property
     def identity(self) -> str:
-        files = map(Path, self.entries.values()) if self.archive is None else [self.archive]
-        return fingerprint([self.names, files_as_they_are(files)])
+        return fingerprint([self.names, files_as_they_are(dict.fromkeys(path for path, _ in self.places.values()))])
 
     def part(self, start: int, stop: int) -> "MeshFiles":
-        return replace(self, entries=dict(list(self.entries.items())[start:stop]))
+        return MeshFiles(dict(list(self.places.items())[start:stop]))
 
     def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
-        mesh = read_mesh(Path(self.entries[name])) if self.archive is None else self._packed(name)
-        rng = np.random.default_rng(zlib.crc32(name.encode()))
+        (path, place), rng = self.places[name], np.random.default_rng(zlib.crc32(name.encode()))
+        if isinstance(place, int):
+            return normalise(rng.permutation(_sampled(path, place, count))[:count], mode)
+        mesh = read_mesh(path) if place is None else _packed(path, place)
         return normalise(sample_surface(mesh, count, rng), mode)
 
-    def _packed(self, name: str) -> Any:
-        assert self.archive is not None
-        entry = self.entries[name]
-        try:
-            return parse_mesh(_open(self.archive).read(entry), Path(entry).suffix)
-        except (MeshError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
-            raise MeshError(f"{self.archive}/{entry}: {error}") from error
+
+def _packed(archive: Path, entry: str) -> Mesh:
+    try:
+        return parse_mesh(_open(archive).read(entry), Path(entry).suffix)
+    except (MeshError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+        raise MeshError(f"{archive}/{entry}: {error}") from error
 
 
-@dataclass(frozen=True)
-class SampledFiles:
-    """HDF5 files of sampled points (``modelnet40_ply_hdf5_2048``): `rows` gives the file and the row of each name."""
-
-    rows: dict[str, tuple[Path, int]]
-
-    @property
-    def names(self) -> Sequence[str]:
-        return list(self.rows)
-
-    @property
-    def identity(self) -> str:
-        return fingerprint([self.names, files_as_they_are(sorted({path for path, _ in self.rows.values()}))])
-
-    def part(self, start: int, stop: int) -> "SampledFiles":
-        return SampledFiles(dict(list(self.rows.items())[start:stop]))
-
-    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
-        path, row = self.rows[name]
-        points = np.asarray(_open(path)["data"][row], np.float64)
-        if points.shape[0] < count or points.shape[1:] != (3,) or not np.isfinite(points).all():
-            raise MeshError(f"{path}: expected {count} finite points, got shape {points.shape} in row {row}")
-        rng = np.random.default_rng(zlib.crc32(name.encode()))
-        return normalise(rng.permutation(points)[:count], mode)
+def _sampled(path: Path, row: int, count: int) -> NDArray[np.float64]:
+    points = np.asarray(_open(path)["data"][row], np.float64)
+    if points.shape[0] < count or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise MeshError(f"{path}: expected {count} finite points, got shape {points.shape} in row {row}")
+    return points
 
 
 def open_archive(source: Path) -> MeshArchive:
@@ -121,7 +103,7 @@ def open_archive(source: Path) -> MeshArchive:
         if list(folder.glob("ply_data_*.h5")):
             return _sampled_archive(folder)
         if entries := _named(str(path) for path in folder.glob("*/*/*") if path.is_file()):
-            return MeshFiles(entries)
+            return MeshFiles({name: (Path(entry), None) for name, entry in entries.items()})
     raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
 
 
@@ -140,15 +122,15 @@ def _zip_archive(path: Path) -> MeshFiles:
         raise ValueError(f"expected a zip of meshes, got {path} ({error}); try downloading it again") from error
     if not entries:
         raise ValueError(f"expected meshes {LAYOUT} in {path}, got none; try ModelNet40.zip")
-    return MeshFiles(entries, archive=path)
+    return MeshFiles({name: (path, entry) for name, entry in entries.items()})
 
 
-def _sampled_archive(folder: Path) -> SampledFiles:
+def _sampled_archive(folder: Path) -> MeshFiles:
     shapes = folder / "shape_names.txt"
     if not shapes.is_file():
         raise ValueError(f"expected {shapes} beside the HDF5 files, got none; try unpacking the archive again")
     classes = shapes.read_text(encoding="utf-8").split()
-    rows: dict[str, tuple[Path, int]] = {}
+    rows: dict[str, tuple[Path, str | int | None]] = {}
     for split in SPLITS:
         for path in sorted(folder.glob(f"ply_data_{split}*.h5")):
             try:
@@ -163,7 +145,7 @@ def _sampled_archive(folder: Path) -> SampledFiles:
             if data.ndim != 3 or len(data) != len(names):
                 raise ValueError(f"expected a label for each shape, got {len(names)} for {data.shape} in {path}")
             rows |= {name: (path, row) for row, name in enumerate(names)}
-    return SampledFiles(rows)
+    return MeshFiles(rows)
 
 
 def _open(path: Path) -> Any:

@@ -50,20 +50,13 @@ class PreprocessedDataModule(PairDataModule):
         self.root, self.dataset, self.cache_dir = Path(root), dataset, cache_dir
         self._pairs: Store | None = None
         self.val_fraction, self.min_points, self.fresh = val_fraction, min_points, fresh_subsets
-        self.max_points, self.eval_max_points, self.rotate = max_points, eval_max_points, rotate
+        evaluation = Augmentation(eval_max_points, clutter=0.0)
+        self.augmentations = dict.fromkeys(("val", "test", "predict"), evaluation)
+        self.augmentations["train"] = Augmentation(max_points, clutter=0.0, rotate=rotate)
 
     def prepare_data(self) -> None:
         """Convert in one process, for `setup` to open in all."""
         self._store()
-
-    def _augmentation(self, part: str) -> Augmentation:
-        training = part == "train"
-        return Augmentation(
-            max_points=self.max_points if training else self.eval_max_points,
-            clutter=0.0,
-            rotate=self.rotate and training,
-            outliers=self.outliers[part],
-        )
 
     def _source(self, part: str, seed: tuple[int, int]) -> StoredPairs:
         store = self._store()

@@ -8,7 +8,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from bpnp.datamodules.augment import Augmentation, Drawn
-from bpnp.datamodules.module import PairDataModule
+from bpnp.datamodules.module import PARTS, PairDataModule
 from bpnp.datamodules.pair import Counts, stacked
 from bpnp.datamodules.synthetic_maps.maps import WEIGHTS, MapOptions, draw_map_pair
 from bpnp.types import Batch
@@ -104,10 +104,8 @@ class SfmSceneDataModule(PairDataModule):
             noise_px=noise_px,
         )
         self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
-        self.fresh, self.turned = fresh_views, frame == "any"
-
-    def _augmentation(self, part: str) -> Augmentation:
-        return Augmentation(rotate=self.turned, outliers=self.outliers[part])
+        self.fresh = fresh_views
+        self.augmentations = dict.fromkeys(PARTS, Augmentation(rotate=frame == "any"))
 
     def _source(self, part: str, seed: tuple[int, int]) -> MapSource:
         split = "test" if part == "predict" else part

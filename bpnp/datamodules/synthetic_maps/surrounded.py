@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bpnp.datamodules.synthetic_maps.scene import Scene, Surface, Viewpoint, Walls, assembled, directions, joined
+from bpnp.datamodules.synthetic_maps.scene import Array, Scene, Surface, Viewpoint, Walls, assembled, directions, joined
 from bpnp.datamodules.synthetic_maps.surroundings import ground_points, horizon_points, tree_points
 from bpnp.datamodules.synthetic_maps.walls import before, box_walls, wall_points
 
@@ -32,19 +32,9 @@ def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
     walls = joined([*sides, box_walls(parked, half_size, np.zeros(cars), np.full(cars, 1.5), cell=0.8, weight=3.0)])
     where = np.array([length * rng.uniform(0.05, 0.7), rng.uniform(-0.8, 0.8) * across, rng.uniform(*EYE)])
     view = _walk(where, rng.choice([0.0, np.pi]) + rng.normal(0, 0.5), 0.08 * rng.standard_normal(), rng)
-    on_trees, on_ground, far = (rng.uniform([0.02, 0.03, 0.0], [0.25, 0.2, 0.35]) * count).astype(int).tolist()
-    low, high = np.array([0.0, -across]), np.array([length, across])
-    scene = assembled(
-        [
-            wall_points(before(walls, view), count - on_trees - on_ground - far, rng),
-            tree_points(np.array([*low, 1.5]), np.array([*high, 6.0]), on_trees, rng),
-            ground_points(low, high, on_ground, rng),
-            horizon_points(np.zeros(3), 80.0, far, rng),
-        ],
-        rng,
-        walls=walls,
-    )
-    return scene, view
+    shares = rng.uniform([0.02, 0.03, 0.0], [0.25, 0.2, 0.35])
+    ground = np.array([[0.0, -across], [length, across]])
+    return _outdoors(walls, view, count, shares, ground, np.c_[ground, [1.5, 6.0]], 80.0, rng), view
 
 
 def courtyard(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
@@ -54,18 +44,9 @@ def courtyard(count: int, half: float, rng: np.random.Generator) -> tuple[Scene,
     walls = box_walls(np.zeros((1, 2)), size, np.zeros(1), rng.uniform(5, 16, 1), inwards=True)
     where = np.array([*(rng.uniform(-0.85, 0.85, 2) * size[0]), rng.uniform(*EYE)])
     view = _walk(where, rng.uniform(0, 2 * np.pi), rng.normal(0.1, 0.1), rng)
-    on_trees, on_ground, far = (rng.uniform([0.0, 0.03, 0.0], [0.2, 0.25, 0.05]) * count).astype(int).tolist()
-    scene = assembled(
-        [
-            wall_points(before(walls, view), count - on_trees - on_ground - far, rng),
-            tree_points(np.array([*-0.7 * size[0], 1.0]), np.array([*0.7 * size[0], 5.0]), on_trees, rng),
-            ground_points(-size[0], size[0], on_ground, rng),
-            horizon_points(np.zeros(3), 60.0, far, rng),
-        ],
-        rng,
-        walls=walls,
-    )
-    return scene, view
+    shares = rng.uniform([0.0, 0.03, 0.0], [0.2, 0.25, 0.05])
+    ground = np.concatenate([-size, size])
+    return _outdoors(walls, view, count, shares, ground, np.c_[0.7 * ground, [1.0, 5.0]], 60.0, rng), view
 
 
 def interior(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
@@ -108,6 +89,24 @@ def interior(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, 
 def without(walls: Walls, wall: int) -> Walls:
     """All walls but one."""
     return Walls(*(np.delete(field, wall, 0) for field in walls))
+
+
+def _outdoors(
+    walls: Walls, view: Viewpoint, count: int, shares: Array, ground: Array, trees: Array, away: float,
+    rng: np.random.Generator,
+) -> Scene:  # fmt: skip
+    """`count` points: `shares` (3,) of them on trees, on the ground and `away` metres or more, the others on the walls.
+
+    ground, trees: lowest and highest corner of the rectangle (2, 2) and of the box (2, 3) that they fill.
+    """
+    on_trees, on_ground, far = (shares * count).astype(int).tolist()
+    surfaces = [
+        wall_points(before(walls, view), count - on_trees - on_ground - far, rng),
+        tree_points(trees[0], trees[1], on_trees, rng),
+        ground_points(ground[0], ground[1], on_ground, rng),
+        horizon_points(np.zeros(3), away, far, rng),
+    ]
+    return assembled(surfaces, rng, walls=walls)
 
 
 def _walk(
