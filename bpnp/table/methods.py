@@ -11,6 +11,7 @@ from torch import nn
 
 from bpnp.configs import packaged_config
 from bpnp.models import TrainedNet
+from bpnp.models.weights import checkpoint_path
 from bpnp.table.pairs import build
 
 SHORT_NAMES = {
@@ -75,14 +76,12 @@ def _parse(text: str, time_limit: float | None) -> Method:
     label, equals, what = text.partition("=")
     what = what if equals else text
     what, at, checkpoint = what.partition("@")
-    if at and not Path(checkpoint).is_file():
-        raise FileNotFoundError(f"expected a checkpoint after @ in {text!r}, got no file {checkpoint}")
     class_path, init_args = _solver(what, text)
     return Method(
         label=label if equals else Path(what).stem if what.endswith(".yaml") else what.rpartition(".")[2],
         class_path=class_path,
         init_args=init_args,
-        checkpoint=checkpoint if at else None,
+        checkpoint=str(checkpoint_path(checkpoint)) if at else None,
         time_limit=time_limit,
     )
 

@@ -10,6 +10,7 @@ from small_data import small_net
 
 from bpnp.cli import main
 from bpnp.files import claimed
+from bpnp.models import Matcher
 from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_results, read_views
 from bpnp.report.folder import append_rows, finished_rows
@@ -183,7 +184,7 @@ def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> Non
     [
         (["--methods", "nonsense"], "expected a method among softposit, ransac"),
         (["--methods", "ransac", "ransac"], "expected a label for each method"),
-        (["--methods", "bpnpnet@nothing.ckpt"], "got no file nothing.ckpt"),
+        (["--methods", "bpnpnet@nothing.ckpt"], "got no file at nothing.ckpt"),
         (["--methods", "bpnp.models.baselines.Nothing"], "bpnp.models.baselines.Nothing"),
         (["--data.nonsense=3"], "nonsense"),
         (["--seed=3"], "nrecognized arguments: --seed=3"),
@@ -248,3 +249,9 @@ def test_every_short_name_can_be_built(name: str, limited: bool) -> None:
     assert not solver.training
     assert len(solver.estimates) >= 1
     assert getattr(solver, "time_limit", None) == (2.5 if limited else None)
+
+
+def test_packaged_weights_are_a_checkpoint_by_name() -> None:
+    (method,) = parse_methods(["matcher@matcher-clutter"])
+    weights = Matcher.from_pretrained("matcher-clutter").state_dict()
+    assert all(torch.equal(value, weights[name]) for name, value in method.build().state_dict().items())
