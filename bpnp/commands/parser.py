@@ -21,6 +21,7 @@ class OneLineParser(ArgumentParser):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self.kinds: dict[str, str] = {}  # by parameter, what its value has to be
+        self.words: dict[str, tuple[Any, ...]] = {}  # and the types of its words, see `_words`
         super().__init__(*args, **kwargs)
 
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
@@ -46,11 +47,12 @@ def run_command(name: str, command: Callable[..., None], arguments: Sequence[str
     extra: dict[str, Any] = {}
     if OVERRIDES in inspect.signature(command).parameters:
         given, extra = _without_overrides(given)
-    chosen = parser.parse_args(given)
-    command(**{key: value for key, value in vars(chosen).items() if not key.startswith("__")}, **extra)
+    chosen = {key: value for key, value in vars(parser.parse_args(given)).items() if not key.startswith("__")}
+    tuples = [key for key, words in parser.words.items() if words and words[-1] is not ... and chosen[key] is not None]
+    command(**chosen | {key: tuple(chosen[key]) for key in tuples}, **extra)
 
 
-def command_parser(name: str, command: Callable[..., None]) -> ArgumentParser:
+def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
     """The parser of a function, its help from the docstring.
 
     A list takes several words, a tuple as many as it has; a bool is a flag without a value; anything else is read as
@@ -69,7 +71,7 @@ def command_parser(name: str, command: Callable[..., None]) -> ArgumentParser:
         option = parameter.kind is parameter.KEYWORD_ONLY
         required = parameter.default is parameter.empty
         kind = hints[parameter.name]
-        words = _words(kind)
+        words = parser.words[parameter.name] = _words(kind)
         settings: dict[str, Any] = {"help": help_of.get(parameter.name)}
         if kind is bool:
             settings |= {"action": "store_true"}

@@ -19,8 +19,8 @@ from bpnp.datamodules.keyed_random import row_keys
 from bpnp.localization.localized import Localized, images_text, localized
 from bpnp.localization.solved import write_text
 from bpnp.report.figures import save_figure
-from bpnp.report.photos import PhotoFinder
-from bpnp.report.pictures import picture_box, solution_picture
+from bpnp.report.photos import PhotoFinder, picture_box
+from bpnp.report.pictures import solution_picture
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
 from bpnp.types import Batch

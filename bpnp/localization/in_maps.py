@@ -10,6 +10,7 @@ from typing import Any
 from rich.text import Text
 from scipy.spatial.transform import Rotation
 
+from bpnp.cameras import Lens, camera_from
 from bpnp.localization.solved import write_text
 from bpnp.maps.colmap_database import is_database, read_database
 from bpnp.maps.keypoints import Keypoints, detected_keypoints, read_features
@@ -56,6 +57,12 @@ def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOption
     if options.leave_one_out:
         scene = scene.without([name])
     camera = camera_from_exif(photo) if options.camera is None else options.camera
+    lens = camera_from(camera)
+    if options.features is None and isinstance(lens, Lens) and 0 < lens.camera.width != size[0]:
+        raise ValueError(
+            f"expected photos of {lens.camera.width} x {lens.camera.height} pixels as --camera says, got {name} of "
+            f"{size[0]} x {size[1]}; try a camera with the focal length and the centre of this size"
+        )
     found = detected_keypoints(photo) if options.features is None else _read_keypoints(options.features, name, size)
     views = None if options.pairs is None else options.pairs.get(name)
     if options.pairs is not None and not views:

@@ -25,11 +25,19 @@ class Box(NamedTuple):
 PhotoFinder = Callable[[str, Box], Array | None]  # (id of a pair, box) to (h, w, 3) uint8 that fills the box, or None
 
 
-def box_of(view: PairView) -> Box:
-    """What the image points of a pair span, and a little more."""
-    low, high = view.points2d.min(0).astype(float), view.points2d.max(0).astype(float)
+def picture_box(points2d: Array) -> Box:
+    """What image points (m, 2) span, and a little more. Raises ValueError if none is finite, in front of the camera."""
+    seen = points2d[np.isfinite(points2d).all(-1)].astype(float)
+    if not len(seen):
+        raise ValueError("expected image points in front of the camera to draw, got none")
+    low, high = seen.min(0), seen.max(0)
     margin = MARGIN * np.maximum(high - low, 1e-6)
     return Box(*(low - margin).tolist(), *(high + margin).tolist())
+
+
+def box_of(view: PairView) -> Box:
+    """The `picture_box` of a pair."""
+    return picture_box(view.points2d)
 
 
 def jpeg(photo: Array, *, quality: int = 70) -> bytes:

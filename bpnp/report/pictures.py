@@ -8,7 +8,7 @@ import numpy as np
 
 from bpnp.cameras import Camera, in_front
 from bpnp.report.palette import LIGHT, QUIET
-from bpnp.report.photos import MARGIN, Box
+from bpnp.report.photos import Box, picture_box
 from bpnp.report.samples import Array
 
 if TYPE_CHECKING:
@@ -18,19 +18,6 @@ if TYPE_CHECKING:
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches
 LINE = 130  # characters
-
-
-def picture_box(points2d: Array) -> Box:
-    """What the image points span, and a little more; the photo of `solution_picture` fills it.
-
-    Raises ValueError if no point is in front of the camera.
-    """
-    seen = points2d[np.isfinite(points2d).all(-1)].astype(float)
-    if not len(seen):
-        raise ValueError("expected image points in front of the camera to draw, got none")
-    low, high = seen.min(0), seen.max(0)
-    margin = MARGIN * np.maximum(high - low, 1e-6)
-    return Box(*(low - margin).tolist(), *(high + margin).tolist())
 
 
 def read_photo(path: Path | str) -> Array:

@@ -84,6 +84,8 @@ def test_bad_input_is_one_clear_error(
     assert "a.jpg, which does not exist" in failing(capsys, str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
     assert "focal length in the EXIF data" in failing(capsys, str(model), str(tmp_path / "plain.jpg"), *out)
+    error = failing(capsys, str(model), str(tmp_path / "plain.jpg"), "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out)
+    assert "expected photos of 128 x 96 pixels as --camera says, got plain.jpg of 64 x 48" in error
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")
     error = failing(
