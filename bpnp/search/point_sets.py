@@ -67,10 +67,14 @@ class PointSets:
         return same_pose(rotation, middle, 0, degrees, share * float(np.linalg.norm(middle[0])))
 
     @property
+    def knows_rotation(self) -> bool:
+        """Whether a prior tells the rotation to 5 degrees: a half turn then has 10^3.5 times the false alarms."""
+        return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
+
+    @property
     def pairs_that_fix(self) -> int:
         """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
-        turned = isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
-        return 2 if turned or isinstance(self.prior, GravityPrior) else 3
+        return 2 if self.knows_rotation or isinstance(self.prior, GravityPrior) else 3
 
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.

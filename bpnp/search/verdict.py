@@ -61,6 +61,8 @@ def with_false_alarms(candidates: Candidates, sets: PointSets) -> Candidates:
     """The candidates, in the user's coordinates, with their false alarms; those that have them already keep them."""
     alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
     new = np.isnan(alarms)
+    if not new.any():
+        return candidates
     unknown = candidates[new]
     alarms[new], rough[new] = alarms_of(sets, unknown.rotation, unknown.translation, unknown.scale)
     return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)

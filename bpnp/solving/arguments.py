@@ -13,6 +13,7 @@ from bpnp.cameras import Camera, camera_from
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
+ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
 EXPECTED = "expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned'"
 
 
@@ -92,13 +93,16 @@ def checked_prior(given: Any) -> Prior | None:
         return _checked_net(given)
     if isinstance(given, PosePrior):
         rotation = _array("prior.rotation", given.rotation, (3, 3))
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(rotation) < 0:
+        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
+        if off > 1e-3 or np.linalg.det(rotation) < 0:
             raise ValueError(f"expected a rotation in `prior.rotation`, got {rotation.tolist()}")
         shift = None if given.translation is None else _array("prior.translation", given.translation, (3,))
         for name in ("rotation_sigma_deg", "translation_sigma"):
             if not getattr(given, name) > 0:
                 raise ValueError(f"expected a positive `prior.{name}`, got {getattr(given, name)}")
-        return given._replace(rotation=Rotation.from_matrix(rotation).as_matrix(), translation=shift)
+        if off > ROUNDING:
+            rotation = Rotation.from_matrix(rotation).as_matrix()
+        return given._replace(rotation=rotation, translation=shift)
     if isinstance(given, GravityPrior):
         camera = _array("prior.up_camera", given.up_camera, (3,))
         scene = _array("prior.up_scene", given.up_scene, (3,))

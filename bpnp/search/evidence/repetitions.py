@@ -29,7 +29,8 @@ def repeated_poses(
     """Poses (c, 3, 3), (c, 3) that see other scene points where this one sees those that have a partner in the image.
 
     If a motion p -> Q p + d takes these points onto other scene points, the pose (R Q^T, t - R Q^T d) sees the latter
-    in the same directions. Q: none, half turns about the axes of the points, and quarter turns where they repeat. d:
+    in the same directions. Q: none and, unless a prior excludes them, half turns about the axes of the points, and
+    quarter turns where they repeat. d:
     from one of three points in their middle to any of the 4096 nearest scene points. scale: of the residuals, radians.
     Only poses that a verdict takes for different from this one (`Evidence.other_deg`), the four with the fewest false
     alarms; and whether there are so few motions that these stand for all.
@@ -55,11 +56,11 @@ def repeated_poses(
     tolerance = NEAR * scale * float(np.median(depth[matched]))
     own = points[matched]
     own = own[np.argsort(np.linalg.norm(own - np.median(own, 0), axis=-1), kind="stable")]
-    own = np.concatenate([own[:REFERENCES], own[np.linspace(REFERENCES, len(own) - 1, MOST).astype(int)]])
-    own = own[np.sort(np.unique(own, axis=0, return_index=True)[1])]
+    own = own[np.unique(np.r_[:REFERENCES, np.linspace(REFERENCES, len(own) - 1, MOST).astype(int)])]
     tree = cKDTree(points)
     found = [(share, np.eye(3), shift) for share, shift in _shifts(tree, own, np.eye(3), tolerance)]
-    for turn in _turns(own, found[0][2] if found else None):
+    turns = [] if sets.knows_rotation else _turns(own, found[0][2] if found else None)
+    for turn in turns:
         found += [(share, turn, shift) for share, shift in _shifts(tree, own, turn, tolerance)]
     found = sorted(found, key=lambda motion: -motion[0])
     if not found:
@@ -146,6 +147,8 @@ def _shifts(tree: "cKDTree[None]", points: Array, turn: Array, tolerance: float)
     some = turned[np.linspace(0, len(turned) - 1, FIRST).astype(int)]
     share = _lying_on(tree, some, shifts, tolerance)
     shifts = shifts[np.argsort(-share, kind="stable")[: min(CONFIRMED, int((share >= SHARE).sum()))]]
+    if not len(shifts):
+        return []
     shifts = _apart(shifts, tolerance)
     share = _lying_on(tree, turned, shifts, tolerance)
     return [(float(share[k]), shifts[k]) for k in np.argsort(-share, kind="stable") if share[k] >= SHARE]
