@@ -22,8 +22,9 @@ from bpnp.solving.sources import Options, solutions_of
 MOST_KEYPOINTS = (
     2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
 )
-BRIEF = replace(DEFAULT, max_batches=2)  # one batch that is looked up, one that is annealed on clusters
-LONGER = replace(DEFAULT, max_batches=10)
+# The view's pose is the one to look near, not the best pose of a view that was tried in vain.
+BRIEF = replace(DEFAULT, max_batches=1, beside=())  # one batch that is looked up
+LONGER = replace(DEFAULT, max_batches=8, beside=())  # four of each kind, as many as a doubtful pose has to be found by
 PROMISING = 3  # views that are tried longer if none is confident
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
@@ -43,13 +44,14 @@ def localize(
 
     keypoints: (m, 2) pixels. camera: as for `bpnp.solve`.
     views: names of views of the map that may show the same place, best first, from any image retrieval (`read_pairs`
-        reads hloc's); None to try views of the whole map, those first that together see most of it.
+        reads hloc's): the points that any of them sees are used near each; None to try the points of one view of the
+        whole map after the other, those first that together see most of it.
     scores: (m,) strength of the keypoints; the strongest are used first.
     prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
     time_limit: seconds for all views together, after which no search begins; None for no limit.
 
-    Each view's points are tried briefly until a pose is confident, then the most promising ones longer; else the pose
-    with the fewest false alarms is returned. `solution.view` is the view whose points gave the pose.
+    Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the pose
+    with the fewest false alarms is returned. `solution.view` is the view near which it was found.
     `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
     with the ids `solution.point_ids` are the points that were tried.
     Raises ValueError for unknown views and for input that `bpnp.solve` refuses.

@@ -16,24 +16,29 @@ VIEW_SHARE = 0.12  # the same of the shift of what they look at, in distances to
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """Points of the map, by their places in `points3d`, that one view, or several, see; `view` has the most of them."""
+    """Points of the map, by their places in `points3d`, that one view, or several, see, and the view to look near."""
 
     view: View
     points: NDArray[np.int32]
 
     def prior(self, scene: ViewedPoints) -> PosePrior:
         """The view's pose, as wide as photos of one place lie apart."""
-        camera = scene.points3d[self.points] @ self.view.rotation.T + self.view.translation
+        camera = scene.points3d[self.view.points] @ self.view.rotation.T + self.view.translation
         distance = float(np.median(np.linalg.norm(camera, axis=-1)))
         return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * distance)
 
 
 def regions_of_views(scene: ViewedPoints, names: Iterable[str]) -> list[Region]:
-    """One region for each view, in the order given. Raises ValueError for unknown names, or if there is none."""
+    """The points that any of these views sees, near each of them in the order given.
+
+    All of them at once, since they show one place: a pose near one view sees points that only others see.
+    Raises ValueError for unknown names, or if there is none.
+    """
     views = scene.named(names)
     if not views:
         raise ValueError("expected names of views to try, got none; try views=None for all of the map")
-    return [Region(view, view.points) for view in views if len(view.points)]
+    points = np.unique(np.concatenate([view.points for view in views]))
+    return [Region(view, points) for view in views if len(view.points)]
 
 
 def covering_regions(scene: ViewedPoints) -> Iterator[Region]:

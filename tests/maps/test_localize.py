@@ -49,6 +49,15 @@ def test_a_photo_near_a_given_view(planted: tuple[SceneMap, Planted]) -> None:
     assert solution.verdict == "confident"
 
 
+def test_the_points_of_all_given_views_are_used_at_once(planted: tuple[SceneMap, Planted]) -> None:
+    scene, truth = planted
+    keypoints, ids = photo_of(truth, 1)
+    solution = scene.localize(keypoints, CAMERA, views=["photo 0.jpg", "photo 1.jpg"])
+    assert solution.verdict == "confident"
+    assert_right(solution, truth, 1, ids)
+    np.testing.assert_array_equal(solution.point_ids, np.union1d(truth.seen[0], truth.seen[1]) + 1)
+
+
 def test_a_photo_somewhere_in_the_map(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, ids = photo_of(truth, 2)

@@ -75,6 +75,9 @@ def test_views_are_found_by_their_names(planted: tuple[Path, Planted]) -> None:
     assert [region.view.name for region in regions_of_views(scene, ["photo 2.jpg", "photo 0.jpg"])] == [
         "photo 2.jpg", "photo 0.jpg",
     ]  # fmt: skip
+    shown = np.union1d(scene.views[2].points, scene.views[0].points)
+    for region in regions_of_views(scene, ["photo 2.jpg", "photo 0.jpg"]):
+        np.testing.assert_array_equal(region.points, shown)
     with pytest.raises(ValueError, match=r"expected names of views of the map, got a\.jpg; try photo 0\.jpg"):
         regions_of_views(scene, ["photo 0.jpg", "a.jpg"])
     with pytest.raises(ValueError, match="got none; try views=None"):
