@@ -24,12 +24,12 @@ from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, sce
 from bpnp import PosePrior, solve
 from bpnp.cameras import camera_from
 from bpnp.maps.localize import localize
+from bpnp.maps.regions import VIEW_DEGREES, VIEW_SHARE
 from bpnp.models import TrainedNet
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
 
 AUC_PX = (1.0, 5.0, 10.0)
-VIEW_DEGREES, VIEW_SHARE = 12.0, 0.12  # how far a photo is from a view that shares a third of its points
 ROUGH_DEGREES, ROUGH_SHARE, ROUGH_SECONDS = 4.0, 0.04, 2.0
 KNOWN: set[str] = {"cones", "tracks"}  # what `solve`, `view-prior` and `rough-prior` are told of the points
 Answer = tuple[Array, Array, str]  # rotation, translation, verdict

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from bpnp.maps.views import View, ViewedPoints
 from bpnp.search.starts import PosePrior
 
-VIEW_DEGREES = 12.0  # root mean square angle per axis between photos that share a third of their points
-VIEW_SHARE = 0.12  # the same of the shift of what they look at, in distances to it
+VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which one sees a third of the other's points
+VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
 
 
 @dataclass(frozen=True, eq=False)
