@@ -1,4 +1,4 @@
-"""`bpnp localize`: new photos in a map, or the images of a COLMAP model as if nobody knew where they were taken."""
+"""`bpnp localize`: new photos in a map, or the images of a COLMAP model as if their poses were unknown."""
 
 from functools import partial
 from pathlib import Path
@@ -36,7 +36,7 @@ def localize(
     """Find where photos were taken in a map, or solve the images of a COLMAP model as if their poses were unknown.
 
     MAP PHOTO... writes solutions/<photo>.json, pictures/<photo>.png and poses.txt (confident poses in the frame of the
-    map); a run that was interrupted goes on. --model instead turns the scene at random, so that nothing of a pose
+    map); an interrupted run resumes. --model instead turns the scene at random, so that nothing of a pose
     leaks into its search, compares with the model and writes results.json, images.txt and pictures/<image>.png.
 
     Args:

@@ -22,7 +22,7 @@ def prepare_modelnet40(
     normalisation: Literal["unit_sphere", "unit_cube", "none"] = "unit_sphere",
     processes: int = PROCESSES,
 ) -> None:
-    """Pack ModelNet40, or any folder or zip of meshes in its layout. A run that was killed goes on where it was.
+    """Pack ModelNet40, or any folder or zip of meshes in its layout. A run that was killed resumes.
 
     Args:
         source: ModelNet40.zip, its folder, or the folder of ply_data_*.h5.
@@ -46,7 +46,7 @@ def prepare_megadepth(
     clutter: float = 0.0,
     processes: int = PROCESSES,
 ) -> None:
-    """Pack MegaDepth, or any folder of COLMAP models. A run that was killed goes on where it was.
+    """Pack MegaDepth, or any folder of COLMAP models. A run that was killed resumes.
 
     Args:
         source: the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin.

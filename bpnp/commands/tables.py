@@ -33,7 +33,7 @@ def table(
 ) -> None:
     """Test several methods on the same pairs and print the paper's table.
 
-    Started again, it goes on where it was; a longer --limit adds to what is there. `--data.NAME=VALUE` overrides the
+    Started again, it resumes; a longer --limit adds to what is there. `--data.NAME=VALUE` overrides the
     recipe's data.
 
     Args:

@@ -51,7 +51,7 @@ class Recipe:
 
 
 def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
-    """The store `output`, made unless it is there already. A run that was stopped goes on after its finished parts.
+    """The store `output`, made unless it is there already. A run that was stopped resumes after its finished parts.
 
     Raises StoreError if `output` is something else or was made with other parameters, or if no part gives a row;
     ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.

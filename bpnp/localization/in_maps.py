@@ -1,4 +1,4 @@
-"""Photos localised in a map, one after the other, into a folder from which an interrupted run goes on."""
+"""Photos localised in a map, one after the other, into a folder; an interrupted run resumes."""
 
 import json
 import re

@@ -1,4 +1,4 @@
-"""Progress of work that may be over before anyone wonders: shown after two seconds, on stderr."""
+"""A progress line on stderr, shown for work that takes longer than two seconds."""
 
 import threading
 from types import TracebackType

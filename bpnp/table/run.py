@@ -1,6 +1,6 @@
 """A table is a loop over `test`: methods in turns, some pairs at a time, in one process or several of one thread.
 
-What is finished is in the results folders, pair by pair, whatever ends the process.
+Finished pairs are in the results folders at once, so that a run that is stopped or killed loses none of them.
 """
 
 import json

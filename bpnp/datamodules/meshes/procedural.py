@@ -1,4 +1,4 @@
-"""Procedural shapes: as many meshes as one likes, without a download."""
+"""Procedural shapes: any number of random meshes, without a download."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""Maps without a download: as many scenes, photos and maps as one likes."""
+"""Synthetic maps: any number of random scenes with photos and their sparse maps, without a download."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal
