@@ -27,7 +27,7 @@ def localize(
     clutter: float = 0.25,
     output: Path = Path("runs/localize"),
     no_pictures: bool = False,
-    solver: str = "search",
+    solver: str = "auto",
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
     seed: int = 0,
@@ -53,7 +53,8 @@ def localize(
         clutter: ratio to the true pairs.
         output: folder of the results.
         no_pictures: write no pictures.
-        solver: search, or the checkpoint of a BPnPNet.
+        solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
+            checkpoint of a network.
         inlier_threshold: largest error of a match, pixels.
         time_limit: seconds a pair.
         seed: of the rotation and of the search.
@@ -69,11 +70,13 @@ def localize(
             pairs=None if views is None else read_pairs(views),
             features=keypoints,
             leave_one_out=leave_one_out,
+            solver=solver,
             seed=seed,
             time_limit=time_limit,
         )
         asked = {"map": str(map), "camera": camera, "views": str(views), "keypoints": str(keypoints)}
-        asked |= {"leave_one_out": str(leave_one_out), "seed": str(seed), "time_limit": str(time_limit)}
+        asked |= {"leave_one_out": str(leave_one_out), "solver": solver}
+        asked |= {"seed": str(seed), "time_limit": str(time_limit)}
         _localize_photos(map, photos or [], options, asked, output, pictures=not no_pictures)
     elif model is not None and map is None:
         _localize_images(

@@ -29,7 +29,7 @@ def solve(
     up_scene: tuple[float, float, float] | None = None,
     up_degrees: float = 2.0,
     clutter: float | None = None,
-    solver: str = "search",
+    solver: str = "auto",
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
     seed: int = 0,
@@ -60,7 +60,8 @@ def solve(
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
-        solver: search, or the checkpoint of a BPnPNet.
+        solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
+            checkpoint of a network.
         inlier_threshold: largest error of a match, pixels with a camera.
         time_limit: seconds.
         seed: of the search.

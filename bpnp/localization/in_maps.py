@@ -36,6 +36,7 @@ class PhotoOptions:
     pairs: Mapping[str, Sequence[str]] | None = None
     features: Path | None = None
     leave_one_out: bool = False
+    solver: str = "auto"
     seed: int = 0
     time_limit: float | None = None
 
@@ -68,7 +69,8 @@ def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOption
     if options.pairs is not None and not views:
         raise ValueError(f"expected views for {name} among the pairs, got none; try without --views")
     return scene.localize(
-        found.pixels, camera, views=views, scores=found.scores, seed=options.seed, time_limit=options.time_limit
+        found.pixels, camera, views=views, scores=found.scores, solver=options.solver, seed=options.seed,
+        time_limit=options.time_limit,
     )  # fmt: skip
 
 

@@ -4,17 +4,19 @@ import math
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import nn
 
 from bpnp.cameras import camera_from
 from bpnp.maps.regions import Region, covering_regions, regions_of_views
 from bpnp.maps.views import ViewedPoints
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
-from bpnp.solving.arguments import checked_prior
+from bpnp.solving.arguments import checked_prior, source_from
 from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
@@ -37,6 +39,7 @@ def localize(
     views: Iterable[str] | None = None,
     scores: Any = None,
     prior: PosePrior | None = None,
+    solver: str | Path | nn.Module = "auto",
     seed: int = 0,
     time_limit: float | int | None = None,
 ) -> Solution:
@@ -48,6 +51,8 @@ def localize(
         whole map after the other, those first that together see most of it.
     scores: (m,) strength of the keypoints; the strongest are used first.
     prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
+    solver: as for `bpnp.solve`; a network that expects the axes of a view gets the points in those of the view that is
+        tried, or of the prior.
     time_limit: seconds for all views together, after which no search begins; None for no limit.
 
     Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the pose
@@ -65,6 +70,7 @@ def localize(
         )
     strongest = None if scores is None else np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
     used = keypoints if strongest is None else np.asarray(keypoints)[strongest]
+    module = source_from(solver)
     regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
     found: list[tuple[Region, Solution]] = []
     chosen, tries, over = regions, 0, False
@@ -76,7 +82,7 @@ def localize(
                 break
             tries += 1
             limit = None if left is None else max(left, 1e-3)
-            options = Options(seed=seed, time_limit=limit, settings=settings)
+            options = Options(module, solver == "auto", seed=seed, time_limit=limit, settings=settings)
             found.append((region, counted(_tried(scene, region, used, camera, prior, options), tries)))
             over = found[-1][1].verdict == "confident"
         found.sort(key=lambda item: _rank(item[1]), reverse=True)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from torch import nn
 
 from bpnp.cameras import Camera, camera_models
 from bpnp.datamodules.colmap.model_files import ColmapError, ModelRecords, read_records
@@ -51,12 +52,14 @@ class SceneMap(ViewedPoints):
         views: Iterable[str] | None = None,
         scores: Any = None,
         prior: PosePrior | None = None,
+        solver: str | Path | nn.Module = "auto",
         seed: int = 0,
         time_limit: float | int | None = None,
     ) -> Solution:
         """The pose of a photo from its keypoints alone; see `bpnp.maps.localize.localize`."""
         return localize(
-            self, keypoints, camera, views=views, scores=scores, prior=prior, seed=seed, time_limit=time_limit
+            self, keypoints, camera, views=views, scores=scores, prior=prior, solver=solver, seed=seed,
+            time_limit=time_limit,
         )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float
@@ -39,6 +40,9 @@ class Matcher(TrainedNet):
         neighbours: nearest neighbours that a point is described by; 0 for none.
         principal: describe 3D points along the principal axes of their set, so that the scene's rotation does not
             matter; false for the axes that they are given in.
+        frame: axes in which the 3D points are expected: "any", or "view", those of a camera nearby, such as that of a
+            map's view of the same place, which looks along the third axis. `bpnp.solve` and `SceneMap.localize` turn
+            the points so, and the pose back.
         mu: entropy weight of the transport at the start of a training; it is learned.
         tolerance: L1 error of the marginals at which the transport stops.
         ransac, pnp, refinement: as in `BPnPNet`.
@@ -58,6 +62,7 @@ class Matcher(TrainedNet):
         heads: int = 4,
         neighbours: int = 8,
         principal: bool = False,
+        frame: Literal["any", "view"] = "any",
         mu: float = 0.1,
         tolerance: float = 1e-6,
         ransac: RansacPnP | AnyModule | None = None,
@@ -66,6 +71,9 @@ class Matcher(TrainedNet):
     ) -> None:
         super().__init__()
         check_mu(mu)
+        if frame not in ("any", "view"):
+            raise ValueError(f"expected `frame` any or view, got {frame!r}")
+        self.frame = frame
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
         self.principal, self.mu, self.tolerance = principal, mu, tolerance
         self.backward_stats = BackwardStats()

@@ -82,12 +82,35 @@ def pose_hypotheses(
     return rotation.to(points3d), translation.to(points3d), stats
 
 
+@full_precision
+@torch.no_grad()
+def drawn_poses(
+    assignment: Float[Tensor, "b m n"],
+    points2d: Float[Tensor, "b m 2"],
+    points3d: Float[Tensor, "b n 3"],
+    *,
+    triples: int,
+    seed: int,
+) -> Float[Tensor, "b s 3 4"]:
+    """All poses of so many triples of pairs drawn in proportion to P, a quarter of those drawn; NaN in empty slots.
+
+    The arguments are those of `pose_hypotheses`, unpadded; P has mass.
+    """
+    drawn = weighted_draws(assignment.flatten(1), 3 * DRAWN * triples, seed)
+    n = assignment.shape[2]
+    chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), torch.ones_like(drawn, dtype=torch.bool))
+    pairs, centre, scale = normalised(chosen)
+    poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in pairs[:2]))
+    rotation, translation = in_scene(poses, centre, scale)
+    return torch.cat([rotation, translation.unsqueeze(-1)], -1)
+
+
 def _poses_of_widest(image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"]) -> Float[Tensor, "b s 3 4"]:
-    """Poses of the TRIPLES triples whose triangles have the largest products of areas."""
+    """Poses of the quarter of the triples whose triangles have the largest products of areas."""
     (x, y), (along, across) = ((points[:, :, 1:] - points[:, :, :1]).unbind(2) for points in (image, scene))
     area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)
-    widest = (area2d * area3d).topk(TRIPLES).indices
+    widest = (area2d * area3d).topk(image.shape[1] // DRAWN).indices
     return poses_of_triples(bearings(take(image, widest)), take(scene, widest))
 
 

@@ -8,13 +8,14 @@ from functools import cache
 from itertools import product
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
-from bpnp.search.nearby import beside, cooled, nearby_batch
+from bpnp.search.nearby import beside, cooled, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
@@ -31,12 +32,14 @@ from bpnp.search.verdict import (
 )
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
+Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
 
 def search_poses(
     sets: PointSets,
     *,
     around: Prior | None = None,
+    proposals: Proposals | None = None,
     clutter: float | None = None,
     seed: int = 0,
     deadline: Deadline = NEVER,
@@ -52,7 +55,8 @@ def search_poses(
     Few points (`bpnp.search.few`) are enumerated first, and annealed only if that leaves a doubt.
 
     around: a guess from the same points, such as a network's pose: the first `settings.around` batches start there, and
-        that they end alike is no evidence. seed: of all that is random.
+        that they end alike is no evidence. proposals: gives poses to start from, such as those that a network finds
+        likely; asked where the search ends in doubt, and no evidence either. seed: of all that is random.
     clutter: share of the points without a partner to expect, from 0 to below 1 (`SearchSettings.expecting`); None for
         that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
@@ -127,16 +131,20 @@ def search_poses(
         exhausted = is_exhausted(candidates, scene, searched - bettered)
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
-    if result.log10_false_alarms <= 0 or not len(candidates) or candidates.hits[0] > batches / 2:
+    if result.log10_false_alarms > 0 and len(candidates) and candidates.hits[0] <= batches / 2:
+        leading = candidates[: settings.beside_poses]
+        for look, k in product(settings.beside, range(len(leading))):
+            if deadline.passed():
+                break
+            candidates = merged([candidates, beside(scene, leading[k : k + 1], look)], scene)
+            candidates, leaders = _weighed_leaders(candidates, scene, sets)
+            if (safe := certain(leaders)) is not None:
+                return safe
+        result = finished(candidates, settings.finished)
+    if proposals is None or result.verdict == "confident" or deadline.passed():
         return result
-    leading = candidates[: settings.beside_poses]
-    for look, k in product(settings.beside, range(len(leading))):
-        if deadline.passed():
-            break
-        candidates = merged([candidates, beside(scene, leading[k : k + 1], look)], scene)
-        candidates, leaders = _weighed_leaders(candidates, scene, sets)
-        if (safe := certain(leaders)) is not None:
-            return safe
+    proposed = Candidates.unscored(*scene.enter(*proposals()))
+    candidates = merged([candidates, likeliest(scene, proposed, settings.nearby)], scene)
     return finished(candidates, settings.finished)
 
 

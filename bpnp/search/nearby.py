@@ -50,7 +50,12 @@ def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> 
     rule: None for that of the settings.
     """
     rule = rule or scene.settings.nearby
-    poses, scale = drawn_around(scene, prior, starts_of(scene, prior, rule)), rule.first_scale
+    return likeliest(scene, drawn_around(scene, prior, starts_of(scene, prior, rule)), rule)
+
+
+def likeliest(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
+    """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
+    scale = rule.first_scale
     raster = raster_of(scene, rule, scale)
     for points, kept in zip(rule.points, rule.kept, strict=True):
         poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)

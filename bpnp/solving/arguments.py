@@ -18,17 +18,17 @@ EXPECTED = "expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a che
 
 
 def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
-    """The module that solves, None for the search."""
+    """The module that solves, None for the search, alone or not."""
     if isinstance(solver, nn.Module):
         return solver
-    if solver == "search":
+    if isinstance(solver, str) and solver in ("auto", "search"):
         return None
     from bpnp.models.weights import TrainedNet, pretrained_names  # the networks, where one is asked for
 
     path = Path(str(solver))
     if not isinstance(solver, (str, Path)) or not (path.suffix or path.is_file() or str(solver) in pretrained_names()):
         raise ValueError(
-            f'expected `solver` "search", a module from Batch to Prediction, a checkpoint, or packaged weights '
+            f'expected `solver` "auto", "search", a module from Batch to Prediction, a checkpoint, or packaged weights '
             f"({', '.join(pretrained_names())}), got {solver!r}"
         )
     return TrainedNet.from_checkpoint(solver)

@@ -26,7 +26,7 @@ def solve(
     labels3d: Any = None,
     scores2d: Any = None,
     scores3d: Any = None,
-    solver: str | Path | nn.Module = "search",
+    solver: str | Path | nn.Module = "auto",
     prior: Prior | str | Path | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
@@ -47,8 +47,9 @@ def solve(
         matched; -1 fits any.
     scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
         strength of a keypoint, or the number of views that see a point; only their ratios matter much.
-    solver: "search", which needs no training; a module from `Batch` to `Prediction`; or a checkpoint of a
-        BPnPNet or a Matcher.
+    solver: "search", which needs no training; "auto", the same, which with a `PosePrior`, such as the pose of a map's
+        view of the same place, asks the packaged matcher for poses to start from when it is in doubt; a module from
+        `Batch` to `Prediction`; or a checkpoint of a BPnPNet or a Matcher.
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.
@@ -91,7 +92,7 @@ def solve_many(
     labels3d: Any = None,
     scores2d: Any = None,
     scores3d: Any = None,
-    solver: str | Path | nn.Module = "search",
+    solver: str | Path | nn.Module = "auto",
     prior: Any = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
@@ -119,8 +120,8 @@ def solve_many(
         if value is not None and not 0 < value < math.inf:
             raise ValueError(f"expected a positive `{name}`, got {value}")
     options = Options(
-        source_from(solver), _float(inlier_threshold), _float(clutter), seed, _float(time_limit), device_from(device),
-        progress,
+        source_from(solver), solver == "auto", _float(inlier_threshold), _float(clutter), seed, _float(time_limit),
+        device_from(device), progress,
     )  # fmt: skip
     sets2d = each_set("points2d", points2d, None)
     count = len(sets2d)

@@ -1,30 +1,25 @@
 """Where the candidate poses of a solution come from: the search, a trained module, or one after the other."""
 
-import copy
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from bpnp.compilation import Deadline
 from bpnp.search.many import search_poses
-from bpnp.search.refine import score_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
-from bpnp.solving.problem import Array, Problem
+from bpnp.solving.networks import axes_for, device_of, evaluation_copy, pose_prior, predicted, proposed
+from bpnp.solving.problem import Problem
 from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
-from bpnp.types import Batch
 
-ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
-NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
 GPU_PAIRS, GPU_CELLS = 64, 2**26  # solved together by a module: pairs, and pairs x 2D points x 3D points
 
 WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
@@ -35,10 +30,12 @@ Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, 
 class Options(NamedTuple):
     """What applies to all pairs; see `bpnp.solve`.
 
-    solver: None for the search. device: None for that of each module. settings: of the search.
+    solver: None for the search. asks: whether a search around a known pose that is in doubt asks the packaged matcher
+        for poses to start from. device: None for that of each module. settings: of the search.
     """
 
     solver: nn.Module | None = None
+    asks: bool = True
     inlier_threshold: float | None = None
     clutter: float | None = None
     seed: int = 0
@@ -56,6 +53,10 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
         if problem.degenerate is not None
     }
     rest = {i: problem for i, problem in problems.items() if i not in solutions}
+    for problem in rest.values():
+        for net in (options.solver, problem.prior):
+            if isinstance(net, nn.Module):
+                axes_for(net, problem)  # before anything is solved
     if options.solver is None and not any(isinstance(problem.prior, nn.Module) for problem in rest.values()):
         return solutions | dict(_shared(rest, options))
     for i, result, seconds in (_searched if options.solver is None else _predicted)(rest, options):
@@ -93,9 +94,11 @@ def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tup
     for i, problem in problems.items():
         start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
         net = nets.get(id(problem.prior))
+        asks = options.asks and isinstance(problem.prior, PosePrior)
         result = search_poses(
-            problem.sets, around=None if net is None else _net_prior(net, problem, deadline), clutter=options.clutter,
-            seed=options.seed, deadline=deadline, settings=options.settings,
+            problem.sets, around=None if net is None else pose_prior(net, problem, deadline), clutter=options.clutter,
+            proposals=partial(proposed, problem, options.seed) if asks else None, seed=options.seed,
+            deadline=deadline, settings=options.settings,
             progress=None if options.progress is None else partial(options.progress, i),
         )  # fmt: skip
         yield i, result, time.perf_counter() - start
@@ -107,27 +110,9 @@ def _predicted(problems: Mapping[int, Problem], options: Options) -> Iterator[tu
     net = evaluation_copy(options.solver, options.device)
     for group in [[i] for i in problems] if device_of(net).type == "cpu" else _groups(problems):
         start = time.perf_counter()
-        found = _asked(net, [problems[i] for i in group], Deadline.after(options.time_limit))
+        found = predicted(net, [problems[i] for i in group], Deadline.after(options.time_limit))
         seconds = (time.perf_counter() - start) / len(group)
         yield from ((i, result, seconds) for i, result in zip(group, found, strict=True))
-
-
-def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
-    """The module in evaluation mode on `device` (None: where it is).
-
-    A copy unless it is that already: the caller's keeps its device and its training flags, and may be in use by other
-    threads.
-    """
-    evaluates = not any(part.training for part in module.modules())
-    if evaluates and device in (None, device_of(module)):
-        return module
-    return copy.deepcopy(module).to(device).eval()
-
-
-def device_of(module: nn.Module) -> torch.device:
-    """Where the parameters of a module are; the CPU if it has none."""
-    parameter = next(module.parameters(), None)
-    return torch.device("cpu") if parameter is None else parameter.device
 
 
 def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
@@ -141,36 +126,3 @@ def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
         group.append(i)
     if group:
         yield group
-
-
-def _net_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrior | None:
-    """The net's pose, None if it has none."""
-    (asked,) = _asked(net, [problem], deadline)
-    if not len(asked.candidates):
-        return None
-    rotation, translation = asked.best
-    centre = rotation @ problem.local3d.mean(0) + translation
-    return PosePrior(rotation, translation, NET_SIGMA_DEG, NET_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12)
-
-
-def _asked(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
-    """The poses of a module's prediction, scored. Points that are not in front of the camera are not given to it."""
-    seen = [problem.points2d[problem.usable] for problem in members]
-    batch = Batch.from_arrays(
-        [points[np.isfinite(points).all(-1)].astype(np.float32) for points in seen],
-        [problem.local3d.astype(np.float32) for problem in members],
-    ).to(device_of(net))
-    with torch.no_grad():
-        poses = net(batch).poses
-    if not poses:
-        raise ValueError(f"expected a pose from the `solver` {type(net).__name__}, got a prediction without one")
-    order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
-    rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
-    translation = _host(torch.stack([poses[name].translation for name in order], 1))
-    return [
-        score_poses(problem.sets, r, t, deadline) for problem, r, t in zip(members, rotation, translation, strict=True)
-    ]
-
-
-def _host(values: Tensor) -> Array:
-    return values.detach().cpu().double().numpy()

@@ -127,6 +127,7 @@ def test_says_what_is_wrong_with_its_options() -> None:
 
 def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -> None:
     net, batch = small().float(), cluttered(9).to(torch.float32)
+    net.frame = "view"
     for name, solver in (("matcher", net), ("other", small_net(8, 1))):
         state = {f"solver.{key}": value for key, value in solver.state_dict().items()}
         torch.save({"solver": described(solver), "state_dict": state}, tmp_path / f"{name}.ckpt")
@@ -134,6 +135,7 @@ def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -
     for cls in (Matcher, TrainedNet):
         again = cls.from_checkpoint(tmp_path / "matcher.ckpt")
         torch.testing.assert_close(again.match(batch).assignment, expected)
+        assert again.frame == "view"
     assert isinstance(TrainedNet.from_checkpoint(tmp_path / "other.ckpt"), BPnPNet)
     with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
         Matcher.from_checkpoint(tmp_path / "other.ckpt")

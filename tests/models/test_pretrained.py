@@ -12,7 +12,7 @@ import torch
 from small_data import small_net
 
 from bpnp import Batch, BPnPNet, Matcher, solve
-from bpnp.datamodules import MeshDataModule, Outliers
+from bpnp.datamodules import MeshDataModule, Outliers, SfmSceneDataModule
 from bpnp.metrics import rotation_error
 from bpnp.models.composition import described
 from bpnp.models.weights import LEARNED, pretrained_names, pretrained_path
@@ -127,6 +127,27 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
     for way in ({"prior": Matcher.from_pretrained("matcher-clutter")}, {"solver": pretrained_path("matcher-clutter")}):
         relative = torch.as_tensor(solve(*points, **way).rotation)[None]
         assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
+
+
+def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
+    """Of synthetic maps; a partner is worth as little as any other point if the points are turned away."""
+    data = SfmSceneDataModule(frame="view", num_points=128, outliers=0.5, test_pairs=8, seed=7)
+    data.setup("test")
+    batch = next(iter(data.test_dataloader()))
+    net = Matcher.from_pretrained("matcher-maps")
+    assert net.frame == "view"
+    turned = replace(batch, points3d=batch.points3d[..., [1, 2, 0]])
+    right, wrong = (shares_of_partners(net, each) for each in (batch, turned))
+    assert right > 0.2
+    assert right > 4 * wrong
+
+
+def shares_of_partners(net: Matcher, batch: Batch) -> float:
+    """Median probability of the true partner of a 3D point that has one."""
+    with torch.no_grad():
+        assignment = net.match(batch).assignment
+    true = assignment.gather(1, batch.match3d.clamp_min(0).unsqueeze(1)).squeeze(1) / assignment.sum(1)
+    return float(true[batch.match3d >= 0].median())
 
 
 def test_packing_keeps_the_net_in_half_the_space(

@@ -165,6 +165,23 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
     assert (result.batches <= DEFAULT.around) == (off < 0.1)
 
 
+def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
+    """One start finds nothing; among 200 proposals one is 3 degrees off. Without need nobody is asked."""
+    planted = plant(1, 200, seed=5, noise=1e-4, outliers2d=100, outliers3d=100)
+    sets = PointSets(planted.bearings[0].double().numpy(), planted.points3d[0].double().numpy())
+    rotation, translation = planted.rotation[0].double().numpy(), planted.translation[0].double().numpy()
+    others = super_fibonacci(200)
+    others[77] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix() @ rotation
+    few = SearchSettings(max_batches=1, starts=1, first_starts=1, beside=())
+
+    def off(result):
+        return np.degrees(Rotation.from_matrix(result.best[0] @ rotation.T).magnitude())
+
+    assert off(search_poses(sets, settings=few)) > 10
+    assert off(search_poses(sets, settings=few, proposals=lambda: (others, np.tile(translation, (200, 1))))) < 0.5
+    assert search_poses(sets, proposals=pytest.fail).verdict == "confident"
+
+
 def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):
     sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
     rotation, translation = (values[0].numpy() for values in problem.near(1.0, seed=1))

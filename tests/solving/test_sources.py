@@ -14,7 +14,7 @@ from bpnp import solve
 from bpnp.compilation import Deadline
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving import sources
-from bpnp.solving.sources import evaluation_copy
+from bpnp.solving.networks import evaluation_copy
 from bpnp.types import Pose, Prediction, SolveStats
 
 
@@ -103,7 +103,7 @@ def test_the_time_limit_of_a_pair_counts_once(limit: float | None, monkeypatch: 
         deadlines.append(deadline)
         return no_pose("none")
 
-    monkeypatch.setattr(sources, "_net_prior", ask)
+    monkeypatch.setattr(sources, "pose_prior", ask)
     monkeypatch.setattr(sources, "search_poses", search)
     planted = plant(1, 30)
     solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=limit)

@@ -1,0 +1,118 @@
+"""What a trained network says of a problem: its poses, or poses to start a search from."""
+
+import copy
+from functools import cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from bpnp.compilation import Deadline
+from bpnp.search.refine import score_poses
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import SearchResult
+from bpnp.solving.problem import Array, Problem
+from bpnp.types import Batch
+
+if TYPE_CHECKING:
+    from bpnp.models.matcher import Matcher
+
+VIEW_MATCHER = "matcher-maps"  # packaged weights of the frame "view"
+ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
+PROPOSED = 20_000  # triples of an assignment; one pair in fifty is right, one triple in 10^5, but some nearly are
+NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
+
+
+def evaluation_copy(module: nn.Module, device: torch.device | None) -> nn.Module:
+    """The module in evaluation mode on `device` (None: where it is).
+
+    A copy unless it is that already: the caller's keeps its device and its training flags, and may be in use by other
+    threads.
+    """
+    evaluates = not any(part.training for part in module.modules())
+    if evaluates and device in (None, device_of(module)):
+        return module
+    return copy.deepcopy(module).to(device).eval()
+
+
+def device_of(module: nn.Module) -> torch.device:
+    """Where the parameters of a module are; the CPU if it has none."""
+    parameter = next(module.parameters(), None)
+    return torch.device("cpu") if parameter is None else parameter.device
+
+
+def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrior | None:
+    """The net's pose, None if it has none."""
+    (asked,) = predicted(net, [problem], deadline)
+    if not len(asked.candidates):
+        return None
+    rotation, translation = asked.best
+    centre = rotation @ problem.local3d.mean(0) + translation
+    return PosePrior(rotation, translation, NET_SIGMA_DEG, NET_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12)
+
+
+def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
+    """The poses of a module's prediction, scored."""
+    axes, batch = _given(net, members)
+    with torch.no_grad():
+        poses = net(batch).poses
+    if not poses:
+        raise ValueError(f"expected a pose from the `solver` {type(net).__name__}, got a prediction without one")
+    order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
+    rotation = _host(torch.stack([poses[name].rotation for name in order], 1)) @ axes[:, None]
+    translation = _host(torch.stack([poses[name].translation for name in order], 1))
+    return [
+        score_poses(problem.sets, r, t, deadline) for problem, r, t in zip(members, rotation, translation, strict=True)
+    ]
+
+
+def proposed(problem: Problem, seed: int) -> tuple[Array, Array]:
+    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of the packaged matcher for views."""
+    from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
+
+    net = _view_matcher()
+    axes, batch = _given(net, [problem])
+    with torch.no_grad():
+        assignment = net.match(batch).assignment
+    assert assignment is not None
+    poses = _host(drawn_poses(assignment, batch.points2d, batch.points3d, triples=PROPOSED, seed=seed)[0])
+    poses = poses[np.isfinite(poses).all((-2, -1))]
+    return poses[:, :, :3] @ axes[0], poses[:, :, 3]
+
+
+@cache
+def _view_matcher() -> "Matcher":
+    from bpnp.models.matcher import Matcher
+
+    return Matcher.from_pretrained(VIEW_MATCHER)
+
+
+def axes_for(net: nn.Module, problem: Problem) -> Array:
+    """Axes (3, 3), one a row, in which the network expects the 3D points: those given, or of the view of the prior.
+
+    Raises ValueError for a network of the frame "view" without a `PosePrior`.
+    """
+    if getattr(net, "frame", "any") == "any":
+        return np.eye(3)
+    if isinstance(problem.prior, PosePrior):
+        return np.asarray(problem.prior.rotation, np.float64)
+    raise ValueError(
+        "expected the axes of a view near the photo's for a network that was trained in them, got no `prior`; try "
+        "prior=PosePrior(rotation, translation, ...) with the pose of the view, or SceneMap.localize"
+    )
+
+
+def _given(net: nn.Module, members: list[Problem]) -> tuple[Array, Batch]:
+    """The axes (b, 3, 3) that the network expects, and the problems in them; without points that no image shows."""
+    axes = np.stack([axes_for(net, problem) for problem in members])
+    seen = [problem.points2d[problem.usable] for problem in members]
+    batch = Batch.from_arrays(
+        [points[np.isfinite(points).all(-1)].astype(np.float32) for points in seen],
+        [(problem.local3d @ rows.T).astype(np.float32) for problem, rows in zip(members, axes, strict=True)],
+    )
+    return axes, batch.to(device_of(net))
+
+
+def _host(values: Tensor) -> Array:
+    return values.detach().cpu().double().numpy()

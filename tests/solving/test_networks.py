@@ -1,0 +1,119 @@
+"""What a network is given, in which axes, and what a search makes of the poses that it proposes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from planted import plant
+from scipy.spatial.transform import Rotation
+
+from bpnp import PosePrior, solve
+from bpnp.models import Matcher
+from bpnp.search.settings import DEFAULT
+from bpnp.solving import networks, sources
+from bpnp.solving.networks import proposed
+from bpnp.solving.problem import problem_from
+from bpnp.solving.sources import Options, solutions_of
+from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+VIEW = Rotation.from_euler("xyz", [100, -35, 60], degrees=True).as_matrix()
+
+
+class Expecting(torch.nn.Module):
+    """Answers with one pose in the axes that it expects, and keeps what it was given."""
+
+    def __init__(self, frame: str, rotation: np.ndarray, translation: np.ndarray) -> None:
+        super().__init__()
+        self.frame, self.given = frame, []
+        self.pose = torch.as_tensor(rotation)[None], torch.as_tensor(translation)[None]
+
+    def forward(self, batch: Batch) -> Prediction:
+        self.given.append(batch.points3d[0])
+        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
+        return Prediction(poses={"fixed": Pose(*self.pose, stats)})
+
+
+def scene(clutter: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Image, points, and pose of 40 points seen by a camera a few degrees off VIEW; and `clutter` on both sides."""
+    rng = np.random.default_rng(2)
+    points = rng.normal(size=(40, 3)) @ VIEW
+    rotation, translation = Rotation.from_rotvec([0.1, -0.05, 0.02]).as_matrix() @ VIEW, np.array([0.2, -0.1, 7.0])
+    camera = points @ rotation.T + translation
+    image = camera[:, :2] / camera[:, 2:]
+    others = rng.uniform(image.min(), image.max(), (clutter, 2))
+    return (
+        np.concatenate([image, others]),
+        np.concatenate([points, rng.normal(size=(clutter, 3))]),
+        rotation,
+        translation,
+    )
+
+
+def test_a_network_for_views_gets_the_points_in_the_axes_of_the_view_and_its_pose_is_turned_back() -> None:
+    image, points, rotation, translation = scene()
+    net = Expecting("view", rotation @ VIEW.T, translation).eval()
+    solution = solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
+    np.testing.assert_allclose(net.given[0], points @ VIEW.T, atol=1e-5)
+    np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
+    np.testing.assert_allclose(solution.translation, translation, atol=1e-5)
+
+
+def test_a_network_for_any_axes_gets_the_points_as_they_are() -> None:
+    image, points, rotation, translation = scene()
+    net = Expecting("any", rotation, translation).eval()
+    solution = solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
+    np.testing.assert_allclose(net.given[0], points, atol=1e-5)
+    np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
+
+
+@pytest.mark.parametrize("place", ["solver", "prior"])
+def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
+    planted = plant(1, 30)
+    net = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
+    with pytest.raises(ValueError, match=r"axes of a view .* try prior=PosePrior"):
+        solve(planted.points2d[0], planted.points3d[0], **{place: net})
+
+
+class Knowing(torch.nn.Module):
+    """A matcher that knows the true pairs, the first 40 of both sides."""
+
+    frame = "view"
+
+    def match(self, batch: Batch) -> Prediction:
+        assignment = torch.zeros(1, batch.points2d.shape[1], batch.points3d.shape[1])
+        assignment[0, range(40), range(40)] = 1 / 80
+        return Prediction(assignment)
+
+
+def test_poses_of_triples_of_a_right_assignment_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
+    image, points, rotation, translation = scene(clutter=10)
+    monkeypatch.setattr(networks, "_view_matcher", Knowing)
+    problem = problem_from(image, points, None, prior=PosePrior(VIEW, None, 20.0))
+    turns, shifts = proposed(problem, 0)
+    off = np.abs(turns - rotation).max((1, 2)) + np.abs(shifts - translation).max(1)
+    # Each triple that has different pairs has the true pose among up to four.
+    assert (off < 1e-3).mean() > 0.25
+
+
+def test_a_search_in_doubt_asks_and_a_sure_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+
+    def propose(problem, seed: int) -> tuple[np.ndarray, np.ndarray]:
+        asked.append(seed)
+        return np.empty((0, 3, 3)), np.empty((0, 3))
+
+    monkeypatch.setattr(sources, "proposed", propose)
+    image, points, rotation, translation = scene()
+    prior = PosePrior(VIEW, translation, 8.0, 0.5)
+    assert solve(image, points, prior=prior).verdict == "confident"
+    assert asked == []
+    rng = np.random.default_rng(0)
+    noise2d, noise3d = rng.uniform(-0.5, 0.5, (60, 2)), rng.normal(size=(60, 3))
+    problem = problem_from(noise2d, noise3d, None, prior=prior)
+    brief = replace(DEFAULT, max_batches=1, beside=())
+    alone, helped = (
+        solutions_of({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
+    )
+    assert asked == [3]
+    assert alone.verdict == helped.verdict != "confident"
