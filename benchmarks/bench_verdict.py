@@ -4,7 +4,8 @@ python benchmarks/bench_verdict.py --data ../shared/data --trials 1000 --output 
 
 noise: image points and scene points drawn evenly and independently, several sizes. shuffled: keypoints of one photo
 against the map points or surface points that another one sees. twins: points with a symmetry, exact or nearly so, of
-which a camera sees all; an exact one has no single answer, of the others only one pose is right.
+which a camera sees all; an exact one has no single answer, of the others only one pose is right. hard: pairs on which a
+verdict is easily wrong (`hard_scenes.py`); an error of a tenth of the distance counts as one of 3 degrees.
 """
 
 import argparse
@@ -18,6 +19,7 @@ from typing import Any
 import numpy as np
 import torch
 from bench_search import source
+from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, Pose
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -26,19 +28,17 @@ from bpnp.datamodules.meshes.surfaces import read_mesh, sample_surface
 from bpnp.report.figures import save_figure
 
 Array = NDArray[np.float64]
-FOCAL, WIDTH, HEIGHT = 500.0, 640, 480  # pixels
-CAMERA = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 NOISE_SIZES = ((4, 4), (6, 6), (8, 8), (10, 17), (20, 20), (10, 50), (30, 30), (50, 50), (20, 100), (100, 20),
                (100, 100), (200, 200), (400, 400), (1000, 1000))  # fmt: skip
 SHUFFLED = ("castle-P30", "fountain-P11", "south_building", "statue_of_liberty", "walkthrough", "psb")
 SHUFFLED_SIZES = (8, 15, 40, 120, 400, 1000)
-KINDS = ("noise", "shuffled", "twins", "surfaces")
+KINDS = ("noise", "shuffled", "twins", "surfaces", "hard")
 CLAIMS = (0.0, -1.0, -2.0, -3.0)  # log10 of false alarms
 # Points of the larger side up to which this share of the trials is made.
 SIZES = ((50, 1.0), (400, 0.2), (np.inf, 0.01))
-SURFACES = 0.1  # share of the trials
+SURFACES = HARD = 0.1  # share of the trials
 MESH_VERTICES, SAMPLES = (100, 2000), 400
-WRONG_DEG = 3.0
+WRONG_DEG, WRONG_SHIFT = 3.0, 0.1
 
 
 def trials_of(points: int, trials: int) -> int:
@@ -97,6 +97,22 @@ def surfaces(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tupl
         yield f"vertices against {SAMPLES} points of the faces", found, degrees(found, rotation)
 
 
+def hard(trials: int, rng: np.random.Generator) -> Iterator[tuple[str, Solution, float]]:
+    """Each kind of hard pair."""
+    for draw_pair in SCENES:
+        for _ in range(max(int(HARD * trials), 3)):
+            points2d, points3d, poses = draw_pair(rng)
+            found = solve(points2d, points3d, CAMERA)
+            yield draw_pair.__name__, found, min((_error(found, pose, points3d) for pose in poses), default=np.nan)
+
+
+def _error(found: Solution, pose: Pose, points: Array) -> float:
+    """Error of the rotation, degrees, or that of the points' middle if it is larger, a tenth of its distance as 3."""
+    middle, there = points.mean(0), pose[0] @ points.mean(0) + pose[1]
+    shift = np.linalg.norm(found.rotation @ middle + found.translation - there) / np.linalg.norm(there)
+    return max(degrees(found, pose[0]), WRONG_DEG / WRONG_SHIFT * float(shift)) if found.found else 180.0
+
+
 def degrees(found: Solution, rotation: Array) -> float:
     """Error of the rotation, 180 where there is none."""
     return float(np.degrees(Rotation.from_matrix(found.rotation.T @ rotation).magnitude())) if found.found else 180.0
@@ -145,6 +161,8 @@ def rows_of(
         yield from noise(trials, rng)
     elif kind == "twins":
         yield from twins(trials, rng)
+    elif kind == "hard":
+        yield from hard(trials, rng)
     elif data:
         yield from (shuffled if kind == "shuffled" else surfaces)(data, trials, rng)
 

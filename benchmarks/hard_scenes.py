@@ -137,8 +137,8 @@ def wrong_focal_plane(rng: np.random.Generator) -> Pair:
 
 
 SCENES: tuple[Callable[[np.random.Generator], Pair], ...] = (
-    lattice, board, wallpaper, stairs, row_of_windows, ending_facade, colonnade, gappy_facade,
-    facade_with_door, lines, clumps, helix, stretched, hinged, wrong_focal_cloud, wrong_focal_plane,
+    ending_facade, colonnade, gappy_facade, row_of_windows, facade_with_door, stretched, hinged, wrong_focal_cloud,
+    wrong_focal_plane, helix, lines, clumps, stairs, board, wallpaper, lattice,
 )  # fmt: skip
 
 
