@@ -78,6 +78,7 @@ def plot_pair(
     fills `bpnp.report.photos.box_of(view)`. Raises ValueError for an unknown estimate.
     """
     from matplotlib.figure import Figure
+    from matplotlib.patheffects import withStroke
 
     if not isinstance(view, PairView):
         view = solution_view(view)
@@ -92,15 +93,10 @@ def plot_pair(
     poses = {name: pose for name, pose in view.estimates.items() if np.isfinite(np.c_[pose]).all()}
     _draw_scene(figure.add_subplot(1, 2, 1, projection="3d"), view, poses, colours)
     axes = figure.add_subplot(1, 2, 2)
-    axes.plot(
-        *view.points2d.T,
-        "o",
-        mfc="none",
-        mec="black" if photo is None else "white",
-        ms=5,
-        label="image points",
-        zorder=3,
-    )
+    rim = "black" if photo is None else "white"
+    rims = axes.plot(*view.points2d.T, "o", mfc="none", mec=rim, ms=5, label="image points", zorder=3)
+    if photo is not None:
+        rims[0].set_path_effects([withStroke(linewidth=2, foreground="black")])  # for bright photos and the legend
     limits = axes.axis()
     if photo is not None:
         left, top, right, bottom = box_of(view)

@@ -78,10 +78,13 @@ def _drawn(points: Array, camera: Camera | None) -> Array:
 def _draw_points(axes: "Axes", seen: Array, projected: Array, matches: Any, *, hidden: bool) -> None:
     """Rings around the image points, crosses where the pose puts 3D points; without a photo, those of no match too."""
     from matplotlib.collections import LineCollection
+    from matplotlib.patheffects import withStroke
 
     size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
     colour = "black" if hidden else "white"
-    axes.plot(*seen.T, "o", mfc="none", mec=colour, mew=0.7, ms=size, label="image points", zorder=3)
+    rims = axes.plot(*seen.T, "o", mfc="none", mec=colour, mew=0.7, ms=size, label="image points", zorder=3)
+    if not hidden:
+        rims[0].set_path_effects([withStroke(linewidth=1.7, foreground="black")])  # for bright photos and the legend
     if not len(projected):
         return
     free = np.ones(len(projected), bool)

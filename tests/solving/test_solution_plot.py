@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from planted import plant
 
 import bpnp
@@ -65,3 +66,16 @@ def test_the_legend_names_only_what_is_drawn() -> None:
     assert (
         {text.get_text() for text in figure.legends[0].get_texts()} == drawn == {"image points", "3D points, matched"}
     )
+
+
+def test_every_entry_of_the_legend_is_dark_enough_to_be_seen_also_under_a_photo() -> None:
+    pixels = camera_from(MATRIX).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), MATRIX)
+    figure = solution.plot(photo=np.full((480, 640, 3), 90, np.uint8))
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    brightness = np.asarray(canvas.buffer_rgba())[..., :3].mean(-1)
+    for text in figure.legends[0].get_texts():
+        box = text.get_window_extent()
+        rows = slice(int(len(brightness) - box.y1), int(len(brightness) - box.y0))
+        assert brightness[rows, int(box.x0) - 30 : int(box.x0) - 2].min() < 150, text.get_text()
