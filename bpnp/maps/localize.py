@@ -82,7 +82,8 @@ def localize(
                 break
             tries += 1
             limit = None if left is None else max(left, 1e-3)
-            options = Options(module, solver == "auto", seed=seed, time_limit=limit, settings=settings)
+            asks = solver == "auto" and settings is LONGER  # not of every view of the map
+            options = Options(module, asks, seed=seed, time_limit=limit, settings=settings)
             found.append((region, counted(_tried(scene, region, used, camera, prior, options), tries)))
             over = found[-1][1].verdict == "confident"
         found.sort(key=lambda item: _rank(item[1]), reverse=True)
