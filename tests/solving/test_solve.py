@@ -225,7 +225,7 @@ WITH_NAN = np.where(np.arange(20)[:, None] == 7, np.nan, P)
         (X, P, {"inlier_threshold": 0.0}, "positive `inlier_threshold`"),
         (X, P, {"time_limit": -1.0}, "positive `time_limit`"),
         (X, P, {"clutter": 1.5}, "`clutter`"),
-        (X, P, {"solver": "serch"}, '`solver` "search"'),
+        (X, P, {"solver": "serch"}, '`solver` "auto", "search"'),
         (X, P, {"device": "gpu0"}, "`device` of this machine"),
         (X, P, {"prior": PosePrior(2 * np.eye(3), None, 5.0)}, "a rotation in `prior.rotation`"),
         (X, P, {"prior": PosePrior(np.eye(3), np.zeros(2), 5.0)}, r"`prior.translation` of shape \(3,\)"),
