@@ -78,7 +78,7 @@ class Nearby:
     points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each.
     first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
         the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other; with
-        factors below 0.7 the narrower optimum is lost more often.
+        factors below 0.7 the narrower optimum is lost more often. With 0 there is the first scale alone.
     copies: of a pose at each step. points_again: 3D points that are looked up there.
     annealed: poses that are annealed on all points from the last scale.
     background: scale of the density that is chance, in scales. cells: of the raster, a scale; most_cells: a side.
@@ -172,7 +172,7 @@ class SearchSettings:
     refined_directly: starts of `refine_poses` that need no clusters; more compete on clusters first.
     beside: how poses around the best `beside_poses` are looked up, one rule after the other, if the batches end without
         a pose that exceeds chance: among many outliers the right pose is no optimum on clusters, but is often some
-        degrees beside one.
+        degrees beside one. Many starts at one scale: with steps 2 of 4 photos of south_building were lost.
     kept: candidates from batch to batch, and in the end.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
@@ -193,7 +193,11 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
-    beside: tuple[Nearby, ...] = (Nearby(wide_deg=8.0, wide_shift=0.08), Nearby())
+    beside: tuple[Nearby, ...] = (
+        Nearby(2**18, 8.0, 0.08, points=(150, 600, 5000), kept=(2**15, 2**11, 150), first_scale=0.025, steps=0,
+               annealed=150),
+        Nearby(2**19, points=(150, 600, 5000), kept=(2**16, 2**12, 200), first_scale=0.04, steps=0, annealed=200),
+    )  # fmt: skip
     beside_poses: int = 2
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
