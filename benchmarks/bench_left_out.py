@@ -98,6 +98,9 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--maps", type=Path, default=Path("runs/left-out"), help="folder of the maps that are built")
     parser.add_argument("--camera", type=float, nargs=4, default=CAMERA, metavar=("FX", "FY", "CX", "CY"))
+    parser.add_argument(
+        "--features", type=int, default=2048, help="of a photo in the maps, the largest (default: 2048)"
+    )
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--limit", type=int, help="photos of a scene, evenly spread (default: all)")
     parser.add_argument("--time-limit", type=float, help="seconds of a search (default: none)")
@@ -106,7 +109,8 @@ def main() -> None:
     options = parser.parse_args()
     rows: list[dict] = []
     for name in options.scenes:
-        scene = PhotoScene(options.data / "photos" / name, options.maps / name, tuple(options.camera))
+        kept = options.maps / f"{name}-{options.features}"
+        scene = PhotoScene(options.data / "photos" / name, kept, tuple(options.camera), options.features)
         full = SceneMap.from_colmap(scene.full())
         names = [photo for photo in scene.names() if photo in full.view_numbers]
         count = min(options.limit or len(names), len(names))

@@ -1,7 +1,7 @@
 """Maps of a folder of photos built without one of them: features and matches once, then a reconstruction for each.
 
-SIFT and exhaustive matching by pycolmap with its defaults, one thread, one known camera. Kept for another run:
-features.db, full/sparse and without-<photo>/sparse.
+SIFT (the largest of each photo) and exhaustive matching by pycolmap, one thread, one known camera. Kept for another
+run: features.db, full/sparse and without-<photo>/sparse.
 """
 
 import shutil
@@ -21,11 +21,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PhotoScene:
-    """The photos of a folder, one camera for all (COLMAP's PINHOLE: fx, fy, cx, cy), and where its maps are kept."""
+    """The photos of a folder, one camera for all (COLMAP's PINHOLE: fx, fy, cx, cy), and where its maps are kept.
+
+    features: the most of a photo, of which COLMAP keeps the largest.
+    """
 
     photos: Path
     kept: Path
     camera: tuple[float, float, float, float]
+    features: int
 
     @property
     def database(self) -> Path:
@@ -37,7 +41,7 @@ class PhotoScene:
             temporary.unlink(missing_ok=True)
             reader, extraction = pycolmap.ImageReaderOptions(), pycolmap.FeatureExtractionOptions()
             reader.camera_model, reader.camera_params = "PINHOLE", ",".join(map(str, self.camera))
-            extraction.num_threads = 1
+            extraction.num_threads, extraction.sift.max_num_features = 1, self.features
             pycolmap.extract_features(
                 temporary, self.photos, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
                 extraction_options=extraction,

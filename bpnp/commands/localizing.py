@@ -8,9 +8,11 @@ from bpnp.commands.output import console
 from bpnp.files import claimed
 
 if TYPE_CHECKING:
-    from bpnp.localization.in_maps import PhotoOptions
+    from collections.abc import Iterator
+
+    from bpnp.localization.in_maps import Attempt, PhotoOptions
     from bpnp.localization.localized import Localized
-    from bpnp.solving.solution import Solution
+    from bpnp.maps.scene_map import SceneMap
 
 
 def localize(
@@ -21,6 +23,7 @@ def localize(
     views: Path | None = None,
     keypoints: Path | None = None,
     leave_one_out: bool = False,
+    cluster: str | None = None,
     model: Path | None = None,
     image: str = "all",
     points: Literal["seen", "clutter", "all"] = "seen",
@@ -46,6 +49,7 @@ def localize(
         views: text file of pairs "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map, and each is taken out of it first.
+        cluster: address of a Dask scheduler whose workers localize the photos, or a number of processes here.
         model: COLMAP model whose images are solved again, such as sparse/0.
         image: one image, or all.
         points: which 2D and 3D points to solve; "seen", the keypoints with a 3D point and these; "clutter", with
@@ -77,7 +81,7 @@ def localize(
         asked = {"map": str(map), "camera": camera, "views": str(views), "keypoints": str(keypoints)}
         asked |= {"leave_one_out": str(leave_one_out), "solver": solver}
         asked |= {"seed": str(seed), "time_limit": str(time_limit)}
-        _localize_photos(map, photos or [], options, asked, output, pictures=not no_pictures)
+        _localize_photos(map, photos or [], options, asked, output, cluster, pictures=not no_pictures)
     elif model is not None and map is None:
         _localize_images(
             model, image, points, clutter, output, no_pictures, solver, inlier_threshold, time_limit, seed, device
@@ -92,52 +96,61 @@ def _localize_photos(
     options: "PhotoOptions",
     asked: dict[str, str | None],
     output: Path,
+    cluster: str | None,
     *,
     pictures: bool,
 ) -> None:
     """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
     from bpnp.localization.in_maps import (
+        attempts,
         check_settings,
-        draw_photo,
         finished_solution,
-        localize_photo,
+        kept,
         photo_files,
         photos_table,
-        solution_file,
         write_poses,
     )  # fmt: skip
     from bpnp.localization.slow_progress import SlowProgress
-    from bpnp.localization.solved import write_text
     from bpnp.maps.scene_map import SceneMap
 
     files, scene = photo_files(photos), SceneMap.from_colmap(place)
-    done: dict[str, "Solution"] = {}
-    errors: dict[str, str] = {}
     with claimed(output), SlowProgress("localizing", total=len(files)) as progress:
         check_settings(output, asked)
-        for name, photo in files.items():
-            progress.describe(name)
-            solution = finished_solution(output, name)
-            try:
-                if solution is None:
-                    solution = localize_photo(scene, name, photo, options)
-                    if pictures:
-                        draw_photo(output, name, photo, solution)
-                    write_text(solution_file(output, name), solution.to_json() + "\n")
-                done[name] = solution
-                write_poses(output, done)
-            except (ValueError, OSError) as error:
-                errors[name] = str(error)
-            progress.advance()
+        earlier = {name: finished_solution(output, name) for name in files}
+        done = {name: solution for name, solution in earlier.items() if solution is not None}
+        errors: dict[str, str] = {}
+        left = {name: photo for name, photo in files.items() if name not in done}
+        progress.advance(len(done))
+        found = attempts(scene, left, options) if cluster is None else _on_cluster(scene, left, options, cluster)
+        try:
+            for name, result in found:
+                progress.describe(f"localized {name}")
+                try:
+                    done[name] = kept(output, name, files[name], result, picture=pictures)
+                except (ValueError, OSError) as error:
+                    errors[name] = str(error)
+                progress.advance()
+        finally:
+            write_poses(output, done)
     out = console()
     if done:
-        out.print(photos_table(done))
+        out.print(photos_table({name: done[name] for name in files if name in done}))
     for name, reason in errors.items():
         out.print(f"{name}: {reason}", markup=False, highlight=False, soft_wrap=True)
     out.print(f"wrote poses.txt, solutions/ in {output}", markup=False, highlight=False, soft_wrap=True)
     if errors:
         name, reason = next(iter(errors.items()))
         raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
+
+
+def _on_cluster(
+    scene: "SceneMap", files: dict[str, Path], options: "PhotoOptions", cluster: str
+) -> "Iterator[Attempt]":
+    try:
+        from bpnp.localization.on_cluster import attempts_on_cluster
+    except ImportError as error:
+        raise ValueError(f"expected Dask for --cluster, got {error}; try `pip install 'bpnp[cluster]'`") from error
+    return attempts_on_cluster(scene, files, options, cluster)
 
 
 def _localize_images(

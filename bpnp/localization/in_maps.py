@@ -23,6 +23,7 @@ from bpnp.report.tables.result_tables import number
 from bpnp.solving.solution import Solution
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+Attempt = tuple[str, Solution | str]  # a photo's name, and its solution or why it could not be tried
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 
 
@@ -74,6 +75,20 @@ def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOption
     )  # fmt: skip
 
 
+def attempt(scene: SceneMap, name: str, photo: Path, options: PhotoOptions) -> Solution | str:
+    """The solution of a photo, or why it could not be tried."""
+    try:
+        return localize_photo(scene, name, photo, options)
+    except (ValueError, OSError) as error:
+        return str(error)
+
+
+def attempts(scene: SceneMap, files: Mapping[str, Path], options: PhotoOptions) -> Iterator[Attempt]:
+    """The photos one after the other."""
+    for name, photo in files.items():
+        yield name, attempt(scene, name, photo, options)
+
+
 def solution_file(folder: Path, name: str) -> Path:
     """Where the solution of a photo is kept."""
     return folder / "solutions" / f"{_safe(name)}.json"
@@ -104,6 +119,16 @@ def write_poses(folder: Path, solutions: Mapping[str, Solution]) -> None:
             x, y, z, w = Rotation.from_matrix(solution.rotation).as_quat(canonical=True).tolist()
             lines.append(" ".join([name, *map(repr, (w, x, y, z, *solution.translation.tolist()))]) + "\n")
     write_text(folder / "poses.txt", POSES_HEADER + "".join(lines))
+
+
+def kept(folder: Path, name: str, photo: Path, result: Solution | str, *, picture: bool) -> Solution:
+    """Write a solution, and its picture if wanted. Raises ValueError with the reason if there is no solution."""
+    if isinstance(result, str):
+        raise ValueError(result)
+    if picture:
+        draw_photo(folder, name, photo, result)
+    write_text(solution_file(folder, name), result.to_json() + "\n")
+    return result
 
 
 def draw_photo(folder: Path, name: str, photo: Path, solution: Solution) -> None:

@@ -36,6 +36,6 @@ class SlowProgress:
         """What is going on now."""
         self._progress.update(self._task, description=text)
 
-    def advance(self) -> None:
-        """One item is done."""
-        self._progress.advance(self._task)
+    def advance(self, items: int = 1) -> None:
+        """So many items are done."""
+        self._progress.advance(self._task, items)

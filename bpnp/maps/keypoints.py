@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
 MOST_DETECTED = 8192
+CONTRAST = 0.02  # of three layers together, of 1: COLMAP's peak_threshold of 0.02 / 3; half of OpenCV's default
 
 
 class Keypoints(NamedTuple):
@@ -27,16 +28,18 @@ class Keypoints(NamedTuple):
 def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
     """SIFT keypoints of a photo (Lowe 2004, OpenCV's), one for each place, the score its scale in pixels.
 
-    Large ones are seen again from other sides and triangulated, so that the scale tells better than the response which
-    have a partner in a map. Raises ValueError for a photo that cannot be read or has no keypoints.
+    As faint as COLMAP's, and the `most` largest, of which COLMAP's maps are made too. Large ones are seen again from
+    other sides and triangulated, so that the scale tells better than the response which have a partner in a map.
+    Raises ValueError for a photo that cannot be read or has no keypoints.
     """
     import cv2
 
     image = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise ValueError(f"expected a photo that OpenCV can read, got {photo}")
-    found = cv2.SIFT.create(nfeatures=most, enable_precise_upscale=True).detect(image)
+    found = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True).detect(image)
     rows = np.array([(*point.pt, point.size) for point in found], np.float64).reshape(-1, 3)
+    rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
     pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)
     if not len(pixels):
         raise ValueError(f"expected a photo with keypoints, got none in {photo}")

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import h5py
 import numpy as np
+import pycolmap
 import pytest
 from PIL import Image
+from scipy.ndimage import gaussian_filter
 
 from bpnp.maps.keypoints import detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
@@ -33,6 +35,21 @@ def test_discs_are_found_at_their_centres_and_large_ones_are_stronger(blobs) -> 
     assert (distance.min(0) < 0.3).all()
     sizes = found.scores[distance.argmin(0)]
     np.testing.assert_allclose(sizes / radii, np.median(sizes / radii), rtol=0.25)
+
+
+def test_keypoints_are_as_faint_as_those_of_colmap_and_the_largest(tmp_path: Path) -> None:
+    """A map's points come from them, so that without the faint ones most of the map would have no partner."""
+    noise = np.random.default_rng(0).normal(size=(200, 240))
+    picture = sum(gaussian_filter(noise, width) * width for width in (1.5, 3.0, 6.0)) * 0.04 + 0.5
+    Image.fromarray((255 * picture).round().clip(0, 255).astype(np.uint8)).save(tmp_path / "noise.png")
+    found = detected_keypoints(tmp_path / "noise.png")
+    pycolmap.extract_features(tmp_path / "database.db", tmp_path, image_names=["noise.png"])
+    with pycolmap.Database.open(tmp_path / "database.db") as content:
+        theirs = content.read_keypoints(content.read_image_with_name("noise.png").image_id)[:, :2]
+    distance = np.linalg.norm(theirs[:, None] - found.pixels, axis=-1).min(1)
+    assert (distance < 1).mean() > 0.8
+    largest = detected_keypoints(tmp_path / "noise.png", most=20)
+    np.testing.assert_array_equal(np.sort(largest.scores), np.sort(found.scores)[-len(largest.scores) :])
 
 
 def test_what_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:

@@ -1,0 +1,70 @@
+"""Photos localised by the workers of a Dask cluster; needs the extra `cluster`."""
+
+import uuid
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+from distributed import Client, Future, LocalCluster, WorkerPlugin, as_completed, get_worker
+
+from bpnp.localization.in_maps import Attempt, PhotoOptions, attempt
+from bpnp.maps.scene_map import SceneMap
+from bpnp.solving.solution import Solution
+
+QUEUED = 4  # photos for each thread of the workers: none waits for the next one, and the scheduler holds few
+PATIENCE = "10s"  # until a scheduler answers
+
+
+class MapOfWorker(WorkerPlugin):
+    """The map, which Dask sends once to each worker, also to one that joins later."""
+
+    def __init__(self, scene: SceneMap) -> None:
+        self.scene, self.name = scene, f"bpnp-{uuid.uuid4().hex}"
+
+
+def attempts_on_cluster(
+    scene: SceneMap, files: Mapping[str, Path], options: PhotoOptions, cluster: str
+) -> Iterator[Attempt]:
+    """The photos in the order in which they are finished.
+
+    cluster: address of a scheduler, such as tcp://10.0.0.1:8786, or how many processes to start on this machine.
+    The workers need bpnp, and photos and keypoints under the same paths as here. A photo whose worker is lost is given
+    to another one. Raises ValueError if there is no scheduler at the address.
+    """
+    plugin = MapOfWorker(scene)
+    with connected(cluster) as client:
+        client.register_plugin(plugin)
+        names: dict[str, str] = {}
+
+        def submitted(photos: Iterable[tuple[str, Path]]) -> Iterator[Future]:
+            for name, photo in photos:
+                own = options if options.pairs is None else replace(options, pairs={name: options.pairs.get(name, ())})
+                future = client.submit(_attempt, plugin.name, name, photo.absolute(), own, pure=False)
+                names[future.key] = name
+                yield future
+
+        left = submitted(files.items())
+        done = as_completed(islice(left, QUEUED * max(sum(client.nthreads().values()), 1)))
+        for future in done:
+            yield names.pop(future.key), str(future.exception()) if future.status == "error" else future.result()
+            done.update(islice(left, 1))
+        client.unregister_worker_plugin(plugin.name)
+
+
+def connected(cluster: str) -> Client:
+    """A client of the scheduler at an address, or of as many single-threaded processes as a number says."""
+    if cluster.isdecimal():
+        if int(cluster) < 1:
+            raise ValueError(f"expected one or more processes, got {cluster}")
+        return Client(LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None))
+    try:
+        return Client(cluster, timeout=PATIENCE)
+    except (OSError, ValueError) as error:
+        raise ValueError(f"expected the address of a Dask scheduler or a number, got {cluster}: {error}") from error
+
+
+def _attempt(plugin: str, name: str, photo: Path, options: PhotoOptions) -> Solution | str:
+    holder = get_worker().plugins[plugin]
+    assert isinstance(holder, MapOfWorker)
+    return attempt(holder.scene, name, photo, options)

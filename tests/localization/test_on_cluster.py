@@ -1,0 +1,110 @@
+"""Photos on a cluster of two processes have the solutions of one process, also if a worker is killed in between."""
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from distributed import Client, LocalCluster
+from PIL import Image
+from planted_model import HEIGHT, WIDTH, plant_model
+
+from bpnp import SceneMap, Solution
+from bpnp.cli import main
+from bpnp.localization.in_maps import PhotoOptions, attempts, photo_files
+from bpnp.localization.on_cluster import attempts_on_cluster
+
+CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
+PHOTOS = 6
+PAIRS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
+    """A map, photos without content, and the database with their keypoints; photo k was taken near view k modulo 3."""
+    folder = tmp_path_factory.mktemp("place")
+    truth = plant_model(folder / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    (folder / "photos").mkdir()
+    rng = np.random.default_rng(0)
+    with pycolmap.Database.open(folder / "database.db") as content:
+        lens = pycolmap.Camera(camera_id=0, model=CAMERA[0], width=WIDTH, height=HEIGHT, params=CAMERA[1])
+        camera = content.write_camera(lens)
+        for k in range(PHOTOS):
+            name = f"new{k}.png"
+            Image.new("L", (WIDTH, HEIGHT)).save(folder / "photos" / name)
+            seen = truth.points3d[truth.seen[k % 3]] @ truth.rotations[k % 3].T + truth.translations[k % 3]
+            pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300] + 0.3 * rng.normal(size=(len(seen), 2))
+            number = content.write_image(pycolmap.Image(name=name, camera_id=camera))
+            content.write_keypoints(number, pixels.astype(np.float32))
+    return folder / "map", folder / "photos", folder / "database.db"
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[LocalCluster]:
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as own:
+        yield own
+
+
+def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: LocalCluster) -> None:
+    model, photos, database = place
+    scene, options = SceneMap.from_colmap(model), PhotoOptions(camera=CAMERA, features=database, pairs=PAIRS)
+    files = photo_files([photos]) | {"lost.png": photos / "lost.png"}
+    alone = dict(attempts(scene, files, options))
+
+    with Client(cluster) as client:
+        workers = client.run(os.getpid)
+        found = attempts_on_cluster(scene, files, options, cluster.scheduler_address)
+        results = dict([next(found)])
+        os.kill(min(workers.values()), signal.SIGKILL)
+        results |= dict(found)
+        assert set(client.run(os.getpid).values()) != set(workers.values())
+
+    assert set(results) == set(alone) == set(files)
+    assert "expected a photo that can be read" in str(results.pop("lost.png"))
+    for name, solution in results.items():
+        assert isinstance(solution, Solution)
+        assert solution.verdict == "confident"
+        np.testing.assert_array_equal(solution.rotation, alone[name].rotation)
+        np.testing.assert_array_equal(solution.matches, alone[name].matches)
+
+
+def test_each_worker_is_sent_the_map_once(place: tuple[Path, Path, Path], cluster: LocalCluster, monkeypatch) -> None:
+    """It is pickled for the workers, not for each of the photos."""
+    model, photos, database = place
+    scene = SceneMap.from_colmap(model)
+    pickled = []
+    monkeypatch.setattr(SceneMap, "__getstate__", lambda self: pickled.append(1) or self.__dict__, raising=False)
+    pairs = PAIRS | {"new5.png": []}
+    options = PhotoOptions(camera=CAMERA, features=database, pairs=pairs)
+    results = dict(attempts_on_cluster(scene, photo_files([photos]), options, cluster.scheduler_address))
+    assert len(results) == PHOTOS
+    assert len(pickled) == 1
+    assert "expected views for new5.png" in str(results["new5.png"])
+
+
+def test_the_command_goes_on_where_it_was(
+    place: tuple[Path, Path, Path], cluster: LocalCluster, tmp_path: Path
+) -> None:
+    model, photos, database = place
+    output = tmp_path / "out"
+    command = ["localize", str(model), str(photos), "--camera", "PINHOLE,520,520,400,300", "--keypoints", str(database)]
+    main([*command, "--output", str(output), "--no_pictures", "--cluster", cluster.scheduler_address])
+    lines = [line for line in (output / "poses.txt").read_text().splitlines() if not line.startswith("#")]
+    assert len(lines) == PHOTOS
+    (output / "solutions" / "new3.png.json").unlink()
+    (output / "poses.txt").unlink()
+    times = {file: file.stat().st_mtime_ns for file in (output / "solutions").iterdir()}
+    main([*command, "--output", str(output), "--no_pictures"])
+    assert [line for line in (output / "poses.txt").read_text().splitlines() if not line.startswith("#")] == lines
+    assert all(file.stat().st_mtime_ns == time for file, time in times.items())
+
+
+@pytest.mark.parametrize(("cluster_name", "got"), [("0", "got 0"), ("nowhere", "got nowhere"), ("tcp://[", "got tcp")])
+def test_no_scheduler_is_one_clear_error(place: tuple[Path, Path, Path], cluster_name: str, got: str) -> None:
+    model, photos, database = place
+    options = PhotoOptions(camera=CAMERA, features=database)
+    with pytest.raises(ValueError, match=f"expected .*{got}".replace("[", r"\[")):
+        next(attempts_on_cluster(SceneMap.from_colmap(model), photo_files([photos]), options, cluster_name))
