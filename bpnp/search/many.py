@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
-from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import beside, cooled, likeliest, nearby_batch
@@ -87,7 +87,7 @@ def search_poses(
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
     scene = entered()
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
-    candidates = few
+    candidates, turned = few, Candidates.none()  # turned: the likeliest ones of different rotations
     if len(few):
         rotation, translation = scene.enter(few.rotation, few.translation)
         candidates = replace(few, rotation=rotation, translation=translation)
@@ -115,6 +115,8 @@ def search_poses(
             found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
             searched += size
         candidates = merged([candidates, found], scene)
+        together = Candidates.concatenated([turned, found])
+        turned = best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
         batches += 1
         if progress is not None:
             progress(batches, time.monotonic() - start)
@@ -132,11 +134,10 @@ def search_poses(
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
     if result.log10_false_alarms > 0 and len(candidates) and candidates.hits[0] <= batches / 2:
-        leading = candidates[: settings.beside_poses]
-        for look, k in product(settings.beside, range(len(leading))):
+        for look, k in product(settings.beside, range(len(turned))):
             if deadline.passed():
                 break
-            candidates = merged([candidates, beside(scene, leading[k : k + 1], look)], scene)
+            candidates = merged([candidates, beside(scene, turned[k : k + 1], look)], scene)
             candidates, leaders = _weighed_leaders(candidates, scene, sets)
             if (safe := certain(leaders)) is not None:
                 return safe

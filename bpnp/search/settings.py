@@ -170,9 +170,9 @@ class SearchSettings:
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
     around: batches from a guess of the pose before those from anywhere.
     refined_directly: starts of `refine_poses` that need no clusters; more compete on clusters first.
-    beside: how poses around the best `beside_poses` are looked up, one rule after the other, if the batches end without
-        a pose that exceeds chance: among many outliers the right pose is no optimum on clusters, but is often some
-        degrees beside one. Many starts at one scale: with steps 2 of 4 photos of south_building were lost.
+    beside: how poses around the likeliest `beside_poses`, no two turned by less than `beside_deg`, are looked up, one
+        rule after the other, if the batches end without a pose that exceeds chance: among many outliers the right pose
+        is no optimum on clusters, but is often some degrees beside one. Six cost about as much as a batch from a prior.
     kept: candidates from batch to batch, and in the end.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
@@ -194,11 +194,13 @@ class SearchSettings:
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
     beside: tuple[Nearby, ...] = (
-        Nearby(2**18, 8.0, 0.08, points=(150, 600, 5000), kept=(2**15, 2**11, 150), first_scale=0.025, steps=0,
-               annealed=150),
-        Nearby(2**19, points=(150, 600, 5000), kept=(2**16, 2**12, 200), first_scale=0.04, steps=0, annealed=200),
+        Nearby(
+            wide_deg=10.0, wide_shift=0.1, points=(50, 300), kept=(2**14, 2**9), points_again=600, annealed=12,
+            first_scale=0.03, last_scale=0.015, steps=2,
+        ),
     )  # fmt: skip
-    beside_poses: int = 2
+    beside_poses: int = 6
+    beside_deg: float = 10.0
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
     least_annealed: int = 12
