@@ -17,6 +17,7 @@ that falls on a bearing tells more, and the copies find the narrower optimum wit
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -122,8 +123,9 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
 
 
+@lru_cache(6)
 def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:
-    """The raster of a scene's bearings, smoothed by a scale in spreads of them."""
+    """The raster of a scene's bearings, smoothed by a scale in spreads of them; kept for the next pose or batch."""
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / (2 + d[:, 2:])
     scale *= scene.spread
