@@ -194,11 +194,8 @@ class SearchSettings:
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
     beside: tuple[Nearby, ...] = (
-        Nearby(
-            wide_deg=10.0, wide_shift=0.1, points=(50, 300), kept=(2**14, 2**9), points_again=600, annealed=12,
-            first_scale=0.03, last_scale=0.015, steps=2,
-        ),
-    )  # fmt: skip
+        Nearby(2**17, 10.0, 0.1, 2**15, (50, 300), (2**14, 2**9), 0.03, 0.015, 2, 16, points_again=600, annealed=12),
+    )
     beside_poses: int = 6
     beside_deg: float = 10.0
     facing: Facing = Facing()
