@@ -115,8 +115,6 @@ def search_poses(
             found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
             searched += size
         candidates = merged([candidates, found], scene)
-        together = Candidates.concatenated([turned, found])
-        turned = best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
         batches += 1
         if progress is not None:
             progress(batches, time.monotonic() - start)
@@ -130,6 +128,8 @@ def search_poses(
         settled = stalled or is_unique(leaders, sets, rule)
         if settled and (safe := certain(leaders)) is not None:
             return safe
+        together = Candidates.concatenated([turned, found])
+        turned = best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
         exhausted = is_exhausted(candidates, scene, searched - bettered)
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.

@@ -17,8 +17,6 @@ that falls on a bearing tells more, and the copies find the narrower optimum wit
 
 import math
 from dataclasses import replace
-from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,21 +26,13 @@ from scipy.spatial.transform import Rotation
 from bpnp.compilation import in_time
 from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.raster import add_up
+from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby, Stages
 from bpnp.search.starts import Array, PosePrior
 
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
-
-
-class Raster(NamedTuple):
-    """What a point adds to the score of a pose by where it falls; see `kernels.raster.add_up`."""
-
-    values: Array
-    half: np.float32
-    per_cell: np.float32
 
 
 def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> Candidates:
@@ -87,29 +77,33 @@ def starts_of(scene: Scene, prior: PosePrior, rule: Nearby) -> int:
 
 
 def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
-    """Poses drawn from the prior, the first one its mean; each turns about the middle of the points.
-
-    There an error of the rotation moves the camera, not what it looks at.
-    """
-    middle, mean = scene.bulk3d.mean(0), np.asarray(prior.rotation, np.float32)
+    """Poses drawn from the prior, the first one its mean."""
+    mean = np.asarray(prior.rotation, np.float32)
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
     vectors[0], shifts[0] = 0, 0
-    rotation = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ mean
-    translation = mean @ middle + np.asarray(prior.translation, np.float32) + shifts - rotation @ middle
-    return Candidates.unscored(rotation, translation.astype(np.float32), hits=1)
+    return _turned(scene, mean, np.asarray(prior.translation, np.float32), vectors, shifts)
 
 
 def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
     """Each pose and copies of it whose points fall about `scale`, in spreads of the bearings, beside its own."""
-    middle, count = scene.bulk3d.mean(0), len(poses) * copies
-    rotation = np.repeat(poses.rotation, copies, 0)
-    centre = rotation @ middle + np.repeat(poses.translation, copies, 0)
-    vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, count, 3), np.float32)
-    shifts *= np.linalg.norm(centre, axis=-1, keepdims=True) * np.array([scene.spread, scene.spread, 1], np.float32)
+    rotation, translation = (np.repeat(x, copies, 0) for x in (poses.rotation, poses.translation))
+    vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, len(rotation), 3), np.float32)
+    depth = np.linalg.norm(rotation @ scene.bulk3d.mean(0) + translation, axis=-1, keepdims=True)
+    shifts *= depth * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
-    rotation = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
-    return Candidates.unscored(rotation, (centre + shifts - rotation @ middle).astype(np.float32), hits=1)
+    return _turned(scene, rotation, translation, vectors, shifts)
+
+
+def _turned(scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array) -> Candidates:
+    """Poses turned by rotation vectors (s, 3) about the middle of the points, and shifted by (s, 3).
+
+    There an error of the rotation moves the camera, not what it looks at.
+    """
+    middle = scene.bulk3d.mean(0)
+    turned = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
+    shifted = rotation @ middle + translation + shifts - turned @ middle
+    return Candidates.unscored(turned, shifted.astype(np.float32), hits=1)
 
 
 def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int) -> Candidates:
@@ -123,9 +117,14 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]
 
 
-@lru_cache(6)
 def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:
-    """The raster of a scene's bearings, smoothed by a scale in spreads of them; kept for the next pose or batch."""
+    """The raster of a scene's bearings, smoothed by a scale in spreads of them; the scene keeps it."""
+    if (rule, scale) not in scene.rasters:
+        scene.rasters[rule, scale] = _drawn_raster(scene, rule, scale)
+    return scene.rasters[rule, scale]
+
+
+def _drawn_raster(scene: Scene, rule: Nearby, scale: float) -> Raster:
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / (2 + d[:, 2:])
     scale *= scene.spread

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.evidence.image_statistics import solid_angle
+from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import SearchSettings
+from bpnp.search.settings import Nearby, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread
 
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
@@ -28,12 +29,13 @@ class Scene:
     spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
     compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
     image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
-    that is random. settings, deadline: of the search.
+    that is random. settings, deadline: of the search. rasters: of the bearings, those that were asked for (`nearby`).
     """
 
     def __init__(self, sets: PointSets, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = sets.bearings, sets.points3d
         self.settings, self.deadline = settings, deadline
+        self.rasters: dict[tuple[Nearby, float], Raster] = {}
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)
         bulk = points3d[in_bulk]

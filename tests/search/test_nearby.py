@@ -1,6 +1,7 @@
 """Starts around a rough pose find a planted one among more outliers than annealing on clusters can stand."""
 
 import time
+import weakref
 from dataclasses import replace
 
 import numpy as np
@@ -55,6 +56,15 @@ def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
     found = search_poses(PointSets(bearings, points, prior=prior))
     assert angle(found.best[0], rotation) < 0.3
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+
+
+def test_a_raster_is_computed_once_and_ends_with_its_scene() -> None:
+    bearings, points, *_ = cluttered(0)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    assert raster_of(scene, DEFAULT.nearby, 0.04) is raster_of(scene, DEFAULT.nearby, 0.04)
+    kept = weakref.ref(scene)
+    del scene
+    assert kept() is None
 
 
 def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:

@@ -5,10 +5,20 @@ stereographic projection around (0, 0, 1), which keeps small shapes and covers e
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from bpnp.search.kernels.vectors import F, compiled, rotated
 from bpnp.search.kernels.weighted import visible_weights
+
+
+class Raster(NamedTuple):
+    """What a point adds to the score of a pose by where it falls: the arguments of `add_up`."""
+
+    values: Any
+    half: np.float32
+    per_cell: np.float32
 
 
 @compiled
