@@ -26,8 +26,8 @@ def pack(checkpoint: str | Path, out: str | Path) -> None:
             state[key] = value.half() if value.is_floating_point() else value
             if not state[key].isfinite().all():
                 raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
-    with written_whole(Path(out)) as temporary:
-        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, temporary)
+    with written_whole(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
+        torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

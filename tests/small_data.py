@@ -1,8 +1,10 @@
 """Small data sets on disk, in the layouts that the recipes read, and a network small enough to train in a test."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from lightning import Trainer
 from torch import nn
 
 from bpnp import BPnPNet
@@ -49,6 +51,12 @@ def small_net(
         refinement=Refinement(enabled=refine),
         rounds=rounds,
     )
+
+
+def quiet_trainer(folder: Path, **settings: Any) -> Trainer:
+    """A trainer on the CPU that prints nothing and, unless told to, writes nothing."""
+    off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps")
+    return Trainer(**dict.fromkeys(off, False) | {"default_root_dir": folder, "accelerator": "cpu"} | settings)
 
 
 def write_mesh_tree(root: Path, *, train: int = 3, test: int = 2) -> Path:

@@ -20,8 +20,8 @@ from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser
 from bpnp.commands.training_help import GROUPS
 from bpnp.files import claimed
+from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.monitor import OfflineWandbLogger
-from bpnp.training.plugins import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 

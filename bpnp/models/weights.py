@@ -15,7 +15,6 @@ from bpnp.layers.ransac import RansacPnP
 from bpnp.models.composition import built, class_name, described, differences
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.features import ImageFeatures, PointFeatures, SceneFeatures
-from bpnp.models.older_checkpoints import brought_up_to_date
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
@@ -118,7 +117,9 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
         ) from error
     if not isinstance(content, dict) or "state_dict" not in content:
         raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {file}")
-    return brought_up_to_date(content)
+    if "blocks" in ((content.get("solver") or {}).get("settings") or {}):  # which every net had, now `depth`
+        raise ValueError(f"expected a checkpoint of this version, got one of an older form: {file}; try the older bpnp")
+    return content
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -27,7 +27,7 @@ from bpnp.report.results import Results, rows_from, summarise
 from bpnp.report.samples import PairView, read_views, select_views, thin, views_from, write_views
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs
-from bpnp.training.plugins import interruptible
+from bpnp.training.callbacks import interruptible
 from bpnp.training.task import BlindPnPTask
 
 IDENTITY = "method.json"

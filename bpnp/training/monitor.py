@@ -8,12 +8,17 @@ import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_warn
+from torch import Tensor, nn
 
 from bpnp.models.evaluation import refinement_enabled
+from bpnp.models.nets.normalisation import centred
 from bpnp.report.dashboards import image
 from bpnp.report.figures import plot_pair, save_figure
 from bpnp.report.samples import PairView, views_from
 from bpnp.types import Batch, Prediction
+
+COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
 
 
 class OfflineWandbLogger(WandbLogger):
@@ -44,7 +49,9 @@ class OfflineWandbLogger(WandbLogger):
 
 class TrainingMonitor(Callback):
     """Logs "train/pairs_per_second" per epoch and, of the first few validation pairs, "val/true_match_mass", the
-    probability that the assignment gives to their true matches, and "val/<estimate>_iterations" of each pose.
+    probability that the assignment gives to their true matches, "val/<estimate>_iterations" of each pose, and
+    "val/feature_spread_2d" and "_3d" (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a
+    set have the same feature the assignment is uniform, and the loss stays where it is.
 
     Every `every` epochs the same pairs are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
     of the trainer's default_root_dir.
@@ -87,8 +94,15 @@ class TrainingMonitor(Callback):
         batch = self.watched.to(pl_module.device)
         with torch.no_grad(), refinement_enabled(pl_module, False):
             prediction = pl_module(batch)
-        values = {f"val/{key}": value for key, value in watched_values(prediction, batch).items()}
+            spreads = feature_spreads(getattr(pl_module, "solver", pl_module), batch)
+        values = {f"val/{key}": value for key, value in (watched_values(prediction, batch) | spreads).items()}
         pl_module.log_dict(values, batch_size=len(batch), sync_dist=True)
+        if any(spread < COLLAPSED for spread in spreads.values()):
+            rank_zero_warn(
+                f"expected features that differ from point to point, got spreads of {min(spreads.values()):.2g} and "
+                f"{max(spreads.values()):.2g} at step {trainer.global_step}: the features have collapsed; try a lower "
+                "model.learning_rate, a warm-up, or `centre` of the solver's features"
+            )
         if self.every and trainer.current_epoch % self.every == 0 and trainer.is_global_zero:
             _draw(trainer, views_from(prediction, batch))
 
@@ -96,13 +110,24 @@ class TrainingMonitor(Callback):
 def first_pairs(batch: Batch, count: int) -> Batch:
     """The first pairs of a batch, on the CPU."""
     parts: dict[str, Any] = {
-        name: value[:count].cpu() if isinstance(value, torch.Tensor) else value and value[:count]
+        name: value[:count].cpu() if isinstance(value, Tensor) else value and value[:count]
         for name, value in vars(batch).items()
     }
     return Batch(**parts)
 
 
-def watched_values(prediction: Prediction, batch: Batch) -> dict[str, torch.Tensor]:
+def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
+    """Mean distance of the unit features of each set from their mean: 1 for vectors in all directions, 0 for one
+    vector; empty for a solver without a method `features`."""
+    features = solver.features(batch) if hasattr(solver, "features") else ()  # type: ignore[operator]
+    spreads = {}
+    for side, z, mask in zip(("2d", "3d"), features, (batch.mask2d, batch.mask3d), strict=False):
+        away = torch.linalg.vector_norm(centred(nn.functional.normalize(z, dim=-1), mask), dim=-1) * mask
+        spreads[f"feature_spread_{side}"] = (away.sum(1) / mask.sum(1)).mean()
+    return spreads
+
+
+def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
     """Mean over the pairs of the probability on true matches, and of the iterations of each pose."""
     values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
     if prediction.assignment is not None and batch.match3d is not None:

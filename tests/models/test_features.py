@@ -2,15 +2,12 @@ from collections.abc import Callable
 
 import pytest
 import torch
-from lightning import LightningModule, Trainer
-from small_data import small_net
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
 from bpnp.models.nets.normalisation import MaskedBatchNorm
 from bpnp.models.nets.pointwise import pointwise_norm
-from bpnp.training.plugins import CompileNets
 
 SIZES = (9, 1, 14)
 
@@ -229,17 +226,3 @@ def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype) 
     assert (out - exact).abs().max() < rounding
     for got, expected in zip(grads, exact_grads, strict=True):
         assert (got - expected).norm() < 10 * rounding * expected.norm()
-
-
-def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch) -> None:
-    compiled = []
-    monkeypatch.setattr(nn.Module, "compile", lambda net, backend: compiled.append((net, backend)))
-    task = LightningModule()
-    task.solver = net = small_net(8, 2)
-    trainer = Trainer(accelerator="cpu", barebones=True)
-    CompileNets(backend="eager").on_fit_start(trainer, task)
-    assert [part is net.features2d or part is net.features3d for part, _ in compiled] == [True] * 2
-    assert {backend for _, backend in compiled} == {"eager"}
-    task.solver = nn.Identity()
-    with pytest.raises(ValueError, match="expected a solver with `features2d` and `features3d`, got Identity"):
-        CompileNets().on_fit_start(trainer, task)

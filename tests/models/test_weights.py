@@ -1,4 +1,4 @@
-"""Checkpoints: written and read as plain data, of networks made of parts, and of those with one constructor."""
+"""Checkpoints: written and read as plain data, of networks made of parts."""
 
 from pathlib import Path
 from typing import Any
@@ -14,15 +14,7 @@ from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
 from bpnp.models import Refinement, TrainedNet
 from bpnp.models.composition import built, described, differences
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.older_checkpoints import brought_up_to_date
 from bpnp.models.weights import PARTS, fitting_state
-
-OLD = {  # settings of a checkpoint that was written when BPnPNet had one constructor
-    "channels": 16, "blocks": 2, "batch_norm": True, "centre_features": True, "image_scale": 4.0,
-    "normalise_scene": True, "mu": 0.2, "learn_mu": True, "dustbin": None, "sinkhorn_tolerance": 1e-5,
-    "ransac_backend": "opencv", "ransac_iterations": 500, "threshold": 0.004, "pairs_factor": 16.0,
-    "pnp_method": "lbfgs", "pnp_iterations": 20, "refine": False, "hypotheses": 5, "rounds": 8,
-}  # fmt: skip
 
 
 class Flat(nn.Module):
@@ -132,43 +124,11 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     assert list(differences(described(Flat(2)), described(Flat(3)))) == ["coordinates=2"]
 
 
-def test_the_options_of_the_older_constructor_are_those_of_the_parts(tmp_path: Path) -> None:
-    shape = {"channels": 16, "depth": 2, "batch_norm": True, "centre": True}
-    net = BPnPNet(
-        ImageFeatures(**shape, scale=4.0),
-        SceneFeatures(**shape, normalise=True),
-        Sinkhorn(mu=0.2, learn_mu=True, tolerance=1e-5),
-        RansacPnP(backend="opencv", max_iterations=500, threshold=0.004, pairs_factor=16.0),
-        WeightedPnP(method="lbfgs", max_iterations=20),
-        refinement=Refinement(hypotheses=5, enabled=False),
-        rounds=8,
-    ).eval()
-    older = {"features3d.align": "align", "transport": "sinkhorn"}
-    state = {}
-    for name, value in net.state_dict().items():
-        old = next((was + name.removeprefix(now) for now, was in older.items() if name.startswith(now)), name)
-        state[f"solver.{old}"] = value
-    assert "solver.sinkhorn.log_mu" in state
-    assert "solver.align.out.weight" in state
-    torch.save({"solver": {"class": "BPnPNet", "settings": OLD}, "state_dict": state}, tmp_path / "old.ckpt")
-    again = BPnPNet.from_checkpoint(tmp_path / "old.ckpt")
-    assert described(again) == described(net)
-    torch.testing.assert_close(again.state_dict(), net.state_dict(), rtol=0, atol=0)
-    # The state of an optimiser goes by the order of the parameters.
-    assert [name for name, _ in again.named_parameters()] == [name for name, _ in net.named_parameters()]
-
-
-def test_older_settings_may_lack_options_and_hold_none_that_never_was() -> None:
-    content: dict[str, Any] = {"solver": {"class": "BPnPNet", "settings": {"channels": 8}}, "state_dict": {}}
-    net = built(brought_up_to_date(content)["solver"], (*PARTS, BPnPNet))
-    assert net.refinement.hypotheses == Refinement().hypotheses
-    assert (net.features2d.channels, net.features3d.channels) == (8, 8)
-    pose = {"class": "Matcher", "settings": {"blocks": 1, "heads": 2, "channels": 8, "pose": {"threshold": 0.004}}}
-    matcher = built(brought_up_to_date({"solver": pose, "state_dict": {}})["solver"], (*PARTS, Matcher))
-    assert (matcher.depth, matcher.ransac.threshold, matcher.ransac.pairs_factor) == (1, 0.004, 1.5)
-    content["solver"]["settings"]["nonsense"] = 1
-    with pytest.raises(ValueError, match="expected options of BPnPNet, got 'nonsense'"):
-        brought_up_to_date(content)
+def test_a_checkpoint_of_an_older_form_is_refused_as_such(tmp_path: Path) -> None:
+    older = {"solver": {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "mu": 0.2}}, "state_dict": {}}
+    torch.save(older, tmp_path / "old.ckpt")
+    with pytest.raises(ValueError, match=r"got one of an older form: .*old.ckpt; try"):
+        TrainedNet.from_checkpoint(tmp_path / "old.ckpt")
 
 
 @pytest.mark.parametrize("content", [{"solver": {"class": "Hungarian"}, "state_dict": {}}, {"state_dict": {}}, [1]])

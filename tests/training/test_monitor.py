@@ -6,23 +6,29 @@ import numpy as np
 import pytest
 import torch
 import wandb
-from lightning import LightningModule, Trainer
+from lightning import LightningModule
 from lightning.pytorch.loggers import CSVLogger
 from matplotlib.image import imread
+from small_data import quiet_trainer
 from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor, first_pairs, watched_values
+from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_pairs, watched_values
 from bpnp.types import Pose, SolveStats
 
 
 class PlantedModule(LightningModule):
-    """Puts 0.25 of the mass on the true matches, the rest on a clutter point, and says 7 iterations."""
+    """Puts 0.25 of the mass on the true matches, the rest on a clutter point, and says 7 iterations; the points are
+    their own features, times `feature`."""
 
-    def __init__(self) -> None:
+    def __init__(self, feature: float = 1.0) -> None:
         super().__init__()
         self.weight = nn.Parameter(torch.ones(()))
+        self.feature = feature
+
+    def features(self, batch: Batch) -> tuple[torch.Tensor, torch.Tensor]:
+        return batch.points2d, self.feature * batch.points3d + (1 - self.feature)
 
     def forward(self, batch: Batch) -> Prediction:
         assert batch.match3d is not None
@@ -58,17 +64,7 @@ def planted(size: int) -> Batch:
 
 def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3) -> None:
     loader = DataLoader([planted(6), planted(4)], batch_size=None)  # type: ignore[arg-type]
-    trainer = Trainer(
-        default_root_dir=folder,
-        max_epochs=epochs,
-        callbacks=[monitor],
-        logger=logger,  # type: ignore[arg-type]
-        accelerator="cpu",
-        enable_progress_bar=False,
-        enable_model_summary=False,
-        enable_checkpointing=False,
-        log_every_n_steps=1,
-    )
+    trainer = quiet_trainer(folder, max_epochs=epochs, callbacks=[monitor], logger=logger, log_every_n_steps=1)
     trainer.fit(PlantedModule(), loader, loader)
 
 
@@ -78,6 +74,27 @@ def test_the_mass_on_true_matches_and_the_iterations_are_those_planted() -> None
     assert float(values["true_match_mass"]) == pytest.approx(0.25)
     assert float(values["pnp_iterations"]) == 7
     assert watched_values(Prediction(), batch) == {}
+
+
+def test_the_spread_of_known_features() -> None:
+    """Corners are sqrt(1 - 1/4) from their mean; of opposite points what is padded does not count."""
+    corners, opposite = torch.eye(4).expand(1, 4, 4), torch.tensor([[[1.0, 0], [-3, 0], [0, 9], [0, 9]]])
+    batch, solver = planted(1), nn.Identity()
+    batch.mask2d, batch.mask3d = torch.ones(1, 4, dtype=torch.bool), torch.tensor([[True, True, False, False]])
+    assert feature_spreads(solver, batch) == {}
+    for features, spreads in (((corners, opposite), (0.75**0.5, 1)), ((torch.ones(1, 4, 3), opposite), (0, 1))):
+        solver.features = lambda _, given=features: given
+        found = feature_spreads(solver, batch)
+        assert (float(found["feature_spread_2d"]), float(found["feature_spread_3d"])) == pytest.approx(spreads)
+
+
+def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
+    loader = DataLoader([planted(6)], batch_size=None)  # type: ignore[arg-type]
+    trainer = quiet_trainer(tmp_path, max_epochs=1, callbacks=[TrainingMonitor(every=0)])
+    with pytest.warns(UserWarning, match="features have collapsed; try a lower model.learning_rate"):
+        trainer.fit(PlantedModule(feature=0.0), loader, loader)
+    assert float(trainer.callback_metrics["val/feature_spread_3d"]) < 1e-6
+    assert float(trainer.callback_metrics["val/feature_spread_2d"]) > 0.1
 
 
 def test_the_first_pairs_are_those_of_the_batch() -> None:

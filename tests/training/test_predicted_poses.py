@@ -3,9 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from lightning import Trainer
 from planted_model import plant_model
 from scipy.spatial.transform import Rotation
+from small_data import quiet_trainer
 from torch import nn
 
 from bpnp import Batch, Pose, Prediction, SolveStats
@@ -28,8 +28,7 @@ class Oracle(nn.Module):
 def test_poses_are_written_in_the_coordinates_of_a_scene_far_from_its_origin(tmp_path: Path) -> None:
     planted = plant_model(tmp_path / "scene" / "sparse" / "0", origin=1e4)
     module = ColmapDataModule(root=str(tmp_path / "scene"))
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-    trainer = Trainer(default_root_dir=tmp_path, callbacks=[ResultsWriter()], **quiet)
+    trainer = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
     trainer.predict(BlindPnPTask(Oracle()), datamodule=module, return_predictions=False)
     with (tmp_path / "predict" / "poses.csv").open(newline="") as file:
         rows = {row["id"].split("/")[-1]: row for row in csv.DictReader(file)}

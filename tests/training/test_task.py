@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from lightning import Callback, Trainer
-from small_data import SMALL_MESHES, small_net
+from small_data import SMALL_MESHES, quiet_trainer, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
@@ -13,9 +13,9 @@ import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
+from bpnp.training.callbacks import PoseLossWarmup
 from bpnp.training.losses import correspondence_loss, pose_loss
 from bpnp.training.results_writer import ResultsWriter
-from bpnp.training.schedules import PoseLossWarmup
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 
@@ -49,31 +49,27 @@ def data(tmp_path: Path, **settings: object) -> MeshDataModule:
     return MeshDataModule(**({k: int(v) for k, v in small.items()} | {"cache_dir": str(tmp_path / "cache")} | settings))
 
 
-def trainer(tmp_path: Path, **settings: object) -> Trainer:
-    quiet = {"logger": False, "enable_progress_bar": False, "enable_model_summary": False, "accelerator": "cpu"}
-    return Trainer(default_root_dir=tmp_path, num_sanity_val_steps=0, **(quiet | settings))
+def fit(tmp_path: Path, task: BlindPnPTask, ckpt_path: str | None = None, **settings: object) -> Trainer:
+    """One epoch unless told otherwise, without validation."""
+    run = quiet_trainer(tmp_path, **({"max_epochs": 1, "limit_val_batches": 0} | settings))
+    run.fit(task, datamodule=data(tmp_path), ckpt_path=ckpt_path, weights_only=ckpt_path is not None)
+    return run
 
 
 def test_no_pose_is_solved_in_training_before_the_switch(tmp_path: Path) -> None:
     task = BlindPnPTask(CountingSolver(), learning_rate=1e-4)
     callbacks = [PoseLossWarmup(start_epoch=1, weight=0.5)]
-    trainer(tmp_path, max_epochs=2, limit_train_batches=3, limit_val_batches=0, callbacks=callbacks,
-            enable_checkpointing=False).fit(task, datamodule=data(tmp_path))  # fmt: skip
+    fit(tmp_path, task, max_epochs=2, limit_train_batches=3, callbacks=callbacks)
     assert task.solver.wanted == [False] * 3 + [True] * 3
     assert callbacks[0].switched_at == 1
     assert task.pose_weight == 0.5
 
 
 def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None:
-    run = trainer(tmp_path, max_epochs=2, limit_train_batches=1, limit_val_batches=0,
-                  callbacks=[PoseLossWarmup(start_epoch=1)])  # fmt: skip
-    run.fit(BlindPnPTask(CountingSolver()), datamodule=data(tmp_path))
-    run.save_checkpoint(tmp_path / "two.ckpt")
-    resumed = BlindPnPTask(CountingSolver())
-    trainer(tmp_path, max_epochs=3, limit_train_batches=1, limit_val_batches=0, enable_checkpointing=False,
-            callbacks=[PoseLossWarmup(start_epoch=50)]).fit(
-        resumed, datamodule=data(tmp_path), ckpt_path=str(tmp_path / "two.ckpt"), weights_only=True
-    )  # fmt: skip
+    first, resumed, file = BlindPnPTask(CountingSolver()), BlindPnPTask(CountingSolver()), str(tmp_path / "two.ckpt")
+    run = fit(tmp_path, first, max_epochs=2, limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=1)])
+    run.save_checkpoint(file)
+    fit(tmp_path, resumed, file, max_epochs=3, limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=50)])
     assert resumed.solver.wanted == [True]
 
 
@@ -81,8 +77,7 @@ def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) ->
     def run(broken_calls: tuple[int, ...], steps: int) -> BlindPnPTask:
         torch.manual_seed(3)
         task = BlindPnPTask(CountingSolver(broken_calls), learning_rate=1e-3)
-        trainer(tmp_path, max_epochs=1, limit_train_batches=steps, limit_val_batches=0,
-                enable_checkpointing=False).fit(task, datamodule=data(tmp_path))  # fmt: skip
+        fit(tmp_path, task, limit_train_batches=steps)
         return task
 
     broken, short = run((2,), 3), run((), 2)
@@ -109,9 +104,7 @@ def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the
             assert counts.samples == counts.unconverged == 0
             shares.append(trainer.callback_metrics.get("train/backward_failed"))
 
-    run = trainer(tmp_path, max_epochs=2, limit_train_batches=3, limit_val_batches=0, enable_checkpointing=False,
-                  callbacks=[Failing()])  # fmt: skip
-    run.fit(task, datamodule=data(tmp_path))
+    run = fit(tmp_path, task, max_epochs=2, limit_train_batches=3, callbacks=[Failing()])
     assert shares == [None, 3 / 12]
     assert run.callback_metrics["train/backward_failed"] == 0
 
@@ -120,7 +113,7 @@ def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytes
     monkeypatch.setattr(bpnp.training.task, "MOST_SKIPPED", 4)
     task = BlindPnPTask(CountingSolver(broken_calls=tuple(range(100))))
     with pytest.raises(TrainingDivergedError, match=r"got 4 steps in a row without.*try a lower model.learning_rate"):
-        trainer(tmp_path, max_epochs=1, enable_checkpointing=False).fit(task, datamodule=data(tmp_path))
+        fit(tmp_path, task)
     assert len(task.solver.wanted) == 4
 
 
@@ -147,8 +140,8 @@ def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> N
         solver = small_net(scale=4.0, centre=True)
         solver.features3d.align = Untransformed()
         task = BlindPnPTask(solver, pose_weight=pose_weight)
-        trainer(tmp_path, max_steps=1, accumulate_grad_batches=len(batches), limit_val_batches=0,
-                enable_checkpointing=False).fit(task, DataLoader(batches, batch_size=None))  # fmt: skip
+        run = quiet_trainer(tmp_path, max_steps=1, accumulate_grad_batches=len(batches), limit_val_batches=0)
+        run.fit(task, DataLoader(batches, batch_size=None))
         return {name: p.grad for name, p in solver.named_parameters()}
 
     for pose_weight in (0.0, 0.5):
@@ -181,7 +174,7 @@ def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
 def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     module = data(tmp_path, num_points=40, noise_px=0.0)
     task = BlindPnPTask(small_net())
-    run = trainer(tmp_path, callbacks=[ResultsWriter()])
+    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
     run.test(task, datamodule=module, verbose=False)
     results = read_results(tmp_path / "test")
     assert len(results.rows) == 7 * 3
@@ -195,16 +188,11 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     assert len(lines) == 1 + 7 * 3
 
 
-def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected start_epoch >= 0"):
-        PoseLossWarmup(start_epoch=-1)
-
-
 def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Path) -> None:
     packaged = Matcher.from_pretrained("matcher-clutter")
     task = BlindPnPTask(Matcher(), weights="matcher-clutter")
     assert all(torch.equal(own, packaged.state_dict()[key]) for key, own in task.solver.state_dict().items())
-    trainer = Trainer(max_epochs=0, accelerator="cpu", logger=False, default_root_dir=tmp_path, barebones=False)
+    trainer = quiet_trainer(tmp_path, max_epochs=0)
     small = BlindPnPTask(Matcher(channels=16, depth=1))
     trainer.strategy.connect(small)
     trainer.save_checkpoint(tmp_path / "small.ckpt", weights_only=True)
