@@ -1,5 +1,8 @@
 """Results of planted pairs for the tests of the page and of the figures."""
 
+import base64
+import gzip
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,13 +14,19 @@ from bpnp.report.samples import PairView, write_views
 HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcff"
 
 
+def inflated(text: str) -> str:
+    """What `compressed` put into the page."""
+    return gzip.decompress(base64.b64decode(text)).decode()
+
+
 def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) -> list[PairRow]:
-    """Random rows; the first pair has a hostile name, every seventh no pose, the second no reprojection error."""
-    rng = np.random.default_rng(seed)
+    """Random rows of pairs whose sizes do not depend on the seed; the first pair has a hostile name, every seventh no
+    pose, the second no reprojection error."""
+    rng, sizes = np.random.default_rng(seed), np.random.default_rng(0)
     planted = []
     for i in range(count):
         name = HOSTILE if i == 0 else f"scene/{i:04d}"
-        m, n = (int(size) for size in rng.integers(10, 99, 2))
+        m, n = (int(size) for size in sizes.integers(10, 99, 2))
         for estimate in estimates:
             found = i % 7 != 6
             errors = (
@@ -31,6 +40,13 @@ def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) 
                 PairRow(i, name, estimate, *errors, inliers, m, n, min(m, n), 12, 1e-8, converged, found, seconds)
             )
     return planted
+
+
+def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
+    """A row of random errors, with changes."""
+    values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
+    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
+    return replace(first, **changes)  # type: ignore[arg-type]
 
 
 def view(index: int, name: str, points: int = 30) -> PairView:

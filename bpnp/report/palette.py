@@ -8,13 +8,17 @@ from collections.abc import Mapping, Sequence
 
 LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#58006e", "#201816")
 DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
-LIGHT_BACKGROUND = "#ffffff"
-DARK_BACKGROUND = "#14171c"
-# Colours of the page itself: quiet text, lines between rows, panels, what has the focus, wrong matches.
-INKS = ("text", "quiet", "line", "panel", "focus", "wrong")
-LIGHT_INKS = ("#1b1f24", "#59626d", "#d5dae0", "#f5f6f8", "#0b57d0", "#b3261e")
-QUIET = LIGHT_INKS[1]
-DARK_INKS = ("#e6e8eb", "#a0a8b3", "#363c45", "#1d2128", "#8ab4f8", "#ff8a80")
+# The page itself, light and dark: quiet text, lines between rows, panels, what has the focus, wrong matches.
+INKS = {
+    "background": ("#ffffff", "#14171c"),
+    "text": ("#1b1f24", "#e6e8eb"),
+    "quiet": ("#59626d", "#a0a8b3"),
+    "line": ("#d5dae0", "#363c45"),
+    "panel": ("#f5f6f8", "#1d2128"),
+    "focus": ("#0b57d0", "#8ab4f8"),
+    "wrong": ("#b3261e", "#ff8a80"),
+} | {f"c{i}": pair for i, pair in enumerate(zip(LIGHT, DARK, strict=True))}
+QUIET = INKS["quiet"][0]
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
 
 
@@ -25,12 +29,9 @@ def styles(runs: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], tuple[int
     """
     series = [(run, estimate) for run, estimates in runs.items() for estimate in estimates]
     names = list(dict.fromkeys(estimate for _, estimate in series))
-    order = {key: i for i, key in enumerate(series)} if len(series) <= len(LIGHT) else None
     places = {run: i for i, run in enumerate(runs)}
+    alone = len(series) <= len(LIGHT)
     return {
-        (run, estimate): (
-            (places[run] if order is None else order[run, estimate]) % len(LIGHT),
-            names.index(estimate) % len(DASHES),
-        )
-        for run, estimate in series
+        (run, estimate): ((i if alone else places[run]) % len(LIGHT), names.index(estimate) % len(DASHES))
+        for i, (run, estimate) in enumerate(series)
     }

@@ -50,7 +50,7 @@ def jpeg(photo: Array, *, quality: int = 70) -> bytes:
 
 
 def page_photos(runs: Mapping[str, Sequence[PairView]], photo: PhotoFinder | None) -> dict[str, dict[str, object]]:
-    """By pair, {"box", "jpeg"} as the page reads them, the worst pairs first while there is room."""
+    """By pair, a plotly layout image that fills its box, the worst pairs first while there is room."""
     if photo is None:
         return {}
     views = sorted((view for views in runs.values() for view in views), key=lambda view: -view.error)
@@ -65,5 +65,8 @@ def page_photos(runs: Mapping[str, Sequence[PairView]], photo: PhotoFinder | Non
         left -= len(content)
         if left < 0:
             break
-        found[view.id] = {"box": list(box), "jpeg": content}
+        found[view.id] = {
+            "source": f"data:image/jpeg;base64,{content}", "xref": "x", "yref": "y", "sizing": "stretch",
+            "layer": "below", "x": box.left, "y": box.top, "sizex": box.right - box.left, "sizey": box.bottom - box.top,
+        }  # fmt: skip
     return found

@@ -94,10 +94,14 @@ def select_views(views: Iterable[PairView], *, worst: int = 12, others: int = 12
         raise ValueError(f"expected `worst` and `others` >= 0, got {worst} and {others}")
     once = {view.index: view for view in views}
     by_error = sorted(once.values(), key=lambda view: (-view.error, view.index))
-    # Multiplying by the golden ratio modulo 1 spreads indices evenly, whatever their number.
-    spread = sorted(once.values(), key=lambda view: (view.index * 2654435769) % 2**32)
+    spread = sorted(once.values(), key=lambda view: spread_key(view.index))
     chosen = {view.index: view for view in [*by_error[:worst], *spread[:others]]}
     return tuple(chosen[index] for index in sorted(chosen))
+
+
+def spread_key(index: int) -> int:
+    """A key whose order spreads indices evenly, whatever their number: multiples of the golden ratio modulo 1."""
+    return index * 2654435769 % 2**32
 
 
 def thin(view: PairView, most: int = FEW) -> PairView:

@@ -1,5 +1,3 @@
-import base64
-import gzip
 import json
 import re
 from dataclasses import replace
@@ -9,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
-from report_data import HOSTILE, rows, write_run
+from report_data import HOSTILE, inflated, rows, write_run
 
 from bpnp.report import read_results, write_page, write_results
 from bpnp.report.page.charts import chart_text, error_chart, page_charts, recall_chart
 from bpnp.report.page.text import headline_html
-from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script, script_json
+from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
 
 
 class Elements(HTMLParser):
@@ -36,26 +34,23 @@ class Elements(HTMLParser):
             self.scripts[-1] += data
 
 
-def unpacked(column: dict[str, str]) -> np.ndarray:
-    ((kind, text),) = column.items()
-    return np.frombuffer(base64.b64decode(text), "<" + kind)
-
-
 def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
-    written = [write_run(tmp_path / name, 20, seed) for seed, name in enumerate(("a", "b"))]
+    """All to five significant digits, those of the tables in full."""
+    written = {name: write_run(tmp_path / name, 20, seed) for seed, name in enumerate(("a", "b"))}
     page = write_page([tmp_path / "a" / "test", tmp_path / "b"], tmp_path / "out" / "report.html", paper="megadepth")
     text = page.read_text(encoding="utf-8")
-    data = json.loads(Elements(text).scripts[0])
-    assert [run["name"] for run in data["runs"]] == ["a", "b"]
-    assert data["ids"] == [[HOSTILE, *(f"scene/{i:04d}" for i in range(1, 20))]]
-    for run, results in zip(data["runs"], written, strict=True):
-        assert unpacked(run["sizes"]["n"]).tolist() == [row.n for row in results.of("pnp")]
-        for name, estimate in run["estimates"].items():
-            for key in ("rotation_error_deg", "translation_error", "reprojection_error_deg", "seconds", "inliers"):
-                np.testing.assert_allclose(
-                    unpacked(estimate["columns"][key]), [getattr(row, key) for row in results.of(name)], rtol=1e-6
-                )
-            assert f'title="{results.estimates[name]["rotation_q2_deg"]}"' in text
+    data = json.loads(inflated(Elements(text).scripts[0]))
+    columns = data["columns"]
+    assert [(own["run"], own["estimate"]) for own in data["series"]] == [
+        (r, e) for r in "ab" for e in ("ransac", "pnp")
+    ]
+    for own in data["series"]:
+        results = written[own["run"]]
+        assert columns[own["ids"]] == [HOSTILE.replace("\udcff", "?"), *(f"scene/{i:04d}" for i in range(1, 20))]
+        for key in ("rotation_error_deg", "translation_error", "reprojection_error_deg", "seconds", "inliers", "n"):
+            shown = np.array(columns[own["numbers"][key]], float)
+            np.testing.assert_allclose(shown, [getattr(r, key) for r in results.of(own["estimate"])], rtol=6e-5)
+        assert f'title="{results.estimates[own["estimate"]]["rotation_q2_deg"]}"' in text
     assert text.count("paper, MegaDepth: Lc Lp") == 2
 
 
@@ -104,11 +99,11 @@ def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path:
     elements = Elements(page)
     assert len(elements.scripts) == 4
     assert not re.search(r"\b(src|srcset|action|data)=|@import|url\(|\bfetch\(|XMLHttpRequest|innerHTML", page)
-    assert gzip.decompress(base64.b64decode(elements.scripts[2])).decode() == get_plotlyjs()
+    assert inflated(elements.scripts[2]) == get_plotlyjs()
     links = [attributes["href"] or "" for tag, attributes in elements.tags if "href" in attributes]
     assert len(links) > 3
     assert all(link == "data:," or link.startswith("#") for link in links)
-    assert set(re.findall(r"https?://[^\"']*", page)) == {"http://www.w3.org/2000/svg"}
+    assert not re.search("https?://", page)
     policy = next(a["content"] or "" for tag, a in elements.tags if a.get("http-equiv") == "Content-Security-Policy")
     assert policy.startswith("default-src 'none';")
 
@@ -121,13 +116,6 @@ def test_eight_runs_of_ten_thousand_pairs_stay_under_20_mb(tmp_path: Path) -> No
         sizes.append(len(page_html([tmp_path / str(count)]).encode()))
     assert sizes[0] + 8 * 10_795 * (sizes[1] - sizes[0]) / 1000 < MOST_BYTES - 3e6
     assert len(plotly_script()) < sizes[0] < 2.3e6
-
-
-@pytest.mark.parametrize("text", [HOSTILE, "<!--<script>", "]]>", "\u2028\u2029", "\\", '"', "\x00"])
-def test_any_text_survives_in_a_script_element(text: str) -> None:
-    written = script_json({"name": text})
-    assert json.loads(written) == {"name": text}
-    assert not set("<>&\u2028") & set(written)
 
 
 def test_what_cannot_be_read_is_named_and_no_page_is_left(tmp_path: Path) -> None:

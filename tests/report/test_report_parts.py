@@ -8,7 +8,7 @@ import pytest
 from report_data import rows, write_run
 
 from bpnp.report import cause_shares, read_training_log, table
-from bpnp.report.palette import DARK, DARK_BACKGROUND, LIGHT, LIGHT_BACKGROUND, styles
+from bpnp.report.palette import DARK, INKS, LIGHT, styles
 from bpnp.report.runs import named_runs
 
 # Machado, Oliveira, Fernandes 2009, severity 1.0, on linear RGB: how the three kinds of dichromats see.
@@ -41,7 +41,7 @@ def lab(rgb: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("sight", SEEN)
-@pytest.mark.parametrize(("colours", "background"), [(LIGHT, LIGHT_BACKGROUND), (DARK, DARK_BACKGROUND)])
+@pytest.mark.parametrize(("colours", "background"), [(LIGHT, INKS["background"][0]), (DARK, INKS["background"][1])])
 def test_colours_stay_apart_for_every_kind_of_sight(colours: tuple[str, ...], background: str, sight: str) -> None:
     seen = lab(linear(colours) @ SEEN[sight].T)
     distance = np.linalg.norm(seen[:, None] - seen, axis=-1)

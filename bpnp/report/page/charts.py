@@ -181,7 +181,7 @@ def _line(
     label = name or (estimate if len(runs) == 1 else f"{run}: {estimate}")
     figure.add_scatter(
         x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=label, mode="lines",
-        legendgroup=f"{run}: {estimate}",
+        meta=list(styles(_estimates(runs))).index(key),
         line={"color": LIGHT[colour], "dash": _dash(dash), "width": 2}, hovertemplate=hover,
     )  # fmt: skip
 

@@ -5,27 +5,32 @@ Colours are those of the light scheme; the page replaces each by that of the dar
 
 from typing import Any
 
-from bpnp.report.palette import INKS, LIGHT_INKS
+from bpnp.report.palette import INKS
 
-INK = dict(zip(INKS, LIGHT_INKS, strict=True))
+INK = {name: light for name, (light, _) in INKS.items()}
 CLEAR = "rgba(0,0,0,0)"
-AXIS = {"gridcolor": INK["line"], "zerolinecolor": INK["line"], "linecolor": INK["quiet"], "automargin": True}
-AXES_3D = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
+GRID = {"gridcolor": INK["line"], "zerolinecolor": INK["line"]}
 PICKED = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}}
+CONFIG = {  # of every figure
+    "responsive": True,
+    "displaylogo": False,
+    "toImageButtonOptions": {"scale": 2, "filename": "bpnp"},
+    "modeBarButtonsToRemove": [
+        "sendChartToCloud", "select2d", "lasso2d", "autoScale2d", "tableRotation", "resetCameraLastSave3d",
+    ],
+}  # fmt: skip
 
 
 def look() -> dict[str, Any]:
     """The plotly template of every figure."""
-    axis3d = {
-        "gridcolor": INK["line"], "zerolinecolor": INK["line"], "color": INK["quiet"], "backgroundcolor": CLEAR,
-        "showspikes": False,
-    }  # fmt: skip
+    axis = GRID | {"linecolor": INK["quiet"], "automargin": True}
+    axis3d = GRID | {"color": INK["quiet"], "backgroundcolor": CLEAR, "showspikes": False}
     layout = {
         "margin": {"l": 50, "r": 12, "t": 44, "b": 40}, "showlegend": False, "paper_bgcolor": CLEAR,
         "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11},
         "hoverlabel": {"namelength": 60, "bgcolor": INK["panel"], "font": {"color": INK["text"]}},
         "modebar": {"bgcolor": CLEAR, "color": INK["quiet"], "activecolor": INK["focus"]},
-        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": AXIS, "yaxis": AXIS,
+        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": axis, "yaxis": axis,
         "scene": {"xaxis": axis3d, "yaxis": axis3d, "zaxis": axis3d},
     }  # fmt: skip
     return {"layout": layout}
@@ -38,23 +43,20 @@ def figures() -> dict[str, dict[str, Any]]:
         "type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper",
         "line": {"color": INK["quiet"], "width": 1, "dash": "dash"},
     }  # fmt: skip
+    hover = "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>"
     versus = {
-        "data": [
-            {
-                "mode": "markers", "marker": {"size": 5, "color": INK["text"], "opacity": 0.5},
-                "hovertemplate": "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>",
-            },
-        ],
+        "data": [_marks("scatter", size=5, color=INK["text"], opacity=0.5) | {"hovertemplate": hover}],
         "layout": {
             "title": {"text": "Rotation error of each pair"}, "hovermode": "closest", "xaxis": degrees,
             "yaxis": degrees | {"matches": "x"},  # so that the diagonal of the picture is x = y
             "shapes": [diagonal],
         },
     }  # fmt: skip
-    axes = {axis: {"title": {"text": direction}} for axis, direction in AXES_3D.items()}
+    directions = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
+    axes = {axis: {"title": {"text": direction}} for axis, direction in directions.items()}
     scene = {
         "data": [
-            _marks(size=3.5, line={"width": 0}) | {"type": "scatter3d"},
+            _marks("scatter3d", size=3.5, line={"width": 0}),
             {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 9}},
         ],
         "layout": {
@@ -64,25 +66,25 @@ def figures() -> dict[str, dict[str, Any]]:
             },
         },
     }  # fmt: skip
+    axis = {"constrain": "domain", "zeroline": False}
     image = {
         "data": [
             _lines(color=INK["quiet"]),
             _lines(color=INK["wrong"], dash="dot"),
-            _marks(symbol="circle-open", line={"width": 1.6}),
-            _marks(symbol="x-thin"),
+            _marks("scatter", symbol="circle-open"),
+            _marks("scatter", symbol="x-thin"),
             {"mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 16}},
         ],
         "layout": {
             "margin": {"l": 40, "r": 10, "t": 10, "b": 30}, "hovermode": "closest", "dragmode": "pan",
-            "xaxis": {"constrain": "domain", "zeroline": False},
-            "yaxis": {"constrain": "domain", "zeroline": False, "scaleanchor": "x"},
+            "xaxis": axis, "yaxis": axis | {"scaleanchor": "x"},
         },
     }  # fmt: skip
     return {"versus": versus, "scene": scene, "image": image}
 
 
-def _marks(**marker: Any) -> dict[str, Any]:
-    return {"mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
+def _marks(kind: str, **marker: Any) -> dict[str, Any]:
+    return {"type": kind, "mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
 
 
 def _lines(**line: Any) -> dict[str, Any]:

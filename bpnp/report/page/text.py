@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from bpnp.report.page.pairs import labels
 from bpnp.report.palette import DASHES, styles
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
 from bpnp.report.runs import seed_groups, with_spread
@@ -22,15 +23,10 @@ def visible(text: object) -> str:
     return html.escape(str(text).encode("utf-8", "replace").decode())
 
 
-def options(texts: Iterable[str]) -> str:
+def options(texts: Iterable[str], chosen: int | None = None) -> str:
     """The options of a select element, numbered."""
-    return "".join(f'<option value="{i}">{visible(text)}</option>' for i, text in enumerate(texts))
-
-
-def labels(runs: Mapping[str, Results]) -> dict[tuple[str, str], str]:
-    """The name of each estimate of each run, with the run's only where there are several."""
-    keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
-    return {key: key[1] if len(runs) == 1 else f"{key[0]}: {key[1]}" for key in keys}
+    numbered = ((i, " selected" if i == chosen else "", visible(text)) for i, text in enumerate(texts))
+    return "".join(f'<option value="{i}"{selected}>{text}</option>' for i, selected, text in numbered)
 
 
 def headline_html(runs: Mapping[str, Results]) -> str:
@@ -94,10 +90,10 @@ def _plain(value: Any) -> bool:
     return isinstance(value, (bool, int, float, str)) and value not in ("", False)
 
 
-def series_buttons(runs: Mapping[str, Results]) -> str:
-    """A button for each estimate of each run that shows and hides it."""
+def series_boxes(runs: Mapping[str, Results]) -> str:
+    """A checkbox for each estimate of each run that shows and hides it."""
     return "".join(
-        f'<button type="button" aria-pressed="true" data-series="{i}">{swatch}{visible(label)}</button>'
+        f'<label><input type="checkbox" id="series{i}" data-state checked>{swatch}{visible(label)}</label>'
         for i, (label, swatch) in enumerate(zip(labels(runs).values(), _swatches(runs), strict=True))
     )
 

@@ -1,11 +1,9 @@
 """Results as one HTML file that needs nothing else: no network, no server.
 
-plotly's script is inside, compressed: 2.0 MB of text. The numbers travel as JSON, long columns as base64 of
-little-endian arrays: eight runs of ten thousand pairs stay under 20 MB. What is drawn from them is in `assets`.
+plotly's script is inside, compressed: 2.0 MB of text. The numbers and points travel as compressed JSON: eight runs of
+ten thousand pairs stay under 20 MB. What is drawn from them is in `assets`.
 """
 
-import base64
-import gzip
 import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,21 +16,18 @@ from bpnp.files import written_whole
 from bpnp.report.folder import read_results
 from bpnp.report.page import templates
 from bpnp.report.page.charts import chart_text, page_charts
-from bpnp.report.page.points import packed, page_points, whole
-from bpnp.report.page.text import causes_html, headline_html, labels, options, quartiles_html, series_buttons, visible
-from bpnp.report.palette import DARK, DARK_BACKGROUND, DARK_INKS, INKS, LIGHT, LIGHT_BACKGROUND, LIGHT_INKS, styles
+from bpnp.report.page.pairs import compressed, labels, page_numbers, page_points, shown_id
+from bpnp.report.page.text import causes_html, headline_html, options, quartiles_html, series_boxes, visible
+from bpnp.report.palette import INKS
 from bpnp.report.photos import PhotoFinder, page_photos
-from bpnp.report.results import CAUSES, PairRow, Results
+from bpnp.report.results import CAUSES
 from bpnp.report.runs import named_runs, trained_only
 from bpnp.report.samples import read_views
 from bpnp.report.tables.published import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log
 
-SCRIPTS = ("results.js", "pairs.js", "viewer.js")
+SCRIPTS = ("page.js", "pair.js")
 MOST_BYTES = 19_850_000
-ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
-COUNTS = ("inliers", "iterations")
-SIZES = ("m", "n", "true_pairs")
 COLUMNS = {  # of the table of pairs: head and hover text
     "rotation_error_deg": ("rot deg", "rotation error, degrees"),
     "translation_error": ("trans", "translation error, scene units"),
@@ -45,17 +40,14 @@ COLUMNS = {  # of the table of pairs: head and hover text
     "iterations": ("iterations", "iterations of the solver"),
     "seconds": ("sec", "seconds, the pair's share of its batch"),
 }
-# Of plotly's buttons those that are not shown.
-BUTTONS = (
-    "sendChartToCloud",
-    "select2d",
-    "lasso2d",
-    "autoScale2d",
-    "tableRotation",
-    "resetCameraLastSave3d",
-)  # not shown
 STATUSES = ("converged", "not converged", "no pose")
 HEADINGS = {"recall": "Recall", "errors": "Errors against size", "time": "Time", "training": "Training"}
+VERSUS = (
+    '<div class="controls"><label>A <select id="a" data-state>{0}</select></label>'
+    '<label>B <select id="b" data-state>{1}</select></label></div><p id="versus-text" role="status"></p>'
+    '<div class="chart" id="versus" role="img"></div>'
+    '<p class="note">A point above the diagonal is a pair that A solves better. Click a point to open its pair.</p>'
+)
 
 
 def write_page(
@@ -84,36 +76,43 @@ def page_html(
     views = {name: read_views(path) for name, path in folders.items()}
     charts = page_charts(runs, logs)
     figures = [chart for section in charts.values() for chart in section]
-    several = sum(len(results.estimates) for results in runs.values()) > 1
+    names = list(labels(runs).values())
     sections = {
         **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
-        **({"versus-section": ("Run against run", VERSUS.format(options(labels(runs).values())))} if several else {}),
+        **(
+            {"versus-section": ("Run against run", VERSUS.format(options(names), options(names, 1)))}
+            if names[1:]
+            else {}
+        ),
         **{name: (HEADINGS[name], _charts_html(own, figures)) for name, own in charts.items()},
         **({"failures": ("Failures", causes_html(runs))} if runs else {}),
     }
-    data = script_json(page_data(runs) | {
-        "photos": page_photos(views, photo), "charts": [chart.to_json() for chart in figures], "buttons": BUTTONS,
+    plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
+    data = compressed(json.dumps(page_numbers(runs) | {
+        "keys": list(COLUMNS), "causes": CAUSES, "inks": INKS,
+        "photos": {shown_id(id): own for id, own in page_photos(views, photo).items()},
+        "charts": [chart.to_json() for chart in figures], "config": templates.CONFIG,
         "figures": {name: json.dumps(figure) for name, figure in templates.figures().items()},
         "look": json.dumps(templates.look()),
-    })  # fmt: skip
-    plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
-    places = {name: _places(results) for name, results in runs.items()}
+    }))  # fmt: skip
     links = {name: heading for name, (heading, _) in sections.items()} | ({"pairs": "Pairs"} if runs else {})
+    colours = " ".join(f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in INKS.items())
     parts = {
-        "style": _colours() + (assets / "page.css").read_text(encoding="utf-8"),
+        "style": f":root {{ color-scheme: light dark; {colours} }}\n"
+        + (assets / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS),
         "data": data,
-        "points": script_json(page_points(views, places, room=MOST_BYTES - len(data) - len(plotly) - 200_000)),
+        "points": page_points(runs, views, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
         "plotly": plotly,
         "title": html.escape("bpnp: " + ", ".join(folders)),
         "headline": headline_html(runs),
-        "list": options(labels(runs).values()),
+        "list": options(names),
         "causes": options(CAUSES),
         "statuses": options(STATUSES),
         "no-pairs": "" if runs else " hidden",
         "pair-head": pair_head("pair", sort=True),
         "number-head": pair_head("estimate"),
-        "series": series_buttons(runs),
+        "series": series_boxes(runs),
         "navigation": " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in links.items()),
         "sections": "\n".join(
             f'<section id="{name}"><h2>{heading}</h2>{content}</section>'
@@ -125,49 +124,13 @@ def page_html(
     return "".join(parts[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
-VERSUS = (
-    '<div class="controls"><label>A <select id="a" data-state>{0}</select></label>'
-    '<label>B <select id="b" data-state>{0}</select></label></div><p id="versus-text" role="status"></p>'
-    '<div class="chart" id="versus" role="img" style="height: 420px; max-width: 42rem"></div>'
-    '<p class="note">A point above the diagonal is a pair that A solves better. Click a point to open its pair.</p>'
-)
-
-
-def page_data(runs: Mapping[str, Results]) -> dict[str, Any]:
-    """The numbers of all pairs, in the types of strict JSON and the packed columns of `packed`."""
-    shapes = styles({name: list(results.estimates) for name, results in runs.items()})
-    ids: list[list[str]] = []
-    shown = []
-    for name, results in runs.items():
-        pairs = results.of(next(iter(results.estimates)))
-        own = [row.id for row in pairs]
-        if own not in ids:
-            ids.append(own)
-        estimates = {
-            key: {"columns": _columns(results.of(key)), "colour": shapes[name, key][0]} for key in results.estimates
-        }
-        sizes = {key: whole([getattr(row, key) for row in pairs]) for key in SIZES}
-        shown.append({"name": name, "ids": ids.index(own), "sizes": sizes, "estimates": estimates})
-    columns = [{"key": key, "whole": key in (*COUNTS, *SIZES)} for key in COLUMNS]
-    colours = [[*LIGHT, *LIGHT_INKS], [*DARK, *DARK_INKS]]
-    return {"runs": shown, "ids": ids, "columns": columns, "causes": CAUSES, "colours": colours}
-
-
 def pair_head(first: str, *, sort: bool = False) -> str:
     """The head of a table of pairs or of estimates of a pair, with buttons that sort."""
-    cells = [("id", first, ""), *((key, *shown) for key, shown in COLUMNS.items())]
-    texts = (
-        (title, f'<button type="button" data-key="{key}">{text}</button>' if sort else text)
-        for key, text, title in cells
-    )
-    heads = "".join(f'<th scope="col" title="{title}">{text}</th>' for title, text in texts)
+    heads = ""
+    for key, (text, title) in {"id": (first, ""), **COLUMNS}.items():
+        shown = f'<button type="button" data-key="{key}">{text}</button>' if sort else text
+        heads += f'<th scope="col" title="{title}">{shown}</th>'
     return f'<thead><tr>{heads}<th scope="col" class="words">cause</th></tr></thead><tbody></tbody>'
-
-
-def script_json(value: Any) -> str:
-    """JSON that can stand in a script element: no name in it can close the element or open another."""
-    text = json.dumps(value, allow_nan=False, separators=(",", ":"))
-    return text.replace("&", "\\u0026").replace("<", "\\u003c").replace(">", "\\u003e")
 
 
 @cache
@@ -175,33 +138,17 @@ def plotly_script() -> str:
     """plotly.js, compressed, in base64."""
     from plotly.offline import get_plotlyjs
 
-    return base64.b64encode(gzip.compress(get_plotlyjs().encode(), 9, mtime=0)).decode()
-
-
-def _columns(rows: Sequence[PairRow]) -> dict[str, dict[str, str]]:
-    status = [2 if not row.found else 0 if row.converged else 1 for row in rows]
-    return {
-        **{key: packed([getattr(row, key) for row in rows], "f4") for key in ERRORS},
-        **{key: whole([getattr(row, key) for row in rows]) for key in COUNTS},
-        "cause": packed([CAUSES.index(row.cause) for row in rows], "u1"),
-        "status": packed(status, "u1"),
-    }
+    return compressed(get_plotlyjs())
 
 
 def _charts_html(charts: Iterable[Any], figures: Sequence[Any]) -> str:
     places = {id(figure): i for i, figure in enumerate(figures)}
-    return '<div class="charts">{}</div>'.format(
-        "".join(
-            f'<div class="chart" role="img" data-chart="{places[id(chart)]}" '
-            f'aria-label="{visible(chart_text(chart))}"></div>'
-            for chart in charts
-        )
+    shown = (
+        f'<div class="chart" role="img" data-chart="{places[id(chart)]}" '
+        f'aria-label="{visible(chart_text(chart))}"></div>'
+        for chart in charts
     )
-
-
-def _places(results: Results) -> dict[int, int]:
-    """The place of each pair's index in the page's lists."""
-    return {row.index: i for i, row in enumerate(results.of(next(iter(results.estimates))))}
+    return f'<div class="charts">{"".join(shown)}</div>'
 
 
 def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
@@ -212,19 +159,3 @@ def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
         if log is not None:
             logs.setdefault(log.files, (name, log))
     return dict(logs.values())
-
-
-def _colours() -> str:
-    schemes = ((LIGHT, LIGHT_BACKGROUND, LIGHT_INKS), (DARK, DARK_BACKGROUND, DARK_INKS))
-    light, dark = (
-        " ".join(
-            f"--{name}: {colour};"
-            for name, colour in (
-                *((f"c{i}", colour) for i, colour in enumerate(colours)),
-                ("background", background),
-                *zip(INKS, inks, strict=True),
-            )
-        )
-        for colours, background, inks in schemes
-    )
-    return f":root {{ {light} }}\n@media (prefers-color-scheme: dark) {{ :root {{ {dark} }} }}\n"

@@ -1,0 +1,84 @@
+"""The points of pairs on the page: planted points and poses survive, and the page keeps to its room."""
+
+import json
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from report_data import inflated, row, view
+from scipy.spatial.transform import Rotation
+
+from bpnp.report.page.pairs import VIEW_POINTS, page_points
+from bpnp.report.results import Results
+from bpnp.report.samples import PairView, thin
+
+
+def results(views: list[PairView]) -> Results:
+    rows = tuple(row(own.index, id=own.id, m=len(own.points2d), n=len(own.points3d)) for own in views)
+    return Results(rows, {"pnp": {}}, None, {}, "", "")
+
+
+def read(text: str) -> tuple[dict[str, list[int]], list[dict[str, Any]]]:
+    """The number of each pair's line by run, and the lines."""
+    places, *lines = map(json.loads, inflated(text).split("\n"))
+    return places, lines
+
+
+def planted(count: int) -> list[PairView]:
+    """Pairs of 10 to 59 points, exactly projected by `ransac`; `pnp` has no pose."""
+    return [view(i, f"scene/{i:04d}", 10 + i % 50) for i in range(count)]
+
+
+def test_the_page_has_the_points_and_poses_of_every_pair_while_there_is_room() -> None:
+    views = planted(40)
+    runs = {"a": results(views), "b": results(views)}
+    places, lines = read(page_points(runs, {"a": [thin(own) for own in views], "b": views}, room=10**6))
+    assert places["a"] == places["b"]
+    assert sorted(places["a"]) == list(range(40))
+    for place, original in zip(places["a"], views, strict=True):
+        line = lines[place]
+        assert len(line["points2d"]) == len(original.points2d)
+        points2d, points3d = np.array(line["points2d"]), np.array(line["points3d"])
+        np.testing.assert_allclose(points3d, original.points3d[line["ids3d"]], atol=1e-4)
+        rotation, translation = original.estimates["ransac"]
+        *quaternion, x, y, z = line["poses"]["b"]["ransac"]
+        assert (Rotation.from_quat(quaternion).inv() * Rotation.from_matrix(rotation)).magnitude() < 1e-4
+        np.testing.assert_allclose([x, y, z], translation, atol=1e-4)
+        camera = points3d @ rotation.T + translation
+        np.testing.assert_allclose((camera[:, :2] / camera[:, 2:])[line["match3d"]], points2d, atol=1e-4)
+        assert line["poses"]["a"]["pnp"] is None
+
+
+def test_assignments_are_those_of_the_solver_and_large_pairs_are_thinned() -> None:
+    original = view(0, "a", 500)
+    match = np.where(np.arange(500) % 4 == 0, original.match3d, -1).astype(np.int32)
+    own = replace(original, match3d=match)
+    _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}, room=10**6))
+    assert len(line["points2d"]) == len(line["points3d"]) == VIEW_POINTS
+    for j, (i, assigned) in enumerate(zip(line["match3d"], line["assigned"]["run"], strict=True)):
+        true = match[line["ids3d"][j]]
+        assert (line["ids2d"][i] if i >= 0 else -1) == true
+        partner = original.assigned3d[line["ids3d"][j]]
+        assert assigned == (line["ids2d"].index(partner) if partner in line["ids2d"] else -1)
+
+
+def test_runs_on_other_points_have_lines_of_their_own() -> None:
+    one, other = view(0, "a", 20), replace(view(3, "a", 20), index=0)
+    runs = {"x": results([one]), "y": results([other])}
+    places, lines = read(page_points(runs, {"x": [one], "y": [other]}, room=10**6))
+    assert sorted(places["x"] + places["y"]) == [0, 1]
+    assert [list(line["poses"]) for line in lines] == [["x"], ["y"]]
+
+
+@pytest.mark.parametrize("room", [0, 8_000, 30_000])
+def test_the_page_keeps_to_its_room_and_takes_the_worst_first(room: int) -> None:
+    error = np.random.default_rng(0).random(200)
+    views = [thin(replace(own, error=float(error[own.index]))) for own in planted(200)]
+    text = page_points({"a": results(views)}, {"a": views}, room=room)
+    places, lines = read(text)
+    kept = np.flatnonzero(np.array(places["a"]) >= 0)
+    assert len(text) <= max(room, 500)
+    assert len(lines) == len(kept) >= room / 1000
+    assert len(kept) < 200
+    assert set(np.argsort(-error)[: len(kept) // 2]) <= set(kept.tolist())
