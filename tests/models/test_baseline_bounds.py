@@ -187,18 +187,17 @@ def test_mixtures_find_planted_clusters_in_any_order() -> None:
 
 
 def test_no_rotation_of_a_box_has_more_inliers_than_its_bound() -> None:
-    points = normal(30, 12, 3)
-    for directions in torch.nn.functional.normalize(points, dim=-1):
+    for directions in torch.nn.functional.normalize(normal(30, 12, 3), dim=-1):
         rays, reach = torch.nn.functional.normalize(normal(10, 3), dim=-1), 0.05 + 0.2 * uniform(12)
         domain = whole(normal(3), 0.4, torch.zeros(3).double(), 0.0)
-        found = best_rotation(rays, directions, reach, domain, floor=0, smallest=0.02)
+        found = best_rotation(rays, directions, domain.place[0], reach, domain, floor=0, smallest=0.02)
         turns = domain.turn + 0.4 * (2 * uniform(400, 3) - 1)
         cosine = (rays @ roma.rotvec_to_rotmat(turns)) @ directions.mT
         counts = (cosine >= reach.cos()).any(-1).sum(-1)
         assert int(counts.max()) <= found.bound
-        assert found.reached <= found.bound
+        assert found.value <= found.bound
         inside = turns.norm(dim=-1) <= math.pi
-        assert int(counts[inside].max()) <= max(found.reached, found.bound)
+        assert int(counts[inside].max()) <= max(found.value, found.bound)
 
 
 def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:

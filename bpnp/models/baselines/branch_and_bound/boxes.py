@@ -5,6 +5,7 @@ The uncertainty angles bound how far a direction can turn within a box, as in GO
 
 import itertools
 import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import roma
@@ -33,7 +34,7 @@ class Boxes(NamedTuple):
 
 class Found(NamedTuple):
     """The best pose, camera = R (p - c), and its number of inliers or its distance; `certified`: no pose of the domain
-    has more than `bound` inliers, or falls below `bound`, and this is as good or within the gap that is asked for."""
+    is better than `bound`, and this one is as good, or within the gap that is asked for."""
 
     rotation: Float[Tensor, "3 3"] | None
     place: Float[Tensor, "3"]
@@ -48,6 +49,38 @@ class Found(NamedTuple):
             return Answer(iterations=self.boxes)
         translation = -self.rotation @ (radius * self.place + centre)
         return Answer((self.rotation, translation), self.boxes, residual, self.certified)
+
+
+def best_first(
+    boxes: Boxes,
+    bounds: Float[Tensor, " b"],
+    expand: Callable[[Boxes], tuple[Boxes, Float[Tensor, " c"], int | float]],
+    *,
+    at_once: int,
+    until: Callable[[int], bool],
+    small: Callable[[Boxes], Bool[Tensor, " b"]] = lambda boxes: torch.zeros_like(boxes.turn_half, dtype=torch.bool),
+) -> tuple[float, int]:
+    """Expand the `at_once` boxes of highest bound together until no box can hold anything better than was found.
+
+    bounds: no pose of a box is better. expand: boxes to their children, the bounds of these, and the value that a bound
+    must exceed for its box to be kept. until: whether to stop after so many children. small: which boxes are kept for
+    their bound but not expanded.
+    Returns the highest bound of the boxes that are left, -inf if none is, and the number of children.
+    """
+    done, aside = 0, bounds.new_tensor([-math.inf])
+    while len(bounds) and not until(done):
+        # One at a time: of equal bounds the oldest.
+        chosen = bounds.topk(min(at_once, len(bounds))).indices if at_once > 1 else bounds.argmax().unsqueeze(0)
+        rest = torch.ones_like(bounds, dtype=torch.bool)
+        rest[chosen] = False
+        children, upper, least = expand(boxes.pick(chosen))
+        done += len(upper)
+        boxes = Boxes(*(torch.cat(values) for values in zip(boxes.pick(rest), children, strict=True)))
+        bounds = torch.cat([bounds[rest], torch.minimum(upper, bounds.max())])
+        kept, final = bounds > least, small(boxes)
+        aside = torch.cat([aside, bounds[kept & final]])
+        boxes, bounds = boxes.pick(kept & ~final), bounds[kept & ~final]
+    return float(torch.cat([aside, bounds]).max()), done
 
 
 def whole_domain(like: Tensor, half: float) -> Boxes:
@@ -67,18 +100,6 @@ def root_mean_square(distances: Float[Tensor, " k"]) -> float:
     """Root mean square; 1 where it is zero."""
     value = float(distances.square().mean().sqrt())
     return value if value > 0 and math.isfinite(value) else 1.0
-
-
-def take_best(boxes: Boxes, order: Float[Tensor, " b"], count: int) -> tuple[Boxes, Boxes, Bool[Tensor, " b"]]:
-    """The `count` boxes of highest `order`, the rest, and which boxes these are."""
-    rest = torch.ones_like(order, dtype=torch.bool)
-    chosen = order.topk(min(count, len(order))).indices
-    rest[chosen] = False
-    return boxes.pick(chosen), boxes.pick(rest), rest
-
-
-def join(parts: list[Boxes]) -> Boxes:
-    return Boxes(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def rotation_uncertainty(boxes: Boxes) -> Float[Tensor, " b"]:

@@ -1,9 +1,6 @@
 """GOPAC: the pose with most inliers, by nested branch and bound (Campbell et al., ICCV 2017)."""
 
-import heapq
-import itertools
 import math
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -16,10 +13,9 @@ from bpnp.layers.pnp import weighted_pnp
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
     Found,
-    join,
+    best_first,
     rotation_uncertainty,
     split,
-    take_best,
     translation_uncertainty,
     unit_scene,
     whole_domain,
@@ -38,7 +34,7 @@ def maximise_inliers(
     domain: Boxes,
     *,
     angle: float,
-    max_boxes: int | None = None,
+    max_boxes: int | float = math.inf,
     deadline: Deadline = NEVER,
 ) -> Found:
     """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
@@ -48,46 +44,40 @@ def maximise_inliers(
     for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
     SMALLEST are not split: where one might hold more than the best pose, the bound stays above the count.
     """
-    rotation, place, count, done = None, domain.place[0], 0, 1
-    order = itertools.count()
-    queue = [(-len(rays), next(order), domain)]
-    unresolved = 0
-    while queue and -queue[0][0] > count:
-        if deadline.passed() or (max_boxes is not None and done >= max_boxes):
-            break
-        _, _, box = heapq.heappop(queue)
+    best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
+    inner = 1
+
+    def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        nonlocal best, inner
         children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
-        uncertainty = translation_uncertainty(children, points)
-        for k in range(len(children.turn_half)):
-            child = children.pick(torch.tensor([k], device=points.device))
-            directions = torch.nn.functional.normalize(points - child.place[0], dim=-1)
-            reach = torch.full_like(points[:, 0], angle)
-            here = best_rotation(rays, directions, reach, domain, floor=count, deadline=deadline)
+        bounds = []
+        for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
+            reach = torch.full_like(moving, angle)
+            here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
             if here.rotation is not None:
-                rotation, place, count = _refined(rays, points, here.rotation, child.place[0], angle)
-            wide = (reach + uncertainty[k]).clamp_max(math.pi)
-            there = best_rotation(rays, directions, wide, domain, floor=count, first=True, deadline=deadline)
-            done += 1 + here.boxes + there.boxes
-            if there.bound > count:
-                if float(child.place_half.max()) < SMALLEST:
-                    unresolved = max(unresolved, there.bound)
-                else:
-                    heapq.heappush(queue, (-there.bound, next(order), child))
-    left = -queue[0][0] if queue else 0
-    bound = max(count, left, unresolved)
-    return Found(rotation, place, count, bound, done, count >= bound)
+                best = _refined(rays, points, here.rotation, place, angle)
+            wide = (reach + moving).clamp_max(math.pi)
+            there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
+            inner += here.boxes + there.boxes
+            bounds.append(there.bound)
+        return children, rays.new_tensor(bounds), best[2]
+
+    left, outer = best_first(
+        domain, rays.new_full((1,), len(rays)), expand, at_once=1,
+        small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST,
+        until=lambda done: deadline.passed() or done + inner >= max_boxes,
+    )  # fmt: skip
+    bound = max(best[2], left)
+    return Found(*best, bound, outer + inner, best[2] >= bound)
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
     """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
     count = count_inliers(rays, points, rotation, place, angle)
     directions = torch.nn.functional.normalize(points - place, dim=-1)
-    inlier = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
-    weights = (inlier / inlier.sum().clamp_min(1)).unsqueeze(0)
-    translation = -rotation @ place
-    turned, shift, stats = weighted_pnp(
-        weights, rays.unsqueeze(0), points.unsqueeze(0), rotation.unsqueeze(0), translation.unsqueeze(0)
-    )
+    weights = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
+    start = (rotation, -rotation @ place)
+    turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in (weights, rays, points, *start)))
     if bool(stats.converged[0]):
         moved = -turned[0].mT @ shift[0]
         if (refined := count_inliers(rays, points, turned[0], moved, angle)) >= count:
@@ -95,19 +85,10 @@ def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angl
     return rotation, place, count
 
 
-class BestRotation(NamedTuple):
-    """`rotation` has `reached` rays within reach; None if none with more than the floor was found. No rotation of the
-    domain has more than `bound`."""
-
-    rotation: Float[Tensor, "3 3"] | None
-    reached: int
-    bound: int
-    boxes: int
-
-
 def best_rotation(
     rays: Float[Tensor, "m 3"],
-    directions: Float[Tensor, "n 3"],
+    points: Float[Tensor, "n 3"],
+    place: Float[Tensor, "3"],
     reach: Float[Tensor, " n"],
     domain: Boxes,
     *,
@@ -115,34 +96,31 @@ def best_rotation(
     first: bool = False,
     smallest: float = 1e-3,
     deadline: Deadline = NEVER,
-) -> BestRotation:
-    """Most rays f_i with some angle(f_i, R d_j) <= reach_j, over the rotations of a domain.
+) -> Found:
+    """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
 
     Only rotations with more than `floor` rays are of interest: boxes that cannot have more are dropped. `first`: stop
     at the first of these. Boxes of half side below `smallest` (radians) are not split; they, and the boxes left at the
     deadline, keep the bound above the count.
     """
-    pending = domain
-    bounds = rays.new_full((len(pending.turn),), len(rays))
-    count, rotation, unresolved, done = floor, None, floor, 0
-    part = max(1, CHUNK // (8 * len(rays) * len(directions)))
-    while len(bounds) and not deadline.passed():
-        parents, others, rest = take_best(pending, bounds, part)
+    directions = torch.nn.functional.normalize(points - place, dim=-1)
+    count, rotation = floor, None
+
+    def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        nonlocal count, rotation
         children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
         reached, reachable = _counts(rays, directions, reach, children)
-        done += len(reached)
         i = int(reached.argmax())
         if int(reached[i]) > count:
             count, rotation = int(reached[i]), children.rotation[i]
-        pending, bounds = join([others, children]), torch.cat([bounds[rest], reachable])
-        if first and rotation is not None:
-            break
-        small = (pending.turn_half < smallest) & (bounds > count)
-        unresolved = max(unresolved, int(bounds[small].max())) if bool(small.any()) else unresolved
-        kept = (bounds > count) & ~small
-        pending, bounds = pending.pick(kept), bounds[kept]
-    left = int(bounds.max()) if len(bounds) else 0
-    return BestRotation(rotation, count, max(count, unresolved, left), done)
+        return children, reachable, count
+
+    left, boxes = best_first(
+        domain, rays.new_full((len(domain.turn),), len(rays)), expand,
+        at_once=max(1, CHUNK // (8 * len(rays) * len(directions))), small=lambda boxes: boxes.turn_half < smallest,
+        until=lambda _: deadline.passed() or (first and rotation is not None),
+    )  # fmt: skip
+    return Found(rotation, place, count, max(count, left), boxes, count >= left)
 
 
 def _counts(rays: Tensor, directions: Tensor, reach: Tensor, boxes: Boxes) -> tuple[Tensor, Tensor]:
@@ -183,7 +161,7 @@ class GOPAC(PairSolver):
     def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
         super().__init__(time_limit)
         check_positive(angle=angle)
-        self.angle, self.max_boxes = angle, max_boxes
+        self.angle, self.max_boxes = angle, math.inf if max_boxes is None else max_boxes
 
     def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         points, centre, radius = unit_scene(pair.points3d)

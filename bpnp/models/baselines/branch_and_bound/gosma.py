@@ -13,12 +13,11 @@ from bpnp.geometry import bearings, retract
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
     Found,
+    best_first,
     distance_range,
-    join,
     root_mean_square,
     rotation_uncertainty,
     split,
-    take_best,
     translation_uncertainty,
     unit_scene,
     whole_domain,
@@ -50,7 +49,7 @@ def align_mixtures(
     gap: float = GAP,
     closest: float = 0.0,
     batch: int = 512,
-    max_boxes: int | None = None,
+    max_boxes: int | float = math.inf,
     deadline: Deadline = NEVER,
 ) -> Found:
     """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
@@ -62,65 +61,75 @@ def align_mixtures(
     mixture's squared norm.
     """
     norm = float(squared_norm(rays))
-    pending, bounds = domain, lower_bound(scene, rays, domain)
-    best, rotation, place = _best_centre(scene, rays, domain, math.inf, None)
-    assert place is not None
-    done = len(bounds)
-    while len(bounds) and float(bounds.min()) < best - gap * norm:
-        if deadline.passed() or (max_boxes is not None and done >= max_boxes):
-            break
-        parents, others, rest = take_best(pending, -bounds, batch)
+    best = _best_centre(scene, rays, domain, (math.inf, domain.rotation[0], domain.place[0]))
+
+    def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        nonlocal best
         moving = translation_uncertainty(parents, scene.means).amax(-1)
         children = split(parents, rotation_uncertainty(parents) >= moving)
         _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
         children = children.pick(farthest.squeeze(-1) >= closest)
-        children_bounds = torch.maximum(lower_bound(scene, rays, children), bounds.min())
-        done += len(children_bounds)
-        allowed = children.pick(children.place.norm(dim=-1) >= closest)
-        best, rotation, place = _best_centre(scene, rays, allowed, best, (rotation, place))
-        pending, bounds = join([others, children]), torch.cat([bounds[rest], children_bounds])
-        promising = bounds < best - gap * norm
+        bounds = -lower_bound(scene, rays, children)
+        best = _best_centre(scene, rays, children.pick(children.place.norm(dim=-1) >= closest), best)
         # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
-        pending, bounds = pending.pick(promising), bounds[promising]
-    certified = len(bounds) == 0 or float(bounds.min()) >= best - gap * norm
-    bound = best - gap * norm if certified else float(bounds.min())
-    return Found(rotation, place, best / norm + 1, bound / norm + 1, done, certified)
+        return children, bounds, gap * norm - best[0]
+
+    left, boxes = best_first(
+        domain, -lower_bound(scene, rays, domain), expand, at_once=batch,
+        until=lambda done: deadline.passed() or done + len(domain.turn) >= max_boxes,
+    )  # fmt: skip
+    value, rotation, place = best
+    certified = -left >= value - gap * norm
+    bound = value - gap * norm if certified else -left
+    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + len(domain.turn), certified)
 
 
 def _best_centre(
-    scene: SceneMixture, rays: RayMixture, boxes: Boxes, best: float, pose: tuple[Tensor, Tensor] | None
+    scene: SceneMixture, rays: RayMixture, boxes: Boxes, best: tuple[float, Tensor, Tensor]
 ) -> tuple[float, Tensor, Tensor]:
-    """The pose of lowest distance: the one given, or the result of a descent from one of the boxes' centres.
+    """Distance and pose of the lowest of: the best so far, and the results of descents from the boxes' centres.
 
-    Adam descends from the best centres, also where they are worse than the pose given, since a better local optimum
-    may lie close to them. The lowest result is polished if it is lower than the pose given.
+    Adam descends from the best centres, also where they are worse than the best so far, since a better local optimum
+    may lie close to them. The lowest result is polished if it is lower than the best so far.
     """
-    if len(boxes.turn) == 0 and pose is not None:
-        return best, *pose
+    if len(boxes.turn) == 0:
+        return best
     values = distance(scene, rays, boxes.rotation, boxes.place)
     chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
     rotations, places = descend(scene, rays, chosen.rotation, chosen.place)
     values = distance(scene, rays, rotations, places)
     i = int(values.argmin())
-    if pose is not None and float(values[i]) >= best:
-        return best, *pose
-    return polish(scene, rays, rotations[i], places[i])
+    return best if float(values[i]) >= best[0] else polish(scene, rays, rotations[i], places[i])
 
 
 def descend(
-    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "b 3 3"], place: Float[Tensor, "b 3"]
+    scene: SceneMixture,
+    rays: RayMixture,
+    rotation: Float[Tensor, "b 3 3"],
+    place: Float[Tensor, "b 3"],
+    *,
+    finely: bool = False,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-    """Adam's steps from several poses, each for itself, from a tenth of a radian down to a thousandth."""
-    unit = _unit(scene, place)
-    step = torch.zeros(len(place), 6, dtype=place.dtype, device=place.device, requires_grad=True)
-    optimiser = torch.optim.Adam([step], lr=0.1)
-    schedule = torch.optim.lr_scheduler.ExponentialLR(optimiser, 0.01 ** (1 / DESCENT_STEPS))
+    """Adam's steps from several poses, each for itself, from a tenth of a unit down to a thousandth; or L-BFGS.
+
+    Units of a step: radians, and the mean distance to the scene's clusters, so that both move the image alike.
+    """
+    away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    unit = torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
+    step = torch.zeros_like(unit, requires_grad=True)
+    lbfgs = torch.optim.LBFGS([step], max_iter=POLISH_STEPS, line_search_fn="strong_wolfe")
+    optimiser = lbfgs if finely else torch.optim.Adam([step], lr=0.1)
+
+    def loss() -> Tensor:
+        step.grad = None
+        total = distance(scene, rays, *retract(unit * step, rotation, place)).sum()
+        total.backward()
+        return total
+
     with torch.enable_grad():
-        for _ in range(DESCENT_STEPS):
-            optimiser.zero_grad()
-            distance(scene, rays, *retract(unit * step, rotation, place)).sum().backward()
-            optimiser.step()
-            schedule.step()
+        for _ in range(1 if finely else DESCENT_STEPS):
+            optimiser.step(loss)
+            optimiser.param_groups[0]["lr"] *= 0.01 ** (1 / DESCENT_STEPS)
     return retract(unit * step.detach(), rotation, place)
 
 
@@ -128,27 +137,10 @@ def polish(
     scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "3 3"], place: Float[Tensor, "3"]
 ) -> tuple[float, Float[Tensor, "3 3"], Float[Tensor, "3"]]:
     """L-BFGS from one pose; the pose given where it ends no lower."""
-    start, unit = (rotation.unsqueeze(0), place.unsqueeze(0)), _unit(scene, place.unsqueeze(0))
-    step = torch.zeros(1, 6, dtype=place.dtype, device=place.device, requires_grad=True)
-    optimiser = torch.optim.LBFGS([step], max_iter=POLISH_STEPS, line_search_fn="strong_wolfe")
-
-    def closure() -> Tensor:
-        optimiser.zero_grad()
-        loss = distance(scene, rays, *retract(unit * step, *start)).squeeze(0)
-        loss.backward()
-        return loss
-
-    with torch.enable_grad():
-        optimiser.step(closure)
-    turned, moved = retract(unit * step.detach(), *start)
+    start = rotation.unsqueeze(0), place.unsqueeze(0)
+    turned, moved = descend(scene, rays, *start, finely=True)
     end, before = float(distance(scene, rays, turned, moved)), float(distance(scene, rays, *start))
     return (end, roma.special_procrustes(turned[0]), moved[0]) if end < before else (before, rotation, place)
-
-
-def _unit(scene: SceneMixture, place: Float[Tensor, "b 3"]) -> Float[Tensor, "b 6"]:
-    """Units of a step: radians, and the mean distance to the scene's clusters, so that both move the image alike."""
-    away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
-    return torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
 
 
 class GOSMA(PairSolver):
@@ -180,7 +172,8 @@ class GOSMA(PairSolver):
     ) -> None:
         super().__init__(time_limit)
         check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
-        self.cluster2d, self.cluster3d, self.batch, self.max_boxes = cluster2d, cluster3d, batch, max_boxes
+        self.cluster2d, self.cluster3d, self.batch = cluster2d, cluster3d, batch
+        self.max_boxes = math.inf if max_boxes is None else max_boxes
 
     def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         rays = bearings(pair.points2d)
