@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from bpnp.geometry import bearings, project, random_rotations, retract, transform
-from bpnp.types import Batch
+from bpnp.types import Batch, Pose, SolveStats
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,13 @@ class Planted:
 
     def batch(self) -> Batch:
         return Batch.from_arrays(self.points2d, self.points3d, self.rotation, self.translation, self.match3d)
+
+
+def posed(rotation: Tensor, translation: Tensor, converged: list[bool] | None = None) -> Pose:
+    """A pose (b, 3, 3), (b, 3) as a solver gives it, after one iteration and by default converged everywhere."""
+    b = len(rotation)
+    found = torch.ones(b, dtype=torch.bool) if converged is None else torch.tensor(converged)
+    return Pose(rotation, translation, SolveStats(torch.ones(b, dtype=torch.long), torch.zeros(b), found))
 
 
 def padded(scenes: Sequence[Planted]) -> Batch:

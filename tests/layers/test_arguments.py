@@ -1,5 +1,6 @@
-"""Arguments that a layer cannot mean end in one clear error."""
+"""Arguments that a layer cannot mean end in one clear error (`bpnp.checks` has the rules), whoever calls it and how."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jaxtyping
@@ -7,7 +8,17 @@ import pytest
 import torch
 from planted import plant
 
-from bpnp.layers import sinkhorn, weighted_pnp
+from bpnp.geometry import rotation_angle
+from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
+
+PLANTED = plant(2, 8)
+PAIRS = {"assignment": PLANTED.permutation(), "points3d": PLANTED.points3d}
+START = dict(zip(("rotation", "translation"), PLANTED.near(0.1), strict=True))
+ARGUMENTS: dict[Callable[..., Any], dict[str, Any]] = {
+    sinkhorn: {"cost": torch.rand(2, 4, 5)},
+    weighted_pnp: {**PAIRS, "bearings": PLANTED.bearings, **START},
+    ransac_pnp: {**PAIRS, "points2d": PLANTED.points2d},
+}
 
 
 @pytest.fixture(autouse=True)
@@ -17,60 +28,36 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize(
-    ("cost", "options", "message"),
+    ("layer", "changed", "message"),
     [
-        (torch.rand(4, 5), {}, r"expected `cost` of shape \(b, m, n\), got \(4, 5\); try .unsqueeze\(0\)"),
-        (torch.ones(2, 4, 5).long(), {}, r"expected `cost` of type float, got torch.int64; try .float\(\)"),
-        (torch.rand(0, 4, 5), {}, r"`cost` of shape \(b, m, n\) with no empty axis, got \(0, 4, 5\)"),
-        (torch.rand(2, 0, 5), {}, r"no empty axis, got \(2, 0, 5\)"),
-        (
-            torch.rand(2, 4, 5),
-            {"mask2d": torch.ones(2, 5).bool()},
-            r"`mask2d` of shape \(b, m\) with m = 4 as in",
-        ),
-        (torch.rand(2, 4, 5), {"col_marginal": torch.ones(5) / 5}, r"expected `col_marginal` of shape \(b, n\)"),
-        (
-            torch.rand(2, 4, 5),
-            {"mask3d": torch.ones(1, 5).bool()},
-            r"`mask3d` of shape \(b, n\) with b = 2 as in",
-        ),
-        (torch.rand(2, 4, 5), {"mu": torch.ones(2)}, r"expected `mu` as a number or a scalar tensor, got shape \(2,\)"),
-        (torch.rand(2, 4, 5), {"dustbin": torch.ones(2, 1)}, "expected `dustbin` as a number or a scalar tensor"),
+        (sinkhorn, {"cost": torch.rand(4, 5)}, r"expected `cost` of shape \(b, m, n\), got \(4, 5\); try .unsqueeze"),
+        (sinkhorn, {"cost": torch.ones(2, 4, 5).long()}, r"expected `cost` of type float, got torch.int64; try"),
+        (sinkhorn, {"mask2d": torch.ones(2, 5).bool()}, r"`mask2d` of shape \(b, m\) with m = 4 as in `cost`"),
+        (sinkhorn, {"col_marginal": torch.ones(5) / 5}, r"expected `col_marginal` of shape \(b, n\)"),
+        (sinkhorn, {"mu": torch.ones(2)}, r"expected `mu` as a number or a scalar tensor, got shape \(2,\)"),
+        (sinkhorn, {"dustbin": torch.ones(2, 1)}, "expected `dustbin` as a number or a scalar tensor"),
+        (weighted_pnp, {"bearings": PLANTED.points2d}, r"expected `bearings` of shape \(b, m, 3\), got \(2, 8, 2\)"),
+        (weighted_pnp, {"bearings": PLANTED.bearings[:, 1:]}, r"`bearings` .* with m = 8 as in `assignment`"),
+        (weighted_pnp, {"translation": torch.zeros(2, 3, 1)}, r"expected `translation` of shape \(b, 3\), got"),
+        (weighted_pnp, {"method": "adam"}, "expected `method` 'newton' or 'lbfgs', got 'adam'"),
+        (ransac_pnp, {"points2d": PLANTED.bearings}, r"expected `points2d` of shape \(b, m, 2\), got \(2, 8, 3\)"),
+        (ransac_pnp, {"assignment": PAIRS["assignment"][:0]}, "no empty axis"),
+        (ransac_pnp, {"points3d": PLANTED.points3d.numpy()}, "expected `points3d` as a tensor"),
+        (ransac_pnp, {"backend": "magsac"}, "expected `backend` .*poselib.*got 'magsac'"),
+        (ransac_pnp, {"pairs_factor": 0.0}, "expected `pairs_factor` > 0, got 0.0"),
+        (ransac_pnp, {"max_iterations": 0}, "expected `max_iterations` > 0, got 0"),
     ],
 )
-def test_sinkhorn_says_what_is_wrong(cost: torch.Tensor, options: dict[str, Any], message: str) -> None:
+def test_a_layer_says_what_is_wrong(layer: Callable[..., Any], changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        sinkhorn(cost, **options)
+        layer(**ARGUMENTS[layer] | changed)
 
 
-@pytest.mark.parametrize(
-    ("name", "change", "message"),
-    [
-        ("bearings", lambda x: x[..., :2], r"expected `bearings` of shape \(b, m, 3\), got \(2, 8, 2\)"),
-        (
-            "bearings",
-            lambda x: x[:, 1:],
-            r"`bearings` of shape \(b, m, 3\) with m = 8 as in `assignment`",
-        ),
-        ("points3d", lambda x: x[..., :2], r"expected `points3d` of shape \(b, n, 3\), got \(2, 8, 2\)"),
-        ("points3d", lambda x: x.long(), "expected `points3d` of type float, got torch.int64"),
-        ("assignment", lambda x: x[0], r"expected `assignment` of shape \(b, m, n\).*try .unsqueeze\(0\)"),
-        ("assignment", lambda x: x[:0], "no empty axis"),
-        ("rotation", lambda x: x[0], r"expected `rotation` of shape \(b, 3, 3\)"),
-        (
-            "translation",
-            lambda x: x.unsqueeze(-1),
-            r"expected `translation` of shape \(b, 3\), got \(2, 3, 1\)",
-        ),
-    ],
-)
-def test_weighted_pnp_says_what_is_wrong(name: str, change: Any, message: str) -> None:
-    planted = plant(2, 8)
-    rotation, translation = planted.near(0.1)
-    arguments = {
-        "assignment": planted.permutation(), "bearings": planted.bearings, "points3d": planted.points3d,
-        "rotation": rotation, "translation": translation,
-    }  # fmt: skip
-    arguments[name] = change(arguments[name])
-    with pytest.raises(ValueError, match=message):
-        weighted_pnp(*arguments.values())
+@pytest.mark.parametrize(("dtype", "found"), [(torch.float32, torch.float32), (torch.bfloat16, torch.float32)])
+def test_half_precision_is_widened_and_ransac_has_no_gradient(dtype: torch.dtype, found: torch.dtype) -> None:
+    assignment = PAIRS["assignment"].to(dtype).requires_grad_()
+    rotation, translation, stats = ransac_pnp(assignment, points2d=PLANTED.points2d, points3d=PLANTED.points3d)
+    assert rotation.dtype == translation.dtype == found
+    assert not rotation.requires_grad
+    assert stats.converged.all()
+    assert rotation_angle(rotation.double(), PLANTED.rotation).max() < 1e-3

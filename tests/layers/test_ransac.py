@@ -1,7 +1,3 @@
-from collections.abc import Callable
-from typing import Any
-
-import jaxtyping
 import pytest
 import torch
 from planted import Planted, plant
@@ -73,7 +69,7 @@ def test_top_pairs_are_the_largest_entries_of_each_sample() -> None:
 
 
 @pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
-@pytest.mark.parametrize("kind", ["three pairs", "one place", "collinear", "no agreement"])
+@pytest.mark.parametrize("kind", ["three pairs", "one place", "collinear", "no agreement", "nothing finite"])
 def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
     planted = plant(3, 12, seed=4)
     assignment, points2d, points3d = planted.permutation(), planted.points2d.clone(), planted.points3d.clone()
@@ -84,6 +80,8 @@ def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
         points3d[0] = 0.5
     elif kind == "collinear":
         points3d[0, :, 1:] = 0
+    elif kind == "nothing finite":
+        points2d[0] = torch.nan
     else:
         points2d[0] = torch.randn(12, 2, generator=torch.Generator().manual_seed(0)).double()
     r, t, stats = ransac_pnp(
@@ -93,7 +91,9 @@ def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
     assert r[0].isnan().all()
     assert t[0].isnan().all()
     assert stats.residual[0] == torch.inf
-    tried = kind != "three pairs" or backend == "torch"  # what was tried counts, whatever came of it
+    tried = (
+        kind not in ("three pairs", "nothing finite") or backend == "torch"
+    )  # what was tried counts, whatever came of it
     assert (stats.iterations[0] > 0) == tried
     assert rotation_angle(r[1:], planted.rotation[1:]).max() < 1e-5
 
@@ -146,17 +146,6 @@ def test_a_seed_gives_the_same_pose_again(backend: str) -> None:
     assert torch.equal(first[1], second[1])
 
 
-def test_float32_and_no_gradient() -> None:
-    planted = plant(2, 20, dtype=torch.float32, seed=7)
-    assignment = planted.permutation().requires_grad_()
-    r, t, stats = ransac_pnp(assignment, planted.points2d, planted.points3d)
-    assert (r.dtype, t.dtype) == (torch.float32, torch.float32)
-    assert not r.requires_grad
-    assert not t.requires_grad
-    assert stats.converged.all()
-    assert rotation_angle(r, planted.rotation).max() < 1e-4
-
-
 def test_more_hypotheses_are_more_iterations() -> None:
     planted = plant(1, 40, seed=8)
     assignment = wrong_pairs(planted, 0.5)
@@ -164,59 +153,3 @@ def test_more_hypotheses_are_more_iterations() -> None:
     assert layer(assignment, planted.points2d, planted.points3d)[2].iterations.max() <= 21
     layer.max_iterations = 5000
     assert layer(assignment, planted.points2d, planted.points3d)[2].iterations.max() > 1000
-
-
-def without_type_checker(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Call the layers as users do, who run no jaxtyping."""
-    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
-
-
-def test_names_the_backends(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_type_checker(monkeypatch)
-    with pytest.raises(ValueError, match="expected `backend` .*poselib.*got 'magsac'"):
-        ransac_pnp(torch.ones(1, 4, 4), torch.ones(1, 4, 2), torch.ones(1, 4, 3), backend="magsac")
-
-
-@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
-@pytest.mark.parametrize(
-    ("name", "change"),
-    [
-        ("points2d", lambda p, x, y: (p, torch.cat([x, x[..., :1]], -1), y)),  # bearings for image coordinates
-        ("points3d", lambda p, x, y: (p, x, y[..., :2])),
-        ("assignment", lambda p, x, y: (p[0], x[0], y[0])),
-        ("assignment", lambda p, x, y: (p[:0], x[:0], y[:0])),
-        ("points2d", lambda p, x, y: (p, x[:, :0], y)),
-        ("points3d", lambda p, x, y: (p, x, y[:, 1:])),
-        ("points3d", lambda p, x, y: (p, x, y[:1])),
-        ("assignment", lambda p, x, y: (p.long(), x, y)),
-        ("points2d", lambda p, x, y: (p, x.int(), y)),
-        ("points3d", lambda p, x, y: (p, x, y.numpy())),
-    ],
-)
-def test_wrong_shapes_and_types_are_named(
-    backend: str, name: str, change: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    without_type_checker(monkeypatch)
-    planted = plant(2, 12)
-    with pytest.raises(ValueError, match=rf"^expected `{name}` .*got"):
-        ransac_pnp(*change(planted.permutation(), planted.points2d, planted.points3d), backend=backend)
-
-
-@pytest.mark.parametrize("option", [{"pairs_factor": 0.0}, {"threshold": -0.01}, {"max_iterations": 0}])
-def test_options_must_be_positive(option: dict[str, Any]) -> None:
-    planted = plant(2, 12)
-    ((name, value),) = option.items()
-    with pytest.raises(ValueError, match=f"expected `{name}` > 0, got {value}"):
-        ransac_pnp(planted.permutation(), planted.points2d, planted.points3d, **option)
-
-
-def test_arguments_by_name_and_in_half_precision(monkeypatch: pytest.MonkeyPatch) -> None:
-    without_type_checker(monkeypatch)
-    planted = plant(2, 30, seed=9)
-    points = {"points2d": planted.points2d, "points3d": planted.points3d}
-    expected = ransac_pnp(planted.permutation(), **points)
-    by_name = ransac_pnp(assignment=planted.permutation(), **points)
-    assert torch.equal(by_name[0], expected[0])
-    half = ransac_pnp(planted.permutation().bfloat16(), **points)
-    assert half[0].dtype == torch.float32
-    assert rotation_angle(half[0].double(), planted.rotation).max() < 1e-3

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planted import posed
 from torchmetrics import MetricCollection
 
 from bpnp.metrics import (
@@ -17,7 +18,7 @@ from bpnp.metrics import (
     pose_quartiles,
     pose_recalls,
 )
-from bpnp.types import Batch, Pose, SolveStats
+from bpnp.types import Batch
 
 
 def random_errors(seed: int, size: int, first_index: int = 0) -> PoseErrors:
@@ -50,9 +51,8 @@ def test_a_metric_does_not_keep_the_graph_of_the_errors() -> None:
     points2d, points3d = torch.zeros(2, 5, 2), torch.ones(2, 5, 3)
     batch = Batch.from_arrays(points2d, points3d, torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))
     translation = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, math.nan]]).requires_grad_()
-    stats = SolveStats(torch.ones(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
     metric = PoseQuartiles()
-    metric.update(pose_errors(Pose(torch.eye(3).expand(2, 3, 3), translation, stats), batch))
+    metric.update(pose_errors(posed(torch.eye(3).expand(2, 3, 3), translation), batch))
     assert not metric.records[0].requires_grad
     values = metric.compute()
     assert (values["found"], values["rotation_q2_deg"]) == (0.5, 90)

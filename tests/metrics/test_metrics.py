@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from planted import plant, posed
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -16,35 +17,22 @@ from bpnp.metrics import (
     reprojection_error,
     rotation_error,
 )
-from bpnp.types import Batch, Pose, SolveStats
+from bpnp.types import Batch, Pose
 
 
 def random_rotations(seed: int, size: int) -> Tensor:
     return torch.from_numpy(Rotation.random(size, rng=np.random.default_rng(seed)).as_matrix())
 
 
-def planted_batch(seed: int, size: int, points: int = 12) -> Batch:
-    """Exact pairs: 3D point j is seen as 2D point (j + 1) mod points."""
-    rng = np.random.default_rng(seed)
-    rotation = Rotation.random(size, rng=rng).as_matrix()
-    translation = rng.normal(size=(size, 3)) * 0.3 + [0, 0, 5]
-    points3d = rng.uniform(-1, 1, (size, points, 3))
-    camera = points3d @ rotation.swapaxes(1, 2) + translation[:, None]
-    points2d = np.roll(camera[..., :2] / camera[..., 2:], 1, axis=1)
-    match3d = np.tile((np.arange(points) + 1) % points, (size, 1))
-    return Batch.from_arrays(points2d, points3d, rotation, translation, match3d)
-
-
-def as_pose(rotation: Tensor, translation: Tensor) -> Pose:
-    size = len(rotation)
-    ones = torch.ones(size, dtype=torch.long)
-    return Pose(rotation, translation, SolveStats(ones, torch.zeros(size), torch.ones(size, dtype=torch.bool)))
+def planted_batch(seed: int, size: int) -> Batch:
+    """Exact pairs of twelve points."""
+    return plant(size, 12, seed=seed).batch()
 
 
 def true_pose(batch: Batch) -> Pose:
     assert batch.rotation is not None
     assert batch.translation is not None
-    return as_pose(batch.rotation.clone(), batch.translation.clone())
+    return posed(batch.rotation.clone(), batch.translation.clone())
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1e-6, 1e-2, 1.0, math.pi - 1e-6, math.pi])
@@ -91,10 +79,10 @@ def test_errors_of_planted_poses() -> None:
         assert error.max() < 1e-6
     # The camera turns about its own centre: the translation changes, the centre does not.
     turn = torch.from_numpy(Rotation.from_euler("z", 3.0, degrees=True).as_matrix())
-    turned = pose_errors(as_pose(turn @ pose.rotation, pose.translation @ turn.mT), batch)
+    turned = pose_errors(posed(turn @ pose.rotation, pose.translation @ turn.mT), batch)
     torch.testing.assert_close(turned.rotation_deg, torch.full((4,), 3.0, dtype=torch.float64))
     assert turned.centre.max() < 1e-12 < turned.translation.min()
-    shifted = pose_errors(as_pose(pose.rotation, pose.translation + torch.tensor([0.0, 0.3, 0.4])), batch)
+    shifted = pose_errors(posed(pose.rotation, pose.translation + torch.tensor([0.0, 0.3, 0.4])), batch)
     torch.testing.assert_close(shifted.translation, torch.full((4,), 0.5, dtype=torch.float64))
     torch.testing.assert_close(shifted.centre, torch.full((4,), 0.5, dtype=torch.float64))
 

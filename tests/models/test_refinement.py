@@ -3,11 +3,11 @@ from dataclasses import replace
 
 import pytest
 import torch
-from planted import Planted, plant
+from planted import Planted, plant, posed
 from small_data import small_net
 from torch import Tensor, nn
 
-from bpnp import Batch, Matcher, Pose, SolveStats
+from bpnp import Batch, Pose, SolveStats
 from bpnp.geometry import is_finite
 from bpnp.models import Refinement, evaluation
 from bpnp.models.evaluation import ALONE, TRUST, WIDTH, log_support, refinement_enabled
@@ -17,9 +17,7 @@ from bpnp.types import Prediction
 def support(
     plan: Tensor, planted: Planted, rotation: Tensor, translation: Tensor, batch: Batch | None = None
 ) -> Tensor:
-    size = len(plan)
-    stats = SolveStats(torch.zeros(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
-    return log_support(Prediction(plan), batch or planted.batch(), Pose(rotation, translation, stats))
+    return log_support(Prediction(plan), batch or planted.batch(), posed(rotation, translation))
 
 
 def test_is_the_sum_over_bearings_written_out() -> None:
@@ -85,8 +83,7 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
         return Pose(turned, shifted, SolveStats(torch.full((2,), len(calls)), torch.zeros(2), ~missing))
 
     monkeypatch.setattr(evaluation, "refine", annealed)
-    stats = SolveStats(torch.zeros(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
-    own = Pose(*planted.near(0.02), stats)
+    own = posed(*planted.near(0.02))
     refined = refinement(Prediction(planted.permutation(), poses={"ransac": own, "pnp": own}), batch).poses["refined"]
     assert calls[0] > 2
     assert calls[1] == 2
@@ -94,16 +91,6 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
     torch.testing.assert_close(refined.translation, planted.translation)
     assert refined.stats.iterations.tolist() == [1, 2]
     assert refined.stats.converged.all()
-
-
-def test_the_choice_does_not_depend_on_the_batch() -> None:
-    torch.manual_seed(0)
-    net = Matcher(channels=16, depth=1, heads=2).double().eval()
-    together = net(plant(3, 12, outliers3d=6).batch()).poses["refined"]
-    planted = plant(3, 12, outliers3d=6)
-    for i in range(3):
-        single = Batch.from_arrays(planted.points2d[i], planted.points3d[i])
-        torch.testing.assert_close(net(single).poses["refined"].rotation[0], together.rotation[i], equal_nan=True)
 
 
 def test_refinement_is_off_within_a_block_and_as_it_was_after_an_error() -> None:

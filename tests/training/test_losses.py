@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp import Batch
-from bpnp.geometry import bearings, rotation_angle, transform
+from bpnp.geometry import bearings, transform
 from bpnp.training.losses import (
     correspondence_loss,
     correspondence_losses,
@@ -40,16 +40,6 @@ def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
         correct[b, planted.match3d[b, j], j] = 1
     expected = (assignment * (1 - 2 * correct)).sum((-2, -1))
     torch.testing.assert_close(correspondence_loss(assignment, planted.match3d), expected)
-
-
-def test_correspondence_loss_is_bounded() -> None:
-    planted = plant(3, 8, outliers2d=2)
-    perfect = correspondence_loss(planted.permutation(), planted.match3d)
-    torch.testing.assert_close(perfect, -torch.ones(3, dtype=torch.float64))
-    wrong = correspondence_loss(planted.permutation().roll(1, 1), planted.match3d)
-    torch.testing.assert_close(wrong, torch.ones(3, dtype=torch.float64))
-    none = torch.full_like(planted.match3d, -1)
-    torch.testing.assert_close(correspondence_loss(random_assignment(planted), none), torch.ones(3).double())
 
 
 @pytest.mark.parametrize("threshold", [0.003, 0.03, 0.3])
@@ -94,16 +84,6 @@ def test_gradients_are_finite_at_the_truth(dtype: torch.dtype) -> None:
     assert loss.max() < 1e-2
     loss.sum().backward()
     assert all(x.grad is not None and x.grad.isfinite().all() for x in (rotation, translation, assignment))
-
-
-def test_pose_loss_points_downhill() -> None:
-    planted = plant(5, 4)
-    rotation, translation = (x.requires_grad_() for x in planted.near(0.3))
-    pose_loss(rotation, translation, *planted.pose).sum().backward()
-    assert rotation.grad is not None
-    with torch.no_grad():
-        u, _, vt = torch.linalg.svd(rotation - 0.05 * rotation.grad)
-        assert (rotation_angle(u @ vt, planted.rotation) < rotation_angle(rotation, planted.rotation)).all()
 
 
 def test_reprojection_loss_is_a_weighted_sum_of_angles() -> None:

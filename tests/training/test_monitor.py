@@ -9,13 +9,13 @@ import wandb
 from lightning import LightningModule
 from lightning.pytorch.loggers import CSVLogger
 from matplotlib.image import imread
+from planted import posed
 from small_data import quiet_trainer
 from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
 from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_pairs, watched_values
-from bpnp.types import Pose, SolveStats
 
 
 class PlantedModule(LightningModule):
@@ -40,8 +40,9 @@ class PlantedModule(LightningModule):
         matched = int((batch.match3d[0] >= 0).sum())
         assignment.scatter_(1, batch.match3d.clamp(min=0)[:, None], 0.25 / matched)
         assignment[:, :, batch.match3d[0] < 0] = 0
-        stats = SolveStats(torch.full((b,), 7), torch.zeros(b), torch.ones(b, dtype=torch.bool))
-        return Prediction(assignment, None, {"pnp": Pose(batch.rotation, batch.translation, stats)})
+        pose = posed(batch.rotation, batch.translation)
+        pose.stats.iterations.fill_(7)
+        return Prediction(assignment, None, {"pnp": pose})
 
     def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
         return self.weight**2

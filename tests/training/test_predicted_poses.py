@@ -2,13 +2,13 @@ import csv
 from pathlib import Path
 
 import numpy as np
-import torch
+from planted import posed
 from planted_model import plant_model
 from scipy.spatial.transform import Rotation
 from small_data import quiet_trainer
 from torch import nn
 
-from bpnp import Batch, Pose, Prediction, SolveStats
+from bpnp import Batch, Prediction
 from bpnp.datamodules import ColmapDataModule
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
@@ -20,9 +20,7 @@ class Oracle(nn.Module):
     estimates = ("truth",)
 
     def forward(self, batch: Batch) -> Prediction:
-        size = len(batch)
-        stats = SolveStats(torch.zeros(size, dtype=torch.long), torch.zeros(size), torch.ones(size, dtype=torch.bool))
-        return Prediction(poses={"truth": Pose(batch.rotation, batch.translation, stats)})
+        return Prediction(poses={"truth": posed(batch.rotation, batch.translation)})
 
 
 def test_poses_are_written_in_the_coordinates_of_a_scene_far_from_its_origin(tmp_path: Path) -> None:

@@ -3,20 +3,19 @@ from dataclasses import replace
 
 import pytest
 import torch
-from planted import Planted, plant
+from planted import Planted, plant, posed
 from small_data import small_net
 
-from bpnp import Batch, Pose, Prediction, SolveStats
+from bpnp import Batch, Pose, Prediction
 from bpnp.models import Matcher
 from bpnp.training.losses import matching_likelihood_loss, matching_losses, self_supervised_loss
 from bpnp.training.task import BlindPnPTask
 
 
-def posed(planted: Planted, converged: list[bool]) -> Pose:
+def solved(planted: Planted, converged: list[bool]) -> Pose:
     found = torch.tensor(converged)
     rotation = torch.where(found[:, None, None], planted.rotation, torch.nan)
-    translation = torch.where(found[:, None], planted.translation, torch.nan)
-    return Pose(rotation, translation, SolveStats(torch.ones(len(found)).long(), torch.zeros(len(found)), found))
+    return posed(rotation, torch.where(found[:, None], planted.translation, torch.nan), converged)
 
 
 def test_the_angle_under_the_solved_pose_is_a_mean_over_the_assigned_mass() -> None:
@@ -27,16 +26,16 @@ def test_the_angle_under_the_solved_pose_is_a_mean_over_the_assigned_mass() -> N
         seen = planted.rotation[0] @ planted.points3d[0, j] + planted.translation[0]
         total += math.acos(float(planted.bearings[0, i] @ seen / seen.norm())) / 6
     for mass in (1.0, 0.3):
-        loss = self_supervised_loss(mass * wrong, planted.batch(), posed(planted, [True]))
+        loss = self_supervised_loss(mass * wrong, planted.batch(), solved(planted, [True]))
         assert float(loss[0]) == pytest.approx(total, rel=1e-9)
-    right = self_supervised_loss(planted.permutation(), planted.batch(), posed(planted, [True]))
+    right = self_supervised_loss(planted.permutation(), planted.batch(), solved(planted, [True]))
     assert float(right[0]) < 1e-6
 
 
 def test_a_sample_without_a_pose_has_no_such_loss_and_no_gradient() -> None:
     planted = plant(2, 6)
     plan = planted.permutation().roll(1, -1).requires_grad_()
-    losses = self_supervised_loss(plan, planted.batch(), posed(planted, [True, False]))
+    losses = self_supervised_loss(plan, planted.batch(), solved(planted, [True, False]))
     (gradient,) = torch.autograd.grad(losses.sum(), plan)
     assert losses[0] > 0
     assert losses[1] == 0
@@ -47,9 +46,9 @@ def test_a_sample_without_a_pose_has_no_such_loss_and_no_gradient() -> None:
 def test_samples_without_a_pose_do_not_dilute_the_mean_of_a_training_step() -> None:
     planted = plant(2, 6)
     plan = planted.permutation().roll(1, -1)
-    prediction = Prediction(plan, poses={"pnp": posed(planted, [True, False])})
+    prediction = Prediction(plan, poses={"pnp": solved(planted, [True, False])})
     task = BlindPnPTask(small_net(8, 1), matching_loss="reprojection")
-    alone = self_supervised_loss(plan, planted.batch(), posed(planted, [True, True]))[0]
+    alone = self_supervised_loss(plan, planted.batch(), solved(planted, [True, True]))[0]
     torch.testing.assert_close(task.losses(prediction, planted.batch()).total.mean(), alone)
 
 

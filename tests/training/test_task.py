@@ -1,10 +1,10 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from lightning import Callback, Trainer
+from planted import padded, plant
 from small_data import SMALL_MESHES, quiet_trainer, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
@@ -125,15 +125,11 @@ class Untransformed(nn.Module):
 
 
 def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    points3d = rng.uniform(-1, 1, (4, 20, 3))
-    points2d = points3d[..., :2] / (points3d[..., 2:] + 4.5)
-    pose = np.broadcast_to(np.eye(3), (4, 3, 3)), np.broadcast_to([0, 0, 4.5], (4, 3))
-    matches = np.broadcast_to(np.arange(20), (4, 20))
+    scene = plant(4, 20, dtype=torch.float32)
 
     def batch(first: int, last: int) -> Batch:
-        arrays = (points2d, points3d, *pose, matches)
-        return Batch.from_arrays(*(list(x[first:last]) for x in arrays)).to(torch.float32)
+        fields = (scene.points2d, scene.points3d, *scene.pose, scene.match3d)
+        return Batch.from_arrays(*(list(x[first:last]) for x in fields))
 
     def gradients(batches: list[Batch], pose_weight: float) -> dict[str, Tensor]:
         torch.manual_seed(3)
@@ -154,11 +150,7 @@ def test_the_gradients_of_two_batches_add_up_to_that_of_one(tmp_path: Path) -> N
 
 
 def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
-    rng = np.random.default_rng(0)
-    points3d = [rng.uniform(-1, 1, (20, 3)), rng.uniform(-1, 1, (3, 3))]
-    points2d = [p[:, :2] / (p[:, 2:] + 4.5) for p in points3d]
-    pose = [np.eye(3)] * 2, [np.array([0, 0, 4.5])] * 2
-    batch = Batch.from_arrays(points2d, points3d, *pose, [np.arange(20), np.arange(3)]).to(torch.float32)
+    batch = padded([plant(1, points, dtype=torch.float32) for points in (20, 3)])
     task = BlindPnPTask(small_net(), pose_weight=2.0)
     prediction = task.solver(batch)
     solved = prediction.poses["pnp"].stats.converged
