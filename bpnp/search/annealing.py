@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import in_time
 from bpnp.search.candidates import Candidates, best_distinct
-from bpnp.search.kernels.dense import descend
-from bpnp.search.kernels.grid import build_grid, descend_sparse
+from bpnp.search.kernels.dense import dense_scratch, descend
+from bpnp.search.kernels.grid import build_grid, descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene
 from bpnp.search.settings import ClusterStage, Recipe, Stages
 from bpnp.search.starts import Prior, draw_poses
@@ -43,7 +43,8 @@ def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage, ke
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
-        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j])
+        scratch = dense_scratch(len(bearings.a), len(points.b))
+        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
     ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
@@ -63,13 +64,12 @@ def anneal_on_points(
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
     image, points = scene.sides(bearings)
     grid, outlier = build_grid(image, float(scales[-1])), scene.outlier_density(outliers)
-    rotation, translation = starts.rotation.copy(), starts.translation.copy()
+    sides, rotation, translation = (tuple(grid), tuple(points)), starts.rotation.copy(), starts.translation.copy()
     result = np.empty((len(starts), 3), np.float32)
 
     def anneal(i: int, j: int) -> None:
-        descend_sparse(
-            tuple(grid), tuple(points), rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j]
-        )
+        scratch = sparse_scratch(len(grid.a), len(points.b))
+        descend_sparse(*sides, rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared

@@ -111,7 +111,8 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
     side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
-        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j])
+        weight = np.empty_like(points.b)
+        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight)
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
     return poses[np.argsort(-score[:done], kind="stable")[:kept]]

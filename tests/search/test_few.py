@@ -1,6 +1,7 @@
 import itertools
 import math
 import time
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from bpnp.robust.p3p import p3p
 from bpnp.search.few.p3p import p3p_depths
 from bpnp.search.few.pairs import p2p_turned, p2p_upright
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
-from bpnp.search.few.triangles import pose_of_triangle, triangle_table
+from bpnp.search.few.triangles import orders_of_triples, pose_of_triangle, triangle_table
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -49,24 +50,27 @@ def degrees(one: Array, other: Array) -> float:
     return math.degrees(Rotation.from_matrix(one @ other.T).magnitude())
 
 
-def compiled_p3p(rays: Array, points: Array) -> list[Array]:
+@pytest.fixture(scope="module")
+def compiled_p3p(entry: Any) -> Callable[[Array, Array], list[Array]]:
     """Poses (12,) of one triple."""
-    triples = np.array([[0, 1, 2]])
-    sides, frames, middles, usable = np.empty((1, 3)), np.empty((1, 3, 3)), np.empty((1, 3)), np.empty(1, np.bool_)
-    triangle_table(points, triples, sides, frames, middles, usable)
-    if not usable[0]:
-        return []
-    i, j, k = triples[0]
-    chords = [float(((rays[a] - rays[b]) ** 2).sum()) for a, b in ((i, j), (j, k), (k, i))]
-    depths, poses = np.empty((4, 3)), []
-    for s in range(p3p_depths(*chords, sides[0, 0], sides[0, 1], depths)):
-        pose = np.empty(12)
-        pose_of_triangle(rays, i, j, k, depths[s], sides[0, 2], frames[0], middles[0], np.empty((3, 3)), pose)
-        poses.append(pose)
-    return poses
+
+    def solve(rays: Array, points: Array) -> list[Array]:
+        orders, chords, _ = orders_of_triples(rays, np.array([[0, 1, 2]]))
+        triples, sides, frames, middles, _ = triangle_table(points, np.empty((0, 3)), orders[:1])
+        if not len(triples):
+            return []
+        (turn,) = np.flatnonzero((orders == triples[0]).all(1))
+        depths, poses = np.empty((4, 3)), []
+        for s in range(entry(p3p_depths)(*chords[turn], sides[0, 0], sides[0, 1], depths)):
+            pose, axes = np.empty(12), np.empty((3, 3))
+            entry(pose_of_triangle)(rays, *triples[0], depths[s], sides[0, 2], frames[0], middles[0], axes, pose)
+            poses.append(pose)
+        return poses
+
+    return solve
 
 
-def test_compiled_p3p_has_the_poses_of_the_batched_one() -> None:
+def test_compiled_p3p_has_the_poses_of_the_batched_one(compiled_p3p: Any) -> None:
     rng = np.random.default_rng(0)
     rays, points = np.empty((2000, 3, 3)), rng.uniform(-1, 1, (2000, 3, 3))
     for i in range(2000):
@@ -86,11 +90,11 @@ def test_compiled_p3p_has_the_poses_of_the_batched_one() -> None:
 
 
 @pytest.mark.parametrize("points", [np.zeros((3, 3)), np.outer([0.0, 1, 3], [1.0, 2, 3]), np.eye(3)[[0, 1, 1]]])
-def test_flat_triangles_have_no_pose(points: Array) -> None:
+def test_flat_triangles_have_no_pose(compiled_p3p: Any, points: Array) -> None:
     assert compiled_p3p(directions(np.random.default_rng(0).normal(0, 0.2, (3, 3)) + [0, 0, 1]), points) == []
 
 
-def test_rays_that_no_pose_explains_have_none() -> None:
+def test_rays_that_no_pose_explains_have_none(compiled_p3p: Any) -> None:
     narrow = directions(np.array([[0.0, 0, 1], [1e-9, 0, 1], [0, 1, 0.2]]))
     for pose in compiled_p3p(narrow, np.eye(3)):
         assert np.isfinite(pose).all()
@@ -216,7 +220,7 @@ def unit(rng: np.random.Generator) -> Array:
     return directions(rng.standard_normal(3))
 
 
-def test_two_pairs_and_the_vertical_give_the_pose() -> None:
+def test_two_pairs_and_the_vertical_give_the_pose(entry: Any) -> None:
     rng = np.random.default_rng(11)
     for _ in range(200):
         angle, translation = rng.uniform(-math.pi, math.pi), rng.uniform(-2, 2, 3)
@@ -224,7 +228,7 @@ def test_two_pairs_and_the_vertical_give_the_pose() -> None:
         points = rng.uniform(-1, 1, (2, 3)) + [0, 4, 0] @ rotation
         camera = points @ rotation.T + translation
         poses = np.empty((2, 12))
-        count = p2p_upright(*directions(camera), *points, poses)
+        count = entry(p2p_upright)(*directions(camera), *points, poses)
         planted_pose = np.concatenate([rotation.ravel(), translation])
         assert min(np.abs(pose - planted_pose).max() for pose in poses[:count]) < 1e-6
         for pose in poses[:count]:
@@ -232,22 +236,22 @@ def test_two_pairs_and_the_vertical_give_the_pose() -> None:
             np.testing.assert_allclose(directions(seen), directions(camera), atol=1e-7)
 
 
-def test_two_pairs_and_the_rotation_give_the_pose() -> None:
+def test_two_pairs_and_the_rotation_give_the_pose(entry: Any) -> None:
     rng = np.random.default_rng(12)
     for _ in range(200):
         rotation, translation = Rotation.from_rotvec(3 * unit(rng)).as_matrix(), np.array([0.5, -0.3, 5.0])
         points = rng.uniform(-1, 1, (2, 3))
         rays, pose = directions(points @ rotation.T + translation), np.empty(12)
-        assert p2p_turned(*rays, *points, rotation.ravel(), 0.1, 1e-4, pose)
+        assert entry(p2p_turned)(*rays, *points, rotation.ravel(), 0.1, 1e-4, pose)
         np.testing.assert_allclose(pose, np.concatenate([rotation.ravel(), translation]), atol=1e-6)
         off = Rotation.from_rotvec(0.05 * unit(rng)).as_matrix() @ rotation
-        assert p2p_turned(*rays, *points, off.ravel(), 0.1, 1e-4, pose)
+        assert entry(p2p_turned)(*rays, *points, off.ravel(), 0.1, 1e-4, pose)
         found = pose[:9].reshape(3, 3)
         np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
         np.testing.assert_allclose(directions(points @ found.T + pose[9:]), rays, atol=1e-9)
         way, normal = rotation @ (points[1] - points[0]), np.cross(*rays)
         out_of_plane = Rotation.from_rotvec(0.5 * directions(np.cross(way, normal))).as_matrix()
-        assert not p2p_turned(*rays, *points, (out_of_plane @ rotation).ravel(), 0.1, 1e-4, pose)
+        assert not entry(p2p_turned)(*rays, *points, (out_of_plane @ rotation).ravel(), 0.1, 1e-4, pose)
 
 
 @pytest.mark.parametrize("kind", ["gravity", "rotation", "pose"])

@@ -1,6 +1,7 @@
 """The compiled loops against the formulas of docs/search.md in float64, finite differences, and each other."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,8 +9,8 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.search.kernels.dense import POWER, assign, descend, normal_equations
-from bpnp.search.kernels.grid import CAPACITY, REACH, assign_sparse, build_grid, descend_sparse
+from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
+from bpnp.search.kernels.grid import CAPACITY, REACH, assign_sparse, build_grid, descend_sparse, sparse_scratch
 from bpnp.search.kernels.vectors import turn
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 
@@ -62,11 +63,11 @@ class View:
 
 @pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
 @pytest.mark.parametrize("relative", [0.3, 0.05])
-def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative: float) -> None:
+def test_the_assignment_on_clusters_is_the_product_form(entry: Any, spread: float, relative: float) -> None:
     view, scale, outlier = View(spread), relative * spread, 0.07
     q = np.empty((4, 60), np.float32)
     kernel, scratch = np.empty((60, 60), np.float32), np.empty((2, 60), np.float32)
-    likelihood = assign(
+    likelihood = entry(assign)(
         *view.sides(view.a, view.b), view.b, *view.pose(), np.float32(scale), np.float32(outlier), kernel, *scratch, q
     )  # fmt: skip
     a, b, u = view.a.astype(float), view.b.astype(float), view.directions()
@@ -80,12 +81,12 @@ def test_the_assignment_on_clusters_is_the_product_form(spread: float, relative:
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
-def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters(spread: float) -> None:
+def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters(entry: Any, spread: float) -> None:
     view, scale, outlier = View(spread), 0.05 * spread, 0.002
     grid, (bearings, points), one = view.grid(0.01 * spread), view.sides(), np.ones(60, np.float32)
     index, kernel = np.empty((60, CAPACITY), np.int32), np.empty((60, CAPACITY), np.float32)
     row, column, q = np.empty(60, np.float32), np.empty(60, np.float32), np.empty((4, 60), np.float32)
-    likelihood, matched = assign_sparse(
+    likelihood, matched = entry(assign_sparse)(
         grid, points, one, *view.pose(), np.float32(scale), np.float32(outlier), index, kernel,
         np.empty(60, np.int32), row, column, q,
     )  # fmt: skip
@@ -93,7 +94,7 @@ def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters
     k = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
-    dense = assign(
+    dense = entry(assign)(
         bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier),
         np.empty((60, 60), np.float32), row, column, q,
     )  # fmt: skip
@@ -101,15 +102,15 @@ def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.01])
-def test_the_gradient_is_that_of_finite_differences(spread: float) -> None:
+def test_the_gradient_is_that_of_finite_differences(entry: Any, spread: float) -> None:
     view = View(spread)
     rng = np.random.default_rng(1)
     total, u = rng.uniform(0.5, 1, 60), view.directions()
     residual = 0.1 * spread * rng.normal(size=(60, 3))
     weighted = residual + total[:, None] * u  # sum_i W_ij f_i
-    hessian, gradient = np.zeros((6, 6)), np.zeros(6)
-    points = np.ascontiguousarray(view.points.T)
-    normal_equations(np.vstack([residual.T, total]), points, view.rotation, view.translation, hessian, gradient)
+    system, points = np.zeros((8, 6)), np.ascontiguousarray(view.points.T)
+    entry(normal_equations)(np.vstack([residual.T, total]), points, view.rotation, view.translation, system)
+    hessian, gradient = np.tril(system[:6]), system[6]
     depth = float(view.translation[2])
     for k in range(6):
         step = torch.zeros(6, dtype=torch.float64)
@@ -124,12 +125,12 @@ def test_the_gradient_is_that_of_finite_differences(spread: float) -> None:
     assert np.linalg.eigvalsh(hessian + np.tril(hessian, -1).T).min() > 0
 
 
-def test_a_turn_is_the_exponential_on_the_left() -> None:
+def test_a_turn_is_the_exponential_on_the_left(entry: Any) -> None:
     rotation = random_rotations(1, torch.Generator().manual_seed(3))[0].double()
     vector = torch.tensor([0.1, -0.3, 0.2], dtype=torch.float64)
     expected, _ = retract(torch.cat([vector, torch.zeros(3)]), rotation, torch.zeros(3, dtype=torch.float64))
     turned = rotation.numpy().copy()
-    turn(turned, vector.numpy())
+    entry(turn)(turned, vector.numpy())
     np.testing.assert_allclose(turned, expected.numpy(), atol=1e-7)
 
 
@@ -142,8 +143,8 @@ def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: floa
     poses = [(rotation.copy(), translation.copy()) for _ in range(2)]
     score, result = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
     bearings, points = view.sides()
-    descend(bearings, points, *poses[0], scales, np.float32(0.5), score)
-    descend_sparse(view.grid(0.02), points, *poses[1], scales, np.float32(0.5), 3, result)
+    descend(bearings, points, *poses[0], scales, np.float32(0.5), score, dense_scratch(60, 60))
+    descend_sparse(view.grid(0.02), points, *poses[1], scales, np.float32(0.5), 3, result, sparse_scratch(60, 60))
     for values in (score, result[:, 0]):
         assert values[1] == -math.inf
         assert np.isfinite(values[[0, 2]]).all()

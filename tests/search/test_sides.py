@@ -1,6 +1,7 @@
 """Normals, labels and scores in the large search: what they weigh, and planted poses that only they make findable."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -110,12 +111,12 @@ def test_nothing_known_is_what_equal_scores_and_one_label_say() -> None:
     assert said.candidates.matched[0] == pytest.approx(bare.candidates.matched[0], abs=1e-3)
 
 
-def test_a_point_is_seen_fully_within_its_cone_and_hardly_behind_it() -> None:
+def test_a_point_is_seen_fully_within_its_cone_and_hardly_behind_it(entry: Any) -> None:
     sets, rotation = wall(4, side=60, seen=50)
     scene = Scene(replace(sets, cosines3d=np.full(120, 0.3)), 0, DEFAULT)
     pose = scene.enter(rotation, TRANSLATION)
     weight = np.empty(120, np.float32)
-    visible_weights(tuple(scene.sides()[1]), *pose, weight)
+    entry(visible_weights)(tuple(scene.sides()[1]), *pose, weight)
     camera = sets.points3d @ rotation.T + TRANSLATION
     cosine = -((sets.normals3d @ rotation.T) * camera).sum(1) / np.linalg.norm(camera, axis=1)
     softness = DEFAULT.facing.softness

@@ -3,73 +3,58 @@
 import math
 from typing import Any
 
-from bpnp.compilation import compiler
-from bpnp.search.few.matching import turned
+from bpnp.search.few.matching import part, turned
 from bpnp.search.kernels.dense import solve_normal_equations
 
-compiled = compiler(error_model="numpy", boundscheck=False)
 
-
-@compiled
-def refine(pose: Any, rays: Any, points: Any, matched: Any, prior: Any, hessian: Any, gradient: Any, step: Any) -> bool:
+@part
+def refine(pose: Any, rays: Any, points: Any, matched: Any, prior: Any, system: Any) -> bool:
     """One Gauss-Newton step, in place, on sum_i w_i^2 |f_i - g(R p + t)|^2 over the matches; False if it has none.
 
     g(y) = y/|y|. rays: (m, 4), f_i and w_i, one over its radius. prior: (k, 8) rows a, b, w: R a = b with the weight
     w; k may be 0. The step is y -> y + w x Rp + s.
     """
-    hessian[:] = 0
-    gradient[:] = 0
-    for i in range(len(matched)):
-        j = matched[i]
-        if j < 0:
-            continue
-        x, y, z = turned(pose, points[j, 0], points[j, 1], points[j, 2])
-        ux, uy, uz = x + pose[9], y + pose[10], z + pose[11]
-        inverse = 1 / math.sqrt(ux * ux + uy * uy + uz * uz)
-        ux, uy, uz = ux * inverse, uy * inverse, uz * inverse
-        w = rays[i, 3]
-        along = rays[i, 0] * ux + rays[i, 1] * uy + rays[i, 2] * uz
-        # Two tangents of the sphere at u.
-        if abs(uz) < 0.9:
-            ex, ey, ez = -uy, ux, 0.0
+    for a in range(7):
+        for b in range(6):
+            system[a, b] = 0.0
+    row = system[7]
+    for i in range(len(matched) + len(prior)):
+        k = i - len(matched)  # of the prior, whose directions have no translation: the step s moves none of them
+        ux = uy = uz = shift = 0.0
+        if k >= 0:
+            x, y, z = turned(pose, prior[k, 0], prior[k, 1], prior[k, 2])
+            turn = w = prior[k, 6]
+            rx, ry, rz = prior[k, 3] - x, prior[k, 4] - y, prior[k, 5] - z
+        elif matched[i] >= 0:
+            j = matched[i]
+            x, y, z = turned(pose, points[j, 0], points[j, 1], points[j, 2])
+            ux, uy, uz = x + pose[9], y + pose[10], z + pose[11]
+            inverse = 1 / math.sqrt(ux * ux + uy * uy + uz * uz)
+            ux, uy, uz = ux * inverse, uy * inverse, uz * inverse
+            along = rays[i, 0] * ux + rays[i, 1] * uy + rays[i, 2] * uz
+            turn = shift = rays[i, 3] * inverse
+            w = rays[i, 3] / (along if along > 0.1 else 0.1)
+            rx, ry, rz = rays[i, 0] - along * ux, rays[i, 1] - along * uy, rays[i, 2] - along * uz
         else:
-            ex, ey, ez = uz, 0.0, -ux
-        scale = 1 / math.sqrt(ex * ex + ey * ey + ez * ez)
-        ex, ey, ez = ex * scale, ey * scale, ez * scale
-        for side in range(2):
-            if side:
-                ex, ey, ez = uy * ez - uz * ey, uz * ex - ux * ez, ux * ey - uy * ex
-            residual = w * (ex * rays[i, 0] + ey * rays[i, 1] + ez * rays[i, 2]) / max(along, 0.1)
-            h = w * inverse
-            step[0], step[1], step[2] = h * (y * ez - z * ey), h * (z * ex - x * ez), h * (x * ey - y * ex)
-            step[3], step[4], step[5] = h * ex, h * ey, h * ez
-            _add(hessian, gradient, step, residual)
-    for k in range(len(prior)):
-        x, y, z = turned(pose, prior[k, 0], prior[k, 1], prior[k, 2])
-        w = prior[k, 6]
-        step[3] = step[4] = step[5] = 0.0
-        step[0], step[1], step[2] = 0.0, w * z, -w * y
-        _add(hessian, gradient, step, w * (prior[k, 3] - x))
-        step[0], step[1], step[2] = -w * z, 0.0, w * x
-        _add(hessian, gradient, step, w * (prior[k, 4] - y))
-        step[0], step[1], step[2] = w * y, -w * x, 0.0
-        _add(hessian, gradient, step, w * (prior[k, 5] - z))
+            continue
+        for axis in range(3):  # of the camera, its part across the direction u
+            own = ux if axis == 0 else uy if axis == 1 else uz
+            ex, ey, ez = (axis == 0) - own * ux, (axis == 1) - own * uy, (axis == 2) - own * uz
+            residual = w * (rx if axis == 0 else ry if axis == 1 else rz)
+            row[0], row[1], row[2] = turn * (y * ez - z * ey), turn * (z * ex - x * ez), turn * (x * ey - y * ex)
+            row[3], row[4], row[5] = shift * ex, shift * ey, shift * ez
+            for a in range(6):
+                system[6, a] += row[a] * residual
+                for b in range(a + 1):
+                    system[a, b] += row[a] * row[b]
     for k in range(6):
-        hessian[k, k] *= 1 + 1e-9
-    if not solve_normal_equations(hessian, gradient, step):
+        system[k, k] *= 1 + 1e-9
+    if not solve_normal_equations(system):
         return False
-    return _turn(pose, step)
+    return _turn(pose, row)
 
 
-@compiled
-def _add(hessian: Any, gradient: Any, row: Any, residual: float) -> None:
-    for a in range(6):
-        gradient[a] += row[a] * residual
-        for b in range(a + 1):
-            hessian[a, b] += row[a] * row[b]
-
-
-@compiled
+@part
 def _turn(pose: Any, step: Any) -> bool:
     """R <- exp([w]x) R, t <- t + s with step (w, s), the turn no larger than half a radian."""
     wx, wy, wz = step[0], step[1], step[2]

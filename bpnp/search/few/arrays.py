@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.few.matching import build_grid
-from bpnp.search.few.triangles import list_triples, orientations, sphere, triangle_table
+from bpnp.search.few.triangles import triangle_table, triples_between
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-DIRECTIONS = sphere(192)
 DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
 OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
 CELLS = 48  # of the grid, a side
@@ -45,14 +43,8 @@ class SceneArrays:
         near = min(near, self.order.shape[1])
         if near not in self._within:
             known = max(self._within)
-            found = triples_between(self.order, self.rank, known + 1, near)
             points, normals, _ = self.arrays
-            sides, frames, middles = (np.empty((len(found), *shape)) for shape in ((3,), (3, 3), (3,)))
-            usable, orientation = np.empty(len(found), np.bool_), np.empty(len(found), np.int64)
-            triangle_table(points, found, sides, frames, middles, usable)
-            orientations(found, frames, normals, DIRECTIONS, usable, orientation)
-            seen = orientation > 0
-            tables = tuple(x[seen] for x in (found, sides, frames, middles, orientation))
+            tables = triangle_table(points, normals, triples_between(self.order, self.rank, known + 1, near))
             if self._tables is not None:
                 tables = tuple(np.concatenate(pair) for pair in zip(self._tables, tables, strict=True))
             self._tables = tables
@@ -71,7 +63,7 @@ class ImageArrays:
     """Bearings in a frame whose z axis is their mean, stereographic, in a grid.
 
     turn: R, f in this frame = R f. rays: (m, 4), with one over the radius. arrays: flat (m, 2), gain (m,), labels (m,)
-    and the grid's corner, starts and items (`matching.build_grid`). density: the chance that one scene point falls
+    and the grid's corner, starts and items (`grid_of`). density: the chance that one scene point falls
     within one radius of a given image point, if it may be anywhere among them.
     """
 
@@ -155,22 +147,26 @@ def neighbours_of(points: Array, normals: Array) -> tuple[NDArray[np.int64], NDA
     return np.ascontiguousarray(order, np.int64), rank
 
 
-def triples_between(order: NDArray[np.int64], rank: NDArray[np.int64], first: int, last: int) -> NDArray[np.int64]:
-    """Triples (t, 3) of a point, one of its `first` to `last` nearest, and a nearer one."""
-    most = len(order) * (last * (last - 1) - (first - 1) * max(first - 2, 0)) // 2
-    triples = np.empty((max(most, 1), 3), np.int64)
-    return triples[: list_triples(order, rank, first, last, triples)]
-
-
 def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Corner, starts and items of the grid in which image points are looked up within `reach` radii."""
-    corner, starts = np.empty(3), np.empty(CELLS * CELLS + 1, np.int64)
-    items = np.empty(64 * len(flat), np.int64)
-    count = build_grid(flat, gain, reach, corner, starts, items)
-    if count < 0:
-        items = np.empty(-count, np.int64)
-        build_grid(flat, gain, reach, corner, starts, items)
-    return corner, starts, items
+    """Cells of the plane with the image points (m, 2) that lie within `reach` radii of each.
+
+    Returns the lower corner and cells a unit (3,); where the items of a cell begin (CELLS^2 + 1,), cells along the
+    second coordinate next to each other; and the items.
+    """
+    around = reach / gain[:, None]
+    low, high = (flat - around).min(0), (flat + around).max(0)
+    per_cell = CELLS / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
+    first, last = (
+        np.clip(((flat + side * around - low) * per_cell).astype(np.int64), 0, CELLS - 1) for side in (-1, 1)
+    )
+    size = last - first + 1
+    count = size.prod(1)
+    item = np.repeat(np.arange(len(flat)), count)
+    nth = np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
+    row, column = first[item].T + np.stack(np.divmod(nth, size[item, 1]))
+    cell = row * CELLS + column
+    order = np.argsort(cell, kind="stable")
+    return np.append(low, per_cell), np.searchsorted(cell[order], np.arange(CELLS**2 + 1)), item[order]
 
 
 def onto_z(direction: Array) -> Array:

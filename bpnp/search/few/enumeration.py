@@ -2,30 +2,29 @@
 
 from typing import Any
 
-from bpnp.compilation import compiler
 from bpnp.search.few.kept import allowed, consider
-from bpnp.search.few.matching import WIDEST_MATCHED, nearest, sight, turned
+from bpnp.search.few.matching import WIDEST_MATCHED, compiled, nearest, part, sight, turned
 from bpnp.search.few.p3p import p3p_depths
 from bpnp.search.few.triangles import pose_of_triangle
 
-compiled = compiler(error_model="numpy", boundscheck=False)
 SKIPPED = 5  # matches of the best pose from which its own triples are not solved again
 
 
 @compiled
 def sweep(
     first: int, last: int, old_image: int, old_scene: int, new_scene: int, stop: float, budget: int,
-    rays: Any, triples2d: Any, scene_triples: Any, witnesses: Any, need: int, reach: float,
+    rays: Any, image_triples: Any, scene_triples: Any, witnesses: Any, need: int, reach: float,
     scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any,
 ) -> tuple[int, int]:  # fmt: skip
     """Solve image triples `first` to `last` against scene triples below `new_scene`; those below `old_image` only
     against scene triples from `old_scene` on.
 
     Ends after an image triple when the best pose's evidence is `stop` nats, or `budget` hypotheses were solved.
-    scene_triples: triples, sides, frames, middles, orientations of `triangles`. witnesses: (n, w) near points, of
+    image_triples, scene_triples: of `orders_of_triples` and `triangle_table`. witnesses: (n, w) near points, of
     which `need` must be matched within `reach` radii for a pose to be looked at further. found: the kept poses.
     Returns the next image triple and the number of hypotheses.
     """
+    orders, chords, hands = image_triples
     triples3d, sides, frames, middles, orientation = scene_triples
     labels3d, labels2d = scene[2], image[2]
     depths, axes, pose = work[0], work[1], work[2]
@@ -35,14 +34,11 @@ def sweep(
     while place < last and solved < budget and found[1][best[0]] < stop:
         begin = old_scene if place < old_image else 0
         for permutation in range(6):
-            turn = permutation % 3
-            i = triples2d[place, turn]
-            j = triples2d[place, (turn + 1) % 3 if permutation < 3 else (turn + 2) % 3]
-            k = triples2d[place, (turn + 2) % 3 if permutation < 3 else (turn + 1) % 3]
-            chord01, chord12, chord20 = _chord(rays, i, j), _chord(rays, j, k), _chord(rays, k, i)
-            side = 1 if _determinant(rays, i, j, k) > 0 else 2
+            row = 6 * place + permutation
+            i, j, k = orders[row, 0], orders[row, 1], orders[row, 2]
+            chord = chords[row, 0], chords[row, 1], chords[row, 2]
             for t in range(begin, new_scene):
-                if not orientation[t] & side:
+                if not orientation[t] & hands[row]:
                     continue
                 a, b, c = triples3d[t, 0], triples3d[t, 1], triples3d[t, 2]
                 if not (
@@ -53,12 +49,12 @@ def sweep(
                 if pairs >= SKIPPED and known[i] == a and known[j] == b and known[k] == c:
                     continue
                 solved += 1
-                for s in range(p3p_depths(chord01, chord12, chord20, sides[t, 0], sides[t, 1], depths)):
+                for s in range(p3p_depths(*chord, sides[t, 0], sides[t, 1], depths)):
                     if not pose_of_triangle(rays, i, j, k, depths[s], sides[t, 2], frames[t], middles[t], axes, pose):
                         continue
                     if not (faces(pose, scene, rays, a, i, b, j) and faces(pose, scene, rays, b, j, c, k)):
                         continue
-                    if not allowed(pose, prior, work[9]):
+                    if not allowed(pose, prior, work[7]):
                         continue
                     if witnessed(pose, a, b, c, i, j, k, witnesses, need, reach, scene, image):
                         consider(pose, reach, rays, scene, image, used, density, prior, found, work)
@@ -66,26 +62,12 @@ def sweep(
     return place, solved
 
 
-@compiled
+@part
 def fits(one: int, other: int) -> bool:
     return one < 0 or other < 0 or one == other
 
 
-@compiled
-def _chord(rays: Any, i: int, j: int) -> float:
-    x, y, z = rays[i, 0] - rays[j, 0], rays[i, 1] - rays[j, 1], rays[i, 2] - rays[j, 2]
-    return x * x + y * y + z * z
-
-
-@compiled
-def _determinant(rays: Any, i: int, j: int, k: int) -> float:
-    x = rays[j, 1] * rays[k, 2] - rays[j, 2] * rays[k, 1]
-    y = rays[j, 2] * rays[k, 0] - rays[j, 0] * rays[k, 2]
-    z = rays[j, 0] * rays[k, 1] - rays[j, 1] * rays[k, 0]
-    return rays[i, 0] * x + rays[i, 1] * y + rays[i, 2] * z
-
-
-@compiled
+@part
 def faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int) -> bool:
     """Whether points a and b face the camera that sees them along the rays i and j."""
     normals = scene[1]
@@ -94,13 +76,13 @@ def faces(pose: Any, scene: Any, rays: Any, a: int, i: int, b: int, j: int) -> b
     )
 
 
-@compiled
+@part
 def _cosine(pose: Any, normals: Any, a: int, rays: Any, i: int) -> float:
     x, y, z = turned(pose, normals[a, 0], normals[a, 1], normals[a, 2])
     return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2])
 
 
-@compiled
+@part
 def witnessed(
     pose: Any, a: int, b: int, c: int, i: int, j: int, k: int, witnesses: Any, need: int, reach: float, scene: Any,
     image: Any,

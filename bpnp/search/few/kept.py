@@ -2,17 +2,16 @@
 
 `found`: poses (c, 12), evidence (c,), numbers of matches (c,), matches (c, m), squared distances (c, m), the place of
 the best (1,), and (2,) numbers of the sweep. `work`: depths (4, 3), axes (3, 3), the pose at hand (12,), its matches
-(m,) and squared distances (m,), a 6 x 6 system, poses (2, 12) of two pairs, and the place (4,) that a prior allows.
+(m,) and squared distances (m,), the normal equations (8, 6), poses (2, 12) of two pairs, the place (4,) that a prior
+allows, and a pose (12,) with its matches (m,) that others are compared with.
 """
 
 import math
 from typing import Any
 
-from bpnp.compilation import compiler
 from bpnp.search.few.adjustment import refine
-from bpnp.search.few.matching import WIDEST_MATCHED, evidence, match, sight, turned
+from bpnp.search.few.matching import WIDEST_MATCHED, compiled, evidence, match, part, sight, turned
 
-compiled = compiler(error_model="numpy", boundscheck=False)
 SAME = 1 + 2 * math.cos(math.radians(2.0))  # trace of the turn between two poses that are the same
 SAME_SHIFT, SAME_DEPTH = 0.1, 0.05  # of the scene's extent and of its distance
 TIGHTER, FINAL = 0.55, 3  # factor of the radius from one step of a refinement to the next, and steps at the last
@@ -23,14 +22,14 @@ FARTHEST = 4.0  # radii from an image point within which another partner is look
 LACKING = 0.25  # matches that an expected but missing point takes away
 
 
-@compiled
+@part
 def copy(values: Any, to: Any) -> None:
     """Element by element: numba compiles an assignment of arrays for more than a second."""
     for k in range(len(values)):
         to[k] = values[k]
 
 
-@compiled
+@part
 def consider(
     pose: Any, reach: float, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any,
     work: Any,
@@ -40,36 +39,30 @@ def consider(
     count, _, expected = match(pose, reach, scene, image, work[3], work[4])
     ahead[1] = max(ahead[1], count - LACKING * max(expected - count, 0))
     if count > used and count - LACKING * max(expected - count, 0) >= ahead[1] - BEHIND:
-        try_pose(reach, rays, scene, image, used, density, prior, found, work)
+        settle(reach, rays, scene, image, used, density, prior, found, work)
 
 
-@compiled
-def try_pose(
+@part
+def settle(
     reach: float, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any
 ) -> None:
-    """Refine the pose in `work`, on matches within a radius that shrinks to the one that exceeds chance most, and keep
-    it."""
-    if tightened(work[2], rays, scene, image, reach, 1.0, prior, work):
-        settle(rays, scene, image, used, density, prior, found, work)
-
-
-@compiled
-def settle(
-    rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any
-) -> None:  # fmt: skip
-    """Keep the pose in `work`, and what becomes of it on matches within the radius that exceeds chance most."""
-    pose, matched, distance2 = work[2], work[3], work[4]
-    for turn in range(2):
+    """Refine the pose in `work` on matches within a radius that shrinks from `reach` to 1, and keep it; then within the
+    radius that exceeds chance most, and keep that too. reach: 0 if it is refined already."""
+    pose, matched, distance2, last = work[2], work[3], work[4], 1.0
+    for _ in range(2):
+        if reach > 0 and not tightened(pose, rays, scene, image, reach, last, prior, work):
+            return
         count, visible, expected = match(pose, 1.0, scene, image, matched, distance2)
         if count <= used:
             return
-        value, radius = evidence(count, visible, expected, distance2, matched, used, density)
-        keep(pose, value, count, found, work)
-        if turn or radius == 1 or not tightened(pose, rays, scene, image, 2 * radius, radius, prior, work):
+        value, last = evidence(count, visible, expected, distance2, matched, used, density)
+        keep(pose, value, count, found, matched, distance2)
+        if last == 1:
             return
+        reach = 2 * last
 
 
-@compiled
+@part
 def tightened(
     pose: Any, rays: Any, scene: Any, image: Any, reach: float, last: float, prior: Any, work: Any
 ) -> bool:  # fmt: skip
@@ -79,14 +72,14 @@ def tightened(
         count, _, _ = match(pose, reach, scene, image, work[3], work[4])
         if count < 3 and count + len(prior) < 3:
             return False
-        if not refine(pose, rays, scene[0], work[3], prior, work[5], work[6], work[7]):
+        if not refine(pose, rays, scene[0], work[3], prior, work[5]):
             return False
         left -= reach <= last
         reach = max(last, TIGHTER * reach)
-    return allowed(pose, prior, work[9])
+    return allowed(pose, prior, work[7])
 
 
-@compiled
+@part
 def allowed(pose: Any, prior: Any, place: Any) -> bool:
     """Whether the pose agrees with what is known of it: directions a that R takes to b, rows (a, b, weight, largest
     squared distance) of `prior`; and the translation, (t, largest squared distance) in `place`."""
@@ -103,8 +96,8 @@ def allowed(pose: Any, prior: Any, place: Any) -> bool:
     return True
 
 
-@compiled
-def keep(pose: Any, value: float, count: int, found: Any, work: Any) -> None:
+@part
+def keep(pose: Any, value: float, count: int, found: Any, matched: Any, distance2: Any) -> None:
     """Put a pose among the kept ones: in the place of the same pose, of an empty one, or of the worst."""
     poses, values, counts, matches, distances2, best, _ = found
     place = -1
@@ -126,14 +119,14 @@ def keep(pose: Any, value: float, count: int, found: Any, work: Any) -> None:
     values[place] = value
     copy(pose, poses[place])
     counts[place] = count
-    copy(work[3], matches[place])
-    copy(work[4], distances2[place])
+    copy(matched, matches[place])
+    copy(distance2, distances2[place])
     for c in range(len(values)):
         if values[c] > values[best[0]]:
             best[0] = c
 
 
-@compiled
+@part
 def _trace(one: Any, other: Any) -> float:
     """Of the turn between two poses: 1 + 2 cos."""
     trace = 0.0
@@ -142,7 +135,7 @@ def _trace(one: Any, other: Any) -> float:
     return trace
 
 
-@compiled
+@part
 def _same(one: Any, other: Any) -> bool:
     shift2 = depth2 = 0.0
     for k in range(9, 12):
@@ -152,19 +145,23 @@ def _same(one: Any, other: Any) -> bool:
 
 
 @compiled
-def exchange(
-    best: Any, own: Any, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any, work: Any
+def vary(
+    reach: float, exchanged: bool, rays: Any, scene: Any, image: Any, used: int, density: float, prior: Any, found: Any,
+    work: Any,
 ) -> None:  # fmt: skip
-    """Keep the poses that follow from the best one (12,) and its matches (m,) when one of them is left out, or goes to
-    the nearest other scene point.
+    """Refine the pose in `work` from matches within `reach` radii, and keep it.
 
-    A single wrong match can turn a pose of few points by some degrees and still lie near its image point; no refinement
-    finds the pose without it, since the wrong match holds it.
+    exchanged: keep too what follows from the best pose when one of its matches is left out, or goes to the nearest
+    other scene point. A single wrong match can turn a pose of few points by some degrees and still lie near its image
+    point; no refinement finds the pose without it, since the wrong match holds it.
     """
-    pose, matched = work[2], work[3]
+    settle(reach, rays, scene, image, used, density, prior, found, work)
+    pose, matched, best, own = work[2], work[3], work[8], work[9]
     count = 0
-    for i in range(len(own)):
-        count += own[i] >= 0
+    if exchanged:
+        copy(found[0][found[5][0]], best)
+        copy(found[3][found[5][0]], own)
+        count = found[2][found[5][0]]
     for i in range(len(own)):
         if own[i] < 0 or count - 1 <= used:
             continue
@@ -179,22 +176,22 @@ def exchange(
             if not _stepped(pose, rays, scene, prior, work):
                 break
             other = _nearest_other(pose, i, own[i], scene, image)
-            if _trace(pose, best) < MOVED and allowed(pose, prior, work[9]):
-                settle(rays, scene, image, used, density, prior, found, work)
+            if _trace(pose, best) < MOVED and allowed(pose, prior, work[7]):
+                settle(0.0, rays, scene, image, used, density, prior, found, work)
             if other < 0:
                 break
 
 
-@compiled
+@part
 def _stepped(pose: Any, rays: Any, scene: Any, prior: Any, work: Any) -> bool:
     """Gauss-Newton steps, in place, on the matches in `work`."""
     steps = 0
-    while steps < EXCHANGED and refine(pose, rays, scene[0], work[3], prior, work[5], work[6], work[7]):
+    while steps < EXCHANGED and refine(pose, rays, scene[0], work[3], prior, work[5]):
         steps += 1
     return steps == EXCHANGED
 
 
-@compiled
+@part
 def _nearest_other(pose: Any, i: int, own: int, scene: Any, image: Any) -> int:
     """The scene point nearest to image point i, of those that are not its own and that fit its label; -1 for none."""
     points, normals, labels3d = scene

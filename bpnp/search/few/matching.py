@@ -11,54 +11,15 @@ from typing import Any
 
 from bpnp.compilation import compiler
 
-compiled = compiler(error_model="numpy", boundscheck=False)
+compiled = compiler(error_model="numpy", _nrt=False)
+part = compiler(error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
 WIDEST_MATCHED = math.cos(math.radians(87.0))  # of the angle between a normal and the line of sight: no match beyond
 WIDEST_EXPECTED = math.cos(math.radians(72.0))  # a point is expected to be seen up to this angle
 RADII = 5  # of the ladder 1, 1/2, 1/4 ... at which matches are counted
 MISSED = 1.5  # nats that an expected but missing point costs: one in five is missed
 
 
-@compiled
-def build_grid(flat: Any, gain: Any, reach: float, corner: Any, starts: Any, items: Any) -> int:
-    """Cells of the plane with the image points that lie within `reach` radii of each; how many items there are.
-
-    flat: (m, 2). corner: (3,), written: the lower corner and cells a unit. starts: (g g + 1,). items: written up to its
-    length; a negative count says that it was too short.
-    """
-    g = int(math.sqrt(len(starts) - 1))
-    low0 = low1 = math.inf
-    high0 = high1 = -math.inf
-    for i in range(len(flat)):
-        r = reach / gain[i]
-        low0, high0 = min(low0, flat[i, 0] - r), max(high0, flat[i, 0] + r)
-        low1, high1 = min(low1, flat[i, 1] - r), max(high1, flat[i, 1] + r)
-    corner[0], corner[1], corner[2] = low0, low1, g / (max(high0 - low0, high1 - low1) * (1 + 1e-9) + 1e-12)
-    starts[:] = 0
-    for turn in range(2):
-        for i in range(len(flat)):
-            r = reach / gain[i]
-            a0, a1 = int((flat[i, 0] - r - low0) * corner[2]), int((flat[i, 0] + r - low0) * corner[2])
-            b0, b1 = int((flat[i, 1] - r - low1) * corner[2]), int((flat[i, 1] + r - low1) * corner[2])
-            for a in range(max(a0, 0), min(a1, g - 1) + 1):
-                for b in range(max(b0, 0), min(b1, g - 1) + 1):
-                    cell = a * g + b
-                    if turn == 0:
-                        starts[cell + 1] += 1
-                    else:
-                        items[starts[cell]] = i
-                        starts[cell] += 1
-        if turn == 0:
-            for cell in range(g * g):
-                starts[cell + 1] += starts[cell]
-            if starts[g * g] > len(items):
-                return -int(starts[g * g])
-    for cell in range(g * g, 0, -1):
-        starts[cell] = starts[cell - 1]
-    starts[0] = 0
-    return int(starts[g * g])
-
-
-@compiled
+@part
 def turned(pose: Any, x: float, y: float, z: float) -> tuple[float, float, float]:
     """R (x, y, z)."""
     return (
@@ -68,7 +29,7 @@ def turned(pose: Any, x: float, y: float, z: float) -> tuple[float, float, float
     )
 
 
-@compiled
+@part
 def sight(pose: Any, points: Any, normals: Any, j: int) -> tuple[float, float, float]:
     """Where point j is seen on the plane, and the cosine of its normal to the line of sight (1 without normals)."""
     x, y, z = turned(pose, points[j, 0], points[j, 1], points[j, 2])
@@ -82,7 +43,7 @@ def sight(pose: Any, points: Any, normals: Any, j: int) -> tuple[float, float, f
     return cx * scale, cy * scale, cosine
 
 
-@compiled
+@part
 def nearest(
     u: float, v: float, label: int, reach2: float, flat: Any, gain: Any, labels2d: Any, corner: Any, starts: Any,
     items: Any,
@@ -104,7 +65,7 @@ def nearest(
     return found, reach2
 
 
-@compiled
+@part
 def match(pose: Any, reach: float, scene: Any, image: Any, matched: Any, distance2: Any) -> tuple[int, int, int]:
     """Each image point's nearest scene point among those that have it as their nearest, within `reach` radii.
 
@@ -132,7 +93,7 @@ def match(pose: Any, reach: float, scene: Any, image: Any, matched: Any, distanc
     return count, visible, expected
 
 
-@compiled
+@part
 def evidence(
     count: int, visible: int, expected: int, distance2: Any, matched: Any, used: int, density: float
 ) -> tuple[float, float]:
@@ -155,6 +116,6 @@ def evidence(
     return best - MISSED * max(expected - count, 0), radius
 
 
-@compiled
+@part
 def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1.0) - math.lgamma(k + 1.0) - math.lgamma(n - k + 1.0) if 0 <= k <= n else 0.0

@@ -7,14 +7,15 @@ The three pairs of points are 01, 12, 20. The caller puts the longest side of th
 import math
 from typing import Any
 
-from bpnp.compilation import compiler
+import numpy as np
 
-compiled = compiler(error_model="numpy", boundscheck=False)
+from bpnp.search.few.matching import part
+
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
 
 
-@compiled
+@part
 def p3p_depths(chord01: float, chord12: float, chord20: float, a: float, b: float, depths: Any) -> int:
     """The depths d_i > 0 of three rays with |d_i f_i - d_j f_j| = |p_i - p_j|; how many solutions there are (0 to 4).
 
@@ -76,11 +77,14 @@ def p3p_depths(chord01: float, chord12: float, chord20: float, a: float, b: floa
         c0, c1, c2 = d01, yy, d21
     else:
         c0, c1, c2 = d02, d12, ww
-    count = _meet(r0, r1, r2, m01, m12, m20, a, b, chord01, chord12, chord20, depths, 0)
-    return _meet(c0, c1, c2, m01, m12, m20, a, b, chord01, chord12, chord20, depths, count)
+    count = np.int64(0)  # as a literal, `_meet` would be compiled for it
+    for line in range(2):
+        l0, l1, l2 = (c0, c1, c2) if line else (r0, r1, r2)
+        count = _meet(l0, l1, l2, m01, m12, m20, a, b, chord01, chord12, chord20, depths, count)
+    return int(count)
 
 
-@compiled
+@part
 def cubic_root(c0: float, c1: float, c2: float, c3: float) -> float:
     """The real root of c_0 s^3 + c_1 s^2 + c_2 s + c_3 that lies farthest from the other two, so the best determined.
 
@@ -106,7 +110,7 @@ def cubic_root(c0: float, c1: float, c2: float, c3: float) -> float:
     return root
 
 
-@compiled
+@part
 def _meet(
     la: float, lb: float, lc: float, m01: float, m12: float, m20: float, a: float, b: float,
     chord01: float, chord12: float, chord20: float, depths: Any, count: int,
@@ -145,7 +149,7 @@ def _meet(
     return count
 
 
-@compiled
+@part
 def _restrict(
     slope: float, offset: float, bound2: float, mixed: float, bound: float, free2: float, free: float, constant: float
 ) -> tuple[float, float, float]:
@@ -158,7 +162,7 @@ def _restrict(
     )
 
 
-@compiled
+@part
 def polished(
     d0: float, d1: float, d2: float, chord01: float, chord12: float, chord20: float, a: float, b: float, depths: Any
 ) -> bool:

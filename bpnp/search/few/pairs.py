@@ -3,17 +3,15 @@
 import math
 from typing import Any
 
-from bpnp.compilation import compiler
 from bpnp.search.few.enumeration import faces, fits, witnessed
-from bpnp.search.few.kept import allowed, consider
-from bpnp.search.few.matching import turned
+from bpnp.search.few.kept import allowed, consider, copy
+from bpnp.search.few.matching import compiled, part, turned
 
-compiled = compiler(error_model="numpy", boundscheck=False)
 LEVEL = 1e-6  # sine of both rays' height, below which a known vertical says nothing about their depths
 UPRIGHT = 1e-3  # horizontal part of the way between two points, below which it says nothing about the heading
 
 
-@compiled
+@part
 def p2p_upright(f: Any, g: Any, p: Any, q: Any, poses: Any) -> int:
     """Poses (2, 12) of two pairs with the vertical along z in both frames: R turns about z; how many there are.
 
@@ -61,7 +59,7 @@ def p2p_upright(f: Any, g: Any, p: Any, q: Any, poses: Any) -> int:
     return count
 
 
-@compiled
+@part
 def p2p_turned(f: Any, g: Any, p: Any, q: Any, known: Any, most: float, noise: float, pose: Any) -> bool:
     """The pose (12,) of two pairs whose rotation is the least turn away from the known one (9,), by rows.
 
@@ -114,7 +112,7 @@ def sweep_pairs(
     """
     tall_rays, tall_points, from_tall, to_tall = upright
     labels2d, labels3d, points, pose = image[2], scene[2], scene[0], work[2]
-    poses = work[8]
+    poses = work[6]
     solved, place, best = 0, first, found[5]
     while place < last and solved < budget and found[1][best[0]] < stop:
         for turn in range(2):
@@ -134,8 +132,8 @@ def sweep_pairs(
                     if len(tall_rays):
                         _changed(poses[s], from_tall, to_tall, pose)
                     else:
-                        pose[:] = poses[s]
-                    if not (faces(pose, scene, rays, a, i, b, j) and allowed(pose, prior, work[9])):
+                        copy(poses[s], pose)
+                    if not (faces(pose, scene, rays, a, i, b, j) and allowed(pose, prior, work[7])):
                         continue
                     if witnessed(pose, a, b, b, i, j, j, witnesses, need, reach, scene, image):
                         consider(pose, reach, rays, scene, image, used, density, prior, found, work)
@@ -143,7 +141,7 @@ def sweep_pairs(
     return place, solved
 
 
-@compiled
+@part
 def _changed(tall: Any, from_tall: Any, to_tall: Any, pose: Any) -> None:
     """The pose A R B, A t of a pose (R, t) between frames that stand upright."""
     for r in range(3):

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays
 from bpnp.search.few.enumeration import sweep
-from bpnp.search.few.kept import exchange, try_pose
+from bpnp.search.few.kept import vary
 from bpnp.search.few.knowledge import Knowledge
 from bpnp.search.few.matching import RADII
 from bpnp.search.few.pairs import sweep_pairs
+from bpnp.search.few.triangles import orders_of_triples
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -43,8 +44,8 @@ class Enumeration:
             np.zeros((kept, m)), np.zeros(1, np.int64), np.zeros(2),
         )  # fmt: skip
         self.work = (
-            np.empty((4, 3)), np.empty((3, 3)), np.empty(12), np.empty(m, np.int64), np.empty(m), np.empty((6, 6)),
-            np.empty(6), np.empty(6), np.empty((2, 12)), known.place,
+            np.empty((4, 3)), np.empty((3, 3)), np.empty(12), np.empty(m, np.int64), np.empty(m), np.empty((8, 6)),
+            np.empty((2, 12)), known.place, np.empty(12), np.empty(m, np.int64),
         )  # fmt: skip
         self.used, k = known.pairs, known.pairs
         self._data = image.rays, scene.arrays, image.arrays, k, image.density, known.directions, self.found, self.work
@@ -66,6 +67,7 @@ class Enumeration:
         self.stage = stage
         if stage.pairs == 3:
             self._image, (self._scene, self._count) = self.image.triples(stage.near2d), self.scene.triples(stage.near3d)
+            self._orders = orders_of_triples(self.image.rays[:, :3], self._image)
         else:
             self._image, self._pairs = self.image.pairs(stage.near2d), self.scene.pairs(stage.near3d)
             self._count = len(self._pairs)
@@ -81,12 +83,12 @@ class Enumeration:
     def sweep(self, place: int, chunk: int) -> int:
         """The image triple, or pair, after about `chunk` hypotheses, or after the best pose has become better."""
         stop = max(self.best + 1e-9, self.tests)
-        block = place, len(self._image), *self._before, self._count, stop, chunk, self.image.rays, self._image
+        block = place, len(self._image), *self._before, self._count, stop, chunk, self.image.rays
         rest = self._witnesses, self._need, self.stage.reach, *self._data[1:]
         if self.stage.pairs == 3:
-            place, solved = sweep(*block, self._scene, *rest)
+            place, solved = sweep(*block, self._orders, self._scene, *rest)
         else:
-            place, solved = sweep_pairs(*block, self._pairs, self.known.upright, self.known.turned, *rest)
+            place, solved = sweep_pairs(*block, self._image, self._pairs, self.known.upright, self.known.turned, *rest)
         self.solved += solved
         return int(place)
 
@@ -96,9 +98,7 @@ class Enumeration:
         if not math.isfinite(self.best):
             return
         for reach in (0.5 * self.widest, self.widest):
-            self.refine(self.found[0][int(self.found[1].argmax())], reach)
-        best = int(self.found[1].argmax())
-        exchange(self.found[0][best].copy(), self.found[3][best].copy(), *self._data)
+            self.refine(self.found[0][int(self.found[1].argmax())], reach, exchanged=reach == self.widest)
         best = int(self.found[1].argmax())
         matched = self.found[3][best]
         seen = self.scene.arrays[0][matched[matched >= 0]]
@@ -112,10 +112,13 @@ class Enumeration:
         turned = (np.eye(3) - 2 * np.outer(sight, sight)) @ rotation @ (np.eye(3) - 2 * np.outer(normal, normal))
         self.refine(np.concatenate([turned.ravel(), middle - turned @ centre]), self.widest)
 
-    def refine(self, pose: Array, reach: float) -> None:
-        """Refine a pose (12,) of these frames from matches within `reach` radii, and keep it."""
+    def refine(self, pose: Array, reach: float, *, exchanged: bool = False) -> None:
+        """Refine a pose (12,) of these frames from matches within `reach` radii, and keep it.
+
+        exchanged: and what follows from the best pose with other matches.
+        """
         self.work[2][:] = pose
-        try_pose(reach, *self._data)
+        vary(reach, exchanged, *self._data)
 
     def best_pose(self) -> tuple[Array, Array]:
         """Rotation (3, 3) and translation (3,) of the best pose, of the given points."""

@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import compiler
-from bpnp.search.few.matching import turned
+from bpnp.search.few.matching import part, turned
 
-compiled = compiler(error_model="numpy", boundscheck=False)
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
 SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
 EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
 
 
-@compiled
+@part
 def triangle_axes(
     x0: float, y0: float, z0: float, x1: float, y1: float, z1: float, x2: float, y2: float, z2: float, axes: Any
 ) -> bool:
@@ -43,38 +43,7 @@ def triangle_axes(
     return True
 
 
-@compiled
-def triangle_table(points: Any, triples: Any, sides: Any, frames: Any, middles: Any, usable: Any) -> None:
-    """What P3P needs of each scene triple, once: triples (t, 3) are turned so that the longest side is 12.
-
-    points: (n, 3). sides: (t, 3), |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|. frames: (t, 3, 3) of
-    `triangle_axes`. middles: (t, 3). usable: (t,), False where the triangle is flat.
-    """
-    for t in range(len(triples)):
-        apex = 0
-        best = -1.0
-        for k in range(3):
-            p, q = triples[t, (k + 1) % 3], triples[t, (k + 2) % 3]
-            side2 = 0.0
-            for x in range(3):
-                side2 += (points[p, x] - points[q, x]) ** 2
-            if side2 > best:
-                apex, best = k, side2
-        i, j, k = triples[t, apex], triples[t, (apex + 1) % 3], triples[t, (apex + 2) % 3]
-        triples[t, 0], triples[t, 1], triples[t, 2] = i, j, k
-        a = b = 0.0
-        for x in range(3):
-            a += (points[i, x] - points[j, x]) ** 2
-            b += (points[k, x] - points[i, x]) ** 2
-            middles[t, x] = (points[i, x] + points[j, x] + points[k, x]) / 3
-        sides[t, 0], sides[t, 1], sides[t, 2] = a / best, b / best, math.sqrt(best)
-        usable[t] = triangle_axes(
-            points[i, 0], points[i, 1], points[i, 2], points[j, 0], points[j, 1], points[j, 2],
-            points[k, 0], points[k, 1], points[k, 2], frames[t],
-        )  # fmt: skip
-
-
-@compiled
+@part
 def pose_of_triangle(
     rays: Any, i: int, j: int, k: int, depths: Any, side: float, frame: Any, middle: Any, axes: Any, pose: Any
 ) -> bool:
@@ -96,31 +65,62 @@ def pose_of_triangle(
     return True
 
 
-@compiled
-def list_triples(order: Any, rank: Any, first: int, last: int, triples: Any) -> int:
-    """Triples of a point, one of its `first` to `last` nearest (counted from 1), and a nearer one.
+def triples_between(order: Places, rank: Places, first: int, last: int) -> Places:
+    """Triples (t, 3) of a point, one of its `first` to `last` nearest (counted from 1), and a nearer one.
 
     Every set of three comes once, from the point to which the farther one of the other two is nearest in rank, and
     nearer triples come first. order: (n, k) each point's nearest. rank: (n, n) the place of one among another's.
-    triples: (t, 3), written up to its length. Returns how many there are.
     """
-    count = 0
+    own, parts = np.arange(len(order)), [np.empty((0, 3), np.int64)]
     for farther in range(max(first - 1, 1), min(last, order.shape[1])):
-        for nearer in range(farther):
-            for i in range(len(order)):
-                a, b = order[i, nearer], order[i, farther]
-                from_a, from_b = max(rank[a, i], rank[a, b]), max(rank[b, i], rank[b, a])
-                if from_a < farther or from_b < farther:
-                    continue
-                if (from_a == farther and a < i) or (from_b == farther and b < i):
-                    continue
-                if count < len(triples):
-                    triples[count, 0], triples[count, 1], triples[count, 2] = i, a, b
-                count += 1
-    return count
+        i, a, b = np.broadcast_arrays(own, order[:, :farther].T, order[:, farther])
+        once = np.ones(a.shape, np.bool_)
+        for one, other in ((a, b), (b, a)):
+            back = np.maximum(rank[one, i], rank[one, other])
+            once &= (back > farther) | ((back == farther) & (one > i))
+        parts.append(np.stack([i[once], a[once], b[once]], -1))
+    return np.concatenate(parts)
 
 
-def sphere(count: int) -> NDArray[np.float64]:
+def orders_of_triples(rays: Array, triples: Places) -> tuple[NDArray[Any], ...]:
+    """The six orders of image triples (t, 3), one after the other: places (6 t, 3), the squared chords 01, 12 and 20
+    between their rays (m, 3), and 1 where these turn right-handed, else 2."""
+    orders = triples[:, [[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]].reshape(-1, 3)
+    f = rays[orders]
+    hands = np.where((f[:, 0] * np.cross(f[:, 1], f[:, 2])).sum(-1) > 0, 1, 2)
+    return orders, ((f - np.roll(f, -1, 1)) ** 2).sum(-1), hands
+
+
+def triangle_table(points: Array, normals: Array, triples: Places) -> tuple[NDArray[Any], ...]:
+    """What P3P needs of scene triples (t, 3), of those that a camera can see: the triples, turned so that the longest
+    side is 12; sides (t, 3), |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|; frames (t, 3, 3) of
+    `triangle_axes`; middles (t, 3); orientations (t,).
+
+    The latter are 1 where a camera can face all three points and see them in the order of their triangle's normal, 2 in
+    the other order, 3 either. points: (n, 3). normals: (n, 3) or (0, 3).
+    """
+    p = points[triples]
+    opposite = ((np.roll(p, -1, 1) - np.roll(p, -2, 1)) ** 2).sum(-1)
+    turn = (opposite.argmax(1)[:, None] + np.arange(3)) % 3
+    triples, p = np.take_along_axis(triples, turn, 1), np.take_along_axis(p, turn[..., None], 1)
+    length2 = np.maximum(opposite.max(1), 1e-300)
+    along = (p[:, 1] - p[:, 2]) / np.sqrt(length2)[:, None]
+    normal = np.cross(along, p[:, 0] - p[:, 2])
+    height2 = (normal**2).sum(-1)
+    normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
+    frames = np.stack([along, np.cross(normal, along), normal], 1)
+    a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
+    orientation: Places = np.full(len(triples), 3)
+    if len(normals):
+        facing = (normals @ DIRECTIONS.T > SLACK)[triples].all(1)
+        above = normal @ DIRECTIONS.T
+        orientation = np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
+    seen = (height2 > FLAT * length2) & (orientation > 0)
+    tables = triples, np.stack([a, b, np.sqrt(length2)], -1), frames, p.mean(1), orientation
+    return tuple(np.ascontiguousarray(table[seen]) for table in tables)
+
+
+def sphere(count: int) -> Array:
     """Unit vectors (count, 3) spread evenly: the golden spiral."""
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = math.pi * (3 - math.sqrt(5)) * np.arange(count)
@@ -128,25 +128,4 @@ def sphere(count: int) -> NDArray[np.float64]:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)
 
 
-@compiled
-def orientations(triples: Any, frames: Any, normals: Any, directions: Any, usable: Any, sides: Any) -> None:
-    """sides (t,): 1 where a camera can face all three points and see them in the order of their triangle's normal,
-    2 in the other order, 3 either; 0 if none can, or the triangle is flat. normals: (n, 3) or (0, 3)."""
-    for t in range(len(triples)):
-        sides[t] = 3 if usable[t] else 0
-        if not usable[t] or not len(normals):
-            continue
-        i, j, k = triples[t, 0], triples[t, 1], triples[t, 2]
-        seen = 0
-        for v in range(len(directions)):
-            x, y, z = directions[v, 0], directions[v, 1], directions[v, 2]
-            if (
-                normals[i, 0] * x + normals[i, 1] * y + normals[i, 2] * z > SLACK
-                and normals[j, 0] * x + normals[j, 1] * y + normals[j, 2] * z > SLACK
-                and normals[k, 0] * x + normals[k, 1] * y + normals[k, 2] * z > SLACK
-            ):
-                height = frames[t, 2, 0] * x + frames[t, 2, 1] * y + frames[t, 2, 2] * z
-                seen |= (height > -EDGE_ON) + 2 * (height < EDGE_ON)
-                if seen == 3:
-                    break
-        sides[t] = seen
+DIRECTIONS = sphere(192)

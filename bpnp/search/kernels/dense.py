@@ -6,15 +6,17 @@ view keep their digits, where float32 rounds f . u - 1 to a multiple of 6e-8.
 
 Shapes, for m bearings and n points: f (3, m) offsets of the bearings; p (3, n) points; rotation
 (3, 3), translation (3,); q (4, n) sums over the bearings of W_ij (f_i - u_j) and, in the last row, of W_ij, W the soft
-assignment and u_j = g(R p_j + t); hessian (6, 6), of which the lower half is used, gradient (6,), step (6,) in (w, s).
+assignment and u_j = g(R p_j + t); system (8, 6) the Hessian, of which the lower half is used, the gradient and the step
+in (w, s). Whatever is overwritten comes from the caller: without an allocation the loops compile in half the time.
 """
 
 import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from bpnp.search.kernels.vectors import F, compiled, cross, direction, rotated, sum_of, turn
+from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
 from bpnp.search.kernels.weighted import visible_weights
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
@@ -22,8 +24,8 @@ DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction tha
 POWER = 256  # of the kernel: eight squarings
 
 
-@compiled
-def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, hessian: Any, gradient: Any) -> None:
+@part
+def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, system: Any) -> None:
     """Fill Hessian and gradient of sum_j q_j . u_j in (w, s), y = R p + t moving by w x Rp + s, Gauss-Newton's.
 
     For one point the gradient in y is (q - (q.u) u) / |y|, the Hessian |q| (I - u u^T) / |y|^2, q the sum W_ij f_i.
@@ -43,7 +45,7 @@ def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, hessian: A
         t0, t1, t2 = cross(x, y, z, hx, hy, hz)
         g0, g1, g2, g3, g4, g5 = g0 + t0, g1 + t1, g2 + t2, g3 + hx, g4 + hy, g5 + hz
         squared = qx * qx + qy * qy + qz * qz + total * (F(2) * along + total)
-        w = math.sqrt(max(squared, F(0))) * inverse * inverse
+        w = math.sqrt(squared if squared > F(0) else F(0)) * inverse * inverse
         m00, m01, m02 = w * (uy * uy + uz * uz), -w * ux * uy, -w * ux * uz
         m11, m12, m22 = w * (ux * ux + uz * uz), -w * uy * uz, w * (ux * ux + uy * uy)
         c00, c01, c02, c11, c12, c22 = c00 + m00, c01 + m01, c02 + m02, c11 + m11, c12 + m12, c22 + m22
@@ -57,54 +59,48 @@ def normal_equations(q: Any, p: Any, rotation: Any, translation: Any, hessian: A
         _, k11, k12 = cross(x, y, z, e10, e11, e12)
         _, _, k22 = cross(x, y, z, e20, e21, e22)
         a00, a01, a02, a11, a12, a22 = a00 + k00, a01 + k01, a02 + k02, a11 + k11, a12 + k12, a22 + k22
-    hessian[0, 0], hessian[1, 0], hessian[2, 0] = a00, a01, a02
-    hessian[1, 1], hessian[2, 1], hessian[2, 2] = a11, a12, a22
-    hessian[3, 0], hessian[4, 0], hessian[5, 0] = b00, b01, b02
-    hessian[3, 1], hessian[4, 1], hessian[5, 1] = b10, b11, b12
-    hessian[3, 2], hessian[4, 2], hessian[5, 2] = b20, b21, b22
-    hessian[3, 3], hessian[4, 3], hessian[5, 3] = c00, c01, c02
-    hessian[4, 4], hessian[5, 4], hessian[5, 5] = c11, c12, c22
-    gradient[0], gradient[1], gradient[2], gradient[3], gradient[4], gradient[5] = g0, g1, g2, g3, g4, g5
+    system[0, 0], system[1, 0], system[2, 0] = a00, a01, a02
+    system[1, 1], system[2, 1], system[2, 2] = a11, a12, a22
+    system[3, 0], system[4, 0], system[5, 0] = b00, b01, b02
+    system[3, 1], system[4, 1], system[5, 1] = b10, b11, b12
+    system[3, 2], system[4, 2], system[5, 2] = b20, b21, b22
+    system[3, 3], system[4, 3], system[5, 3] = c00, c01, c02
+    system[4, 4], system[5, 4], system[5, 5] = c11, c12, c22
+    system[6, 0], system[6, 1], system[6, 2], system[6, 3], system[6, 4], system[6, 5] = g0, g1, g2, g3, g4, g5
 
 
-@compiled
-def solve_normal_equations(hessian: Any, gradient: Any, step: Any) -> bool:
-    """Solve hessian step = gradient by Cholesky, in place; False if it is not positive definite, or not finite."""
+@part
+def solve_normal_equations(system: Any) -> bool:
+    """Solve Hessian step = gradient by Cholesky, in place; False if it is not positive definite, or not finite."""
     for j in range(6):
-        pivot = hessian[j, j]
+        pivot = system[j, j]
         for k in range(j):
-            pivot -= hessian[j, k] * hessian[j, k]
+            pivot -= system[j, k] * system[j, k]
         if not (pivot > 0 and math.isfinite(pivot)):
             return False
-        hessian[j, j] = math.sqrt(pivot)
-        for i in range(j + 1, 6):
-            value = hessian[i, j]
+        system[j, j] = math.sqrt(pivot)
+        for i in range(j + 1, 7):  # row 6, the gradient, becomes the solution of the lower triangle
+            value = system[i, j]
             for k in range(j):
-                value -= hessian[i, k] * hessian[j, k]
-            hessian[i, j] = value / hessian[j, j]
-    for i in range(6):
-        value = gradient[i]
-        for k in range(i):
-            value -= hessian[i, k] * step[k]
-        step[i] = value / hessian[i, i]
+                value -= system[i, k] * system[j, k]
+            system[i, j] = value / system[j, j]
     for i in range(5, -1, -1):
-        value = step[i]
+        value = system[6, i]
         for k in range(i + 1, 6):
-            value -= hessian[k, i] * step[k]
-        step[i] = value / hessian[i, i]
+            value -= system[k, i] * system[7, k]
+        system[7, i] = value / system[i, i]
     return True
 
 
-@compiled
-def move(
-    q: Any, p: Any, rotation: Any, translation: Any, length: Any, hessian: Any, gradient: Any, step: Any
-) -> bool:  # fmt: skip
+@part
+def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: Any) -> bool:
     """`length` times one damped Gauss-Newton step of the pose, in place; False if the points do not fix the pose."""
-    normal_equations(q, p, rotation, translation, hessian, gradient)
+    normal_equations(q, p, rotation, translation, system)
     for k in range(6):
-        hessian[k, k] *= F(1 + DAMPING)
-    if not solve_normal_equations(hessian, gradient, step):
+        system[k, k] *= F(1 + DAMPING)
+    if not solve_normal_equations(system):
         return False
+    step = system[7]
     for k in range(6):
         step[k] *= length
     turn(rotation, step)
@@ -113,7 +109,7 @@ def move(
     return True
 
 
-@compiled
+@part
 def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
            kernel: Any, base: Any, row: Any, q: Any) -> Any:  # fmt: skip
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
@@ -175,25 +171,29 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
 
 
 @compiled
-def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any,
-            score: Any) -> None:  # fmt: skip
+def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any,
+            scratch: Any) -> None:  # fmt: skip
     """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
 
     score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix. bearings, points: as for `assign`. outlier: o / s^2 of `Scene.outlier_density`.
+    not fix. bearings, points: as for `assign`. outlier: o / s^2 of `Scene.outlier_density`. scratch: `dense_scratch`.
     """
     p = points[0]
-    m, n = bearings[0].shape[1], p.shape[1]
+    kernel, base, row, q, weight, system = scratch
     for k in range(len(rotation)):
-        kernel, base, row, q = np.empty((n, m), F), np.empty(m, F), np.empty(m, F), np.empty((4, n), F)
-        hessian, gradient, step, weight = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F), np.empty(n, F)
-        for scale in scales:
+        for step in range(len(scales)):
+            scale = scales[step]
             visible_weights(points, rotation[k], translation[k], weight)
             score[k] = assign(
                 bearings, points, weight, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base,
                 row, q,
             )  # fmt: skip
-            fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), hessian, gradient, step)
+            fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), system)
             if not (fixed and math.isfinite(score[k])):
                 score[k] = -np.inf
                 break
+
+
+def dense_scratch(m: int, n: int) -> tuple[NDArray[np.float32], ...]:
+    """What `descend` overwrites, for m bearings and n points."""
+    return tuple(np.empty(shape, F) for shape in ((n, m), m, m, (4, n), n, (8, 6)))

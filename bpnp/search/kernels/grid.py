@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.kernels.dense import move
-from bpnp.search.kernels.vectors import F, compiled, direction, rotated, sum_of
+from bpnp.search.kernels.vectors import F, compiled, direction, part, rotated, sum_of
 from bpnp.search.kernels.weighted import WeightedBearings, visible_weights
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
@@ -59,7 +59,14 @@ def build_grid(bearings: WeightedBearings, smallest: float) -> Grid:
     )
 
 
-@compiled
+@part
+def cells_within(x: Any, radius: Any, cell: Any, size: Any) -> tuple[int, int]:
+    """First and last of `size` cells that lie within `radius` of x along an axis."""
+    first, last = math.floor((x - radius) / cell), math.floor((x + radius) / cell)
+    return first if first > 0 else 0, last if last < size else size - 1
+
+
+@part
 def neighbours(grid: Any, label: Any, x: Any, y: Any, z: Any, radius: Any, index: Any, squared: Any) -> int:
     """Bearings of a label within `radius` of the offset (x, y, z): how many, at most as many as the arrays hold.
 
@@ -67,18 +74,9 @@ def neighbours(grid: Any, label: Any, x: Any, y: Any, z: Any, radius: Any, index
     """
     f, labels, start, low, cell, shape = grid[0], grid[3], grid[4], grid[5], grid[6], grid[7]
     count, bound = 0, radius * radius
-    i0, i1 = (
-        max(0, math.floor((x - radius - low[0]) / cell)),
-        min(shape[0] - 1, math.floor((x + radius - low[0]) / cell)),
-    )
-    j0, j1 = (
-        max(0, math.floor((y - radius - low[1]) / cell)),
-        min(shape[1] - 1, math.floor((y + radius - low[1]) / cell)),
-    )
-    k0, k1 = (
-        max(0, math.floor((z - radius - low[2]) / cell)),
-        min(shape[2] - 1, math.floor((z + radius - low[2]) / cell)),
-    )
+    i0, i1 = cells_within(x - low[0], radius, cell, shape[0])
+    j0, j1 = cells_within(y - low[1], radius, cell, shape[1])
+    k0, k1 = cells_within(z - low[2], radius, cell, shape[2])
     if k1 < k0:
         return 0
     for i in range(i0, i1 + 1):
@@ -95,7 +93,7 @@ def neighbours(grid: Any, label: Any, x: Any, y: Any, z: Any, radius: Any, index
     return count
 
 
-@compiled
+@part
 def assign_sparse(grid: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
                   index: Any, kernel: Any, count: Any, row: Any, column: Any, q: Any) -> Any:  # fmt: skip
     """Fill q by Sinkhorn with slack; return the mean log-likelihood of the bearings and the matched share.
@@ -153,14 +151,14 @@ def assign_sparse(grid: Any, points: Any, weight: Any, rotation: Any, translatio
     return likelihood / total_a, matched / min(total_a, max(total_b, F(LEAST_SEEN) * sum_of(points[1])))
 
 
-@compiled
+@part
 def clear(values: Any) -> None:
     """Zero in all places of values (k,)."""
     for i in range(len(values)):
         values[i] = 0
 
 
-@compiled
+@part
 def is_finite(rotation: Any, translation: Any) -> bool:
     """Whether a pose has neither NaN nor infinity."""
     finite = True
@@ -171,7 +169,7 @@ def is_finite(rotation: Any, translation: Any) -> bool:
     return finite
 
 
-@compiled
+@part
 def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
     """Element by element: numba compiles an assignment of arrays for 3 s, most of it the message of a wrong shape."""
     for r in range(3):
@@ -182,24 +180,21 @@ def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation:
 
 @compiled
 def descend_sparse(grid: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int,
-                   result: Any) -> None:  # fmt: skip
+                   result: Any, scratch: Any) -> None:  # fmt: skip
     """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best.
 
     A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
     result (S, 3): likelihood, matched share and scale there; -inf, 0, 0 for a pose that is not finite. outlier: o / s^2
-    of `Scene.outlier_density`.
+    of `Scene.outlier_density`. scratch: `sparse_scratch`.
     """
     p = points[0]
-    m, n = grid[0].shape[1], p.shape[1]
+    index, kernel, count, row, column, q, weight, system, best_rotation, best_translation = scratch
     for k in range(len(rotation)):
-        index, kernel, count = np.empty((n, CAPACITY), np.int32), np.empty((n, CAPACITY), F), np.empty(n, np.int32)
-        row, column, weight, q = np.empty(m, F), np.empty(n, F), np.empty(n, F), np.empty((4, n), F)
-        hessian, gradient, step = np.empty((6, 6), F), np.empty(6, F), np.empty(6, F)
-        best_rotation, best_translation = np.empty((3, 3), F), np.empty(3, F)
         copy_pose(rotation[k], translation[k], best_rotation, best_translation)
         result[k, 0], result[k, 1], result[k, 2] = -np.inf, F(0), F(0)
         since = 0
-        for scale in scales:
+        for step in range(len(scales)):
+            scale = scales[step]
             if not is_finite(rotation[k], translation[k]):
                 break
             visible_weights(points, rotation[k], translation[k], weight)
@@ -212,6 +207,13 @@ def descend_sparse(grid: Any, points: Any, rotation: Any, translation: Any, scal
                 result[k, 0], result[k, 1], result[k, 2] = likelihood, matched, scale
                 copy_pose(rotation[k], translation[k], best_rotation, best_translation)
                 since = 0
-            if since > patience or not move(q, p, rotation[k], translation[k], F(1), hessian, gradient, step):
+            if since > patience or not move(q, p, rotation[k], translation[k], F(1), system):
                 break
         copy_pose(best_rotation, best_translation, rotation[k], translation[k])
+
+
+def sparse_scratch(m: int, n: int) -> tuple[NDArray[Any], ...]:
+    """What `descend_sparse` overwrites, for m bearings and n points."""
+    index, count = np.empty((n, CAPACITY), np.int32), np.empty(n, np.int32)
+    kernel, row, *rest = (np.empty(shape, F) for shape in ((n, CAPACITY), m, n, (4, n), n, (8, 6), (3, 3), 3))
+    return index, kernel, count, row, *rest

@@ -22,19 +22,21 @@ class Raster(NamedTuple):
 
 
 @compiled
-def add_up(raster: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, score: Any) -> None:
+def add_up(raster: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, score: Any,
+           weight: Any) -> None:  # fmt: skip
     """score (S,): the sum of the points' weights times the raster's values where pose k sees them, 0 outside it.
 
     points: a `WeightedPoints` as a tuple, whose labels are ignored.
     raster (g, g), rows are y. Its first cell begins at -half in both coordinates; per_cell cells a unit.
-    rotation (S, 3, 3), translation (S, 3).
+    rotation (S, 3, 3), translation (S, 3). weight (n,): overwritten.
     """
     cells, p = raster.shape[0], points[0]
-    weight = points[1].copy()
+    visible = points[1]
     for k in range(len(rotation)):
         turn, t = rotation[k], translation[k]
         if points[5].shape[1]:
             visible_weights(points, turn, t, weight)
+            visible = weight
         total = F(0)
         for j in range(p.shape[1]):
             x, y, z = rotated(turn, p[0, j], p[1, j], p[2, j])
@@ -42,5 +44,5 @@ def add_up(raster: Any, half: Any, per_cell: Any, points: Any, rotation: Any, tr
             shrink = F(2) / (math.sqrt(x * x + y * y + z * z) + z + F(1e-9))
             column, row = (x * shrink + half) * per_cell, (y * shrink + half) * per_cell
             if column >= 0 and row >= 0 and column < cells and row < cells:
-                total += weight[j] * raster[int(row), int(column)]
+                total += visible[j] * raster[int(row), int(column)]
         score[k] = total

@@ -9,13 +9,13 @@ from bpnp.compilation import compiler
 
 F = np.float32
 # Sums in any order, but NaN and infinity keep their meaning: they mark a lost pose.
-compiled = compiler(
-    fastmath={"reassoc", "contract", "arcp", "nsz", "afn"}, error_model="numpy", boundscheck=False
-)  # fmt: skip
+FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
+compiled = compiler(fastmath=FAST, error_model="numpy", _nrt=False)
+part = compiler(fastmath=FAST, error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by compiled ones
 LARGEST_TURN = 0.5  # radians in one step
 
 
-@compiled
+@part
 def sum_of(values: Any) -> Any:
     """The sum of float32 values (k,): numba takes longer to compile its own."""
     total = F(0)
@@ -24,13 +24,13 @@ def sum_of(values: Any) -> Any:
     return total
 
 
-@compiled
+@part
 def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
     """(x, y, z) x (a, b, c)."""
     return y * c - z * b, z * a - x * c, x * b - y * a
 
 
-@compiled
+@part
 def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
     """R (x, y, z)."""
     return (
@@ -40,7 +40,7 @@ def rotated(rotation: Any, x: Any, y: Any, z: Any) -> Any:
     )
 
 
-@compiled
+@part
 def direction(x: Any, y: Any, z: Any) -> Any:
     """The unit vector of (x, y, z) as the offset from (0, 0, 1), and 1 / |(x, y, z)|."""
     inverse = F(1) / math.sqrt(x * x + y * y + z * z + F(1e-12))
@@ -48,7 +48,7 @@ def direction(x: Any, y: Any, z: Any) -> Any:
     return x, y, -(x * x + y * y) / (F(1) + z) if z > F(0) else z - F(1), inverse
 
 
-@compiled
+@part
 def turn(rotation: Any, vector: Any) -> None:
     """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
     x, y, z = vector[0], vector[1], vector[2]

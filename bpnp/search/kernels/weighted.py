@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.kernels.vectors import F, compiled
+from bpnp.search.kernels.vectors import F, part
 
 Array = NDArray[np.float32]
 
@@ -46,7 +46,7 @@ class WeightedPoints(NamedTuple):
     cones: Array
 
 
-@compiled
+@part
 def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -> None:
     """weight (n,): b_j v_j of points, a `WeightedPoints` as a tuple, under a pose (3, 3), (3,)."""
     p, b, cones = points[0], points[1], points[5]
