@@ -22,10 +22,10 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
     names another one); where neither can, each process compiles again. A function is compiled without the wrappers that
     a type checker puts around it when it is imported.
-    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. The wrapper for
-    Python is another tenth, which `no_cpython_wrapper` leaves out of a function that only compiled ones call (a call
-    from Python ends the process). Counting references is a fifth, which `_nrt=False` leaves out of one that allocates
-    nothing.
+    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. The wrapper
+    for Python is another tenth, which `no_cpython_wrapper` leaves out of a function that only compiled ones call (a
+    call from Python ends the process). Counting references is a fifth, which `_nrt=False` leaves out of one that
+    allocates nothing.
     """
     options |= {"nogil": True, "no_cfunc_wrapper": True}
 
