@@ -8,7 +8,6 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 
-from bpnp.cameras import camera_models
 from bpnp.datamodules.colmap.model_files import read_records
 
 Array = NDArray[np.float64]
@@ -22,7 +21,7 @@ class DescribedMap:
     """The descriptors of a model's observations, from the database that the model was built from."""
 
     def __init__(self, model: Path, database: Path) -> None:
-        records = read_records(model, camera_models=camera_models())
+        records = read_records(model)
         self._points3d = dict(zip(records.point_ids.tolist(), records.points3d, strict=True))
         self._database = database
         self._views = {}

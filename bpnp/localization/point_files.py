@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 if TYPE_CHECKING:
-    from bpnp.datamodules.colmap.model_records import ModelRecords
+    from bpnp.datamodules.colmap.model_files import ModelRecords
 
 Array = npt.NDArray[np.float64]
 TEXTS = (".csv", ".txt", ".xyz")
@@ -137,10 +137,9 @@ def read_camera(text: str, image: str | None = None) -> Any:
 
 def _colmap(path: Path) -> "ModelRecords":
     """The COLMAP model in a folder, or around one of its files."""
-    from bpnp.cameras import camera_models
     from bpnp.datamodules.colmap.model_files import read_records
 
-    return read_records(path if path.is_dir() else path.parent, camera_models=camera_models())
+    return read_records(path if path.is_dir() else path.parent)
 
 
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from bpnp.cameras import Camera, camera_models
+from bpnp.cameras import Camera
 from bpnp.datamodules.colmap.model_files import ColmapError, ModelRecords, read_records
 from bpnp.datamodules.colmap.reconstruction import camera_of
 from bpnp.maps.localize import localize
@@ -42,7 +42,7 @@ class SceneMap(ViewedPoints):
         Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
         """
         folder = Path(path)
-        return _scene_map(folder, read_records(folder, camera_models=camera_models()))
+        return _scene_map(folder, read_records(folder))
 
     def localize(
         self,

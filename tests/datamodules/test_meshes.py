@@ -16,8 +16,7 @@ from bpnp.datamodules.augment import Augmentation, Outliers
 from bpnp.datamodules.loader import PairDataset, PairKeys
 from bpnp.datamodules.meshes.module import MeshDataModule
 from bpnp.datamodules.meshes.prepare import WIDTHS
-from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, hold_out
-from bpnp.datamodules.meshes.views import Views
+from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, Views, hold_out
 from bpnp.datamodules.pair import PairSource
 from bpnp.datamodules.store import Store, new_store, open_store
 from bpnp.types import Batch

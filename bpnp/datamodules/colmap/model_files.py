@@ -1,31 +1,71 @@
 """The three files of a COLMAP model, binary or text, as plain numpy arrays.
 
-Text files go to pycolmap. Binary ones do not, because pycolmap 4.2 takes a truncated `cameras.bin` for a whole one (the
-parameters are then whatever was in memory), fills the memory on a truncated `points3D.bin` and never returns from a
-truncated `frames.bin`: here every size is checked against the file before anything is read. Poses are those of
-`images`, which COLMAP writes composed with the rig, so `rigs` and `frames` are not needed.
+pycolmap rewrites text files as binary ones. It does not read binary ones, because pycolmap 4.2 takes a truncated
+`cameras.bin` for a whole one (the parameters are then whatever was in memory), fills the memory on a truncated
+`points3D.bin` and never returns from a truncated `frames.bin`: here every size is checked against the file before
+anything is read. Poses are those of `images`, which COLMAP writes composed with the rig, so `rigs` and `frames` are not
+needed.
 
 Source: https://colmap.github.io/format.html
 """
 
 import mmap
+import re
 import struct
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.colmap.model_records import POINT, CameraRecord, ColmapError, ImageRecord, ModelRecords
-from bpnp.datamodules.colmap.text_files import read_text
+from bpnp.cameras import camera_models, read_text_model
 
-__all__ = ["FILES", "CameraRecord", "ColmapError", "ImageRecord", "ModelRecords", "model_format", "read_records"]
-
-FILES = ("cameras", "images", "points3D")
+FILES = {"cameras": 1, "images": 2, "points3D": 1}  # lines of a record in a text file
 TRACK_ELEMENT = 8
 KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])  # no point: 2^64 - 1 in the file, so -1 here
+# A point's track of `track_length` (image, keypoint) follows, 8 bytes each.
+POINT = np.dtype(
+    [("point_id", "<i8"), ("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
+)
+
+
+class ColmapError(ValueError):
+    """A COLMAP folder or file that cannot be used; the message names it."""
+
+
+@dataclass(frozen=True)
+class CameraRecord:
+    model: str
+    params: NDArray[np.float64]
+    size: tuple[int, int]  # width and height of the image, pixels
+
+
+@dataclass(frozen=True)
+class ImageRecord:
+    """quaternion (w, x, y, z) and translation are cam_from_world; keypoints (k, 2) pixels; point_ids (k,), -1: none."""
+
+    name: str
+    image_id: int
+    camera_id: int
+    quaternion: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    keypoints: NDArray[np.float64]
+    point_ids: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class ModelRecords:
+    """What the three files hold. points3d (n, 3) has the ids `point_ids` and `track_lengths` observations."""
+
+    cameras: dict[int, CameraRecord]
+    images: list[ImageRecord]
+    point_ids: NDArray[np.int64]
+    points3d: NDArray[np.float64]
+    track_lengths: NDArray[np.int64]
 
 
 def model_format(folder: Path) -> str | None:
@@ -34,8 +74,8 @@ def model_format(folder: Path) -> str | None:
     return next(whole, None)
 
 
-def read_records(folder: Path, *, camera_models: Mapping[int, tuple[str, int]]) -> ModelRecords:
-    """Read the model in `folder`. `camera_models`: name and number of parameters of each COLMAP camera model id.
+def read_records(folder: Path) -> ModelRecords:
+    """Read the model in `folder`.
 
     Raises ColmapError, naming the file and the byte or line, if a file is missing, empty, truncated or too long, holds
     no record, or is not a COLMAP file.
@@ -49,12 +89,12 @@ def read_records(folder: Path, *, camera_models: Mapping[int, tuple[str, int]]) 
         )
     paths = [folder / f"{name}.{suffix}" for name in FILES]
     contents = [_content(path) for path in paths]
-    if suffix == "bin":
-        cameras = dict(_binary_cameras(_Cursor(paths[0], contents[0]), camera_models))
-        images = list(_binary_images(_Cursor(paths[1], contents[1])))
-        points = _binary_points(_Cursor(paths[2], contents[2]))
-    else:
-        cameras, images, points = read_text(paths, [content[:] for content in contents])
+    with TemporaryDirectory() as rewritten:
+        if suffix == "txt":
+            _rewrite_text(paths, [content[:] for content in contents], rewritten)
+            contents = [_content(Path(rewritten) / f"{name}.bin") for name in FILES]
+        cursors = [_Cursor(path, content) for path, content in zip(paths, contents, strict=True)]
+        cameras, images, points = dict(_cameras(cursors[0])), list(_images(cursors[1])), _points(cursors[2])
     for path, count in zip(paths, (len(cameras), len(images), len(points)), strict=True):
         if not count:
             raise ColmapError(f"expected cameras, images and points in a COLMAP model, got none in {path}; try another")
@@ -76,6 +116,38 @@ def _content(path: Path) -> mmap.mmap:
     except OSError as error:
         raise ColmapError(f"expected a readable COLMAP file, got {error}; try its permissions") from error
     raise ColmapError(f"expected a COLMAP file, got {path} of 0 bytes; try copying the model again")
+
+
+def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None:
+    """Write the model of three text files as binary files into a folder.
+
+    Notices what pycolmap does not: that a file was cut between two records, or in the last number. The count in
+    COLMAP's header, where there is one, and the line break at the end show it.
+    """
+    for path, content in zip(paths, contents, strict=True):
+        if not content.endswith(b"\n"):
+            raise ColmapError(
+                f"expected {path} to end with a line break, got {content[-20:]!r}: it looks truncated; try copying the "
+                "model again, or add the line break if it is whole"
+            )
+        header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
+        found = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
+        if header and int(header[1]) > found:
+            raise ColmapError(
+                f"expected {int(header[1])} records in {path} as its header says, got {found}: it is truncated; try "
+                "copying the model again, or correct the header if records were removed on purpose"
+            )
+    try:
+        model = read_text_model(paths[0].parent)
+        lines = (line for line in contents[1].splitlines() if not line.startswith(b"#"))
+        for line in filter(bytes.strip, lines):
+            image_id, *_, name = line.split(maxsplit=9)
+            model.image(int(image_id)).name = name.rstrip().decode(errors="backslashreplace")
+            next(lines, None)  # its keypoints
+        model.write_binary(target)
+    except ValueError as error:
+        files = f"{paths[0]}, {paths[1].name} and {paths[2].name}"
+        raise ColmapError(f"expected a COLMAP model in {files}, got one that pycolmap refuses: {error}") from error
 
 
 class _Cursor:
@@ -105,10 +177,9 @@ class _Cursor:
         start = self.skip((end if end >= 0 else len(self.content)) - self.offset + 1)
         return self.content[start:end].decode(errors="backslashreplace")
 
-    def records(self) -> range:
-        return range(self.take(_COUNT)[0])
-
-    def finish(self) -> None:
+    def records(self) -> Iterator[int]:
+        """The number of each record of the file, which has to end after the last."""
+        yield from range(self.take(_COUNT)[0])
         if self.offset != len(self.content):
             raise ColmapError(
                 f"expected {self.path} to end at byte {self.offset}, got {len(self.content)} bytes: it is not a COLMAP "
@@ -122,7 +193,8 @@ _IMAGE = struct.Struct("<I7dI")
 CHUNK = 2**16  # points that are copied at a time
 
 
-def _binary_cameras(cursor: _Cursor, models: Mapping[int, tuple[str, int]]) -> Iterator[tuple[int, CameraRecord]]:
+def _cameras(cursor: _Cursor) -> Iterator[tuple[int, CameraRecord]]:
+    models = camera_models()
     for _ in cursor.records():
         camera_id, model_id, width, height = cursor.take(_CAMERA)
         if model_id not in models:
@@ -132,10 +204,9 @@ def _binary_cameras(cursor: _Cursor, models: Mapping[int, tuple[str, int]]) -> I
             )
         name, count = models[model_id]
         yield camera_id, CameraRecord(name, cursor.array(np.dtype("<f8"), count), (width, height))
-    cursor.finish()
 
 
-def _binary_images(cursor: _Cursor) -> Iterator[ImageRecord]:
+def _images(cursor: _Cursor) -> Iterator[ImageRecord]:
     for _ in cursor.records():
         image_id, *pose, camera_id = cursor.take(_IMAGE)
         name = cursor.string()
@@ -144,16 +215,14 @@ def _binary_images(cursor: _Cursor) -> Iterator[ImageRecord]:
         yield ImageRecord(
             name, image_id, camera_id, quaternion, translation, keypoints["position"], keypoints["point_id"]
         )
-    cursor.finish()
 
 
-def _binary_points(cursor: _Cursor) -> NDArray[Any]:
+def _points(cursor: _Cursor) -> NDArray[Any]:
     starts = array("q")
     for _ in cursor.records():
         starts.append(cursor.skip(POINT.itemsize))
         (track_length,) = _COUNT.unpack_from(cursor.content, cursor.offset - _COUNT.size)
         cursor.skip(TRACK_ELEMENT * track_length)
-    cursor.finish()
     content = np.frombuffer(cursor.content, np.uint8)
     points = np.empty(len(starts), POINT)
     places = np.frombuffer(starts, np.int64) if len(starts) else np.empty(0, np.int64)

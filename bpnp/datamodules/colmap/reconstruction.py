@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, camera_models, colmap_camera
+from bpnp.cameras import Camera, colmap_camera
 from bpnp.datamodules.colmap.model_files import CameraRecord, ColmapError, ImageRecord, read_records
 
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
@@ -69,7 +69,7 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
     Raises ColmapError if a file cannot be read, no image is left, or a camera is missing or broken.
     """
     path = Path(folder)
-    records = read_records(path, camera_models=camera_models())
+    records = read_records(path)
     order = np.argsort(records.point_ids)
     ids, points3d = records.point_ids[order], records.points3d[order]
     finite = np.isfinite(points3d).all(-1)
@@ -102,7 +102,7 @@ def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], 
 
     Raises ColmapError as `read_reconstruction`.
     """
-    records = read_records(folder, camera_models=camera_models())
+    records = read_records(folder)
     cameras = {image.camera_id: image for image in records.images}
     lenses = {
         key: camera_of(records.cameras.get(key), f"camera {key} of image {image.name!r} in {folder}")

@@ -9,9 +9,8 @@ from torch.utils.data import DataLoader
 
 from bpnp.datamodules.meshes.prepare import open_surfaces, split_rows
 from bpnp.datamodules.meshes.procedural import ProceduralShapes
-from bpnp.datamodules.meshes.source import MeshSource, hold_out
+from bpnp.datamodules.meshes.source import MeshSource, Views, hold_out
 from bpnp.datamodules.meshes.surfaces import Normalisation
-from bpnp.datamodules.meshes.views import Views
 from bpnp.datamodules.module import STAGES, PairDataModule
 from bpnp.datamodules.store import Store
 from bpnp.geometry import MIN_POINTS

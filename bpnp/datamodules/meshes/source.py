@@ -1,22 +1,70 @@
-"""Pairs of meshes' surface samples and what virtual cameras see of them."""
+"""Pairs of meshes' surface samples and what virtual cameras, drawn at random, see of them."""
 
+import math
 import warnings
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
+import roma
 import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
-from bpnp.datamodules.keyed_random import row_keys
-from bpnp.datamodules.meshes.views import Views, check_seen, draw_views
+from bpnp.datamodules.augment import picked
+from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
 from bpnp.datamodules.pair import Counts
 from bpnp.datamodules.store import Store
+from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 
 POINTS = "points"  # the bulk column of a store of surface samples
 SURFACES = "surfaces"  # the kind of such a store
+MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
+
+
+@dataclass(frozen=True)
+class Views:
+    """How cameras are drawn. The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40.
+
+    rotation: "euler" draws R = Rz Ry Rx with each angle uniform in `euler_range` (degrees); "so3" draws R uniformly.
+    translation_range, distance: t = (x, y, distance + z), each of x, y, z uniform in +-translation_range; scene units.
+    focal: pixels. The paper's image has 640 x 480 pixels, but points beyond its border are kept, there and here.
+    noise_px: standard deviation of the normal noise on each 2D coordinate, in pixels.
+    """
+
+    rotation: Literal["euler", "so3"] = "euler"
+    euler_range: tuple[float, float] = (0.0, 45.0)
+    translation_range: float = 0.5
+    distance: float = 4.5
+    focal: float = 800.0
+    noise_px: float = 2.0
+
+    def __post_init__(self) -> None:
+        if self.rotation not in ("euler", "so3"):
+            raise ValueError(f"expected `rotation` euler or so3, got {self.rotation!r}")
+        low, high = self.euler_range
+        if not -math.inf < low <= high < math.inf:
+            raise ValueError(f"expected `euler_range` as (low, high) in degrees, got {self.euler_range}")
+        for name in ("translation_range", "distance", "noise_px"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"expected a finite, non-negative `{name}`, got {getattr(self, name)}")
+        if not 0 < self.focal < math.inf:
+            raise ValueError(f"expected a positive `focal` in pixels, got {self.focal}")
+
+    def poses(self, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+        """A random camera = R p + t for each key; float64."""
+        numbers = uniform(keys, 6)
+        if self.rotation == "so3":
+            rotation = rotations(stream(keys, Purpose.POSE))
+        else:
+            low, high = (math.radians(angle) for angle in self.euler_range)
+            rotation = roma.euler_to_rotmat("xyz", low + (high - low) * numbers[:, :3])
+        offset = self.translation_range * (2 * numbers[:, 3:] - 1)
+        offset[:, 2] += self.distance
+        return rotation, offset
 
 
 class MeshSource:
@@ -43,7 +91,7 @@ class MeshSource:
         if num_pairs is not None and num_pairs < 1:
             raise ValueError(f"expected at least one {label} pair, got {num_pairs}")
         radius = float(store.columns["radius"][rows].max())
-        self.sees_all = views.sees_all(radius)
+        self.sees_all = views.distance - views.translation_range - radius > MIN_DEPTH
         if not self.sees_all:
             warnings.warn(
                 f"the {label} meshes reach {radius:.3g} from their origin: points that fall behind a camera at "
@@ -67,12 +115,39 @@ class MeshSource:
         return tuple(f"{self.store.name(int(self.rows[mesh]))}#{view}" for view, mesh in views)
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        samples = self._samples(index % len(self.rows))
+        """A random camera's view of `num_points` samples of each mesh, drawn without replacement.
+
+        2D points are x/z and y/z plus noise, computed in float64. A point behind the camera, or less than 0.1 in front
+        of it, has no 2D point and -1 in match3d. Raises ValueError that names a pair of which fewer than 4 are left.
+        """
+        count, size, device = self.num_points, len(index), index.device
         keys = row_keys(index, *self.seed, epoch)
-        views = draw_views(samples, index, self.views, self.num_points, keys)
-        if not self.sees_all:
-            check_seen(views, self.names(index.tolist()))
-        return views
+        samples = self._samples(index % len(self.rows))
+        points3d = picked(samples, permutations(stream(keys, Purpose.SUBSET), samples.shape[1])[:, :count])
+        rotation, translation = self.views.poses(stream(keys, Purpose.POSE))
+        camera = transform(rotation, translation, points3d.double())
+        seen = camera[..., 2] > MIN_DEPTH
+        if not self.sees_all and bool((few := seen.sum(-1) < MIN_POINTS).any()):
+            first = int(few.nonzero()[0, 0])
+            raise ValueError(
+                f"expected at least {MIN_POINTS} points in front of the camera, got {int(seen[first].sum())} in "
+                f"{self.names(index.tolist())[first]}; try normalisation unit_sphere or a larger `distance`"
+            )
+        noise = normal(stream(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
+        points2d = project(camera) + noise * (self.views.noise_px / self.views.focal)
+        return Batch(
+            points2d=(points2d.where(seen[..., None], 0.0)).float(),
+            points3d=points3d,
+            mask2d=seen,
+            mask3d=torch.ones_like(seen),
+            focal=torch.full((size,), self.views.focal, device=device),
+            index=index,
+            ids=(),
+            rotation=rotation,
+            translation=translation,
+            match3d=torch.arange(count, device=device).where(seen, -1),
+            origin=torch.zeros(size, 3, dtype=torch.float64, device=device),
+        )
 
     def free(self) -> None:
         """Forget the samples on the device."""
@@ -81,15 +156,14 @@ class MeshSource:
     def _samples(self, mesh: Int[Tensor, " b"]) -> Float[Tensor, "b k 3"]:
         """Surface samples of each mesh: from the mapped files, or on another device from all samples, copied once."""
         if mesh.device.type == "cpu":
-            return torch.from_numpy(np.stack([self._row(i) for i in mesh.tolist()]))
+            return self._stacked(mesh.tolist())
         if self._on_device is None or self._on_device.device != mesh.device:
-            self._on_device = torch.empty(len(self.rows), self.pool_size, 3, device=mesh.device)
-            for i in range(len(self.rows)):
-                self._on_device[i] = torch.from_numpy(self._row(i).copy())
+            self._on_device = self._stacked(range(len(self.rows))).to(mesh.device)
         return self._on_device[mesh]
 
-    def _row(self, mesh: int) -> NDArray[np.float32]:
-        return self.store.row(int(self.rows[mesh]))[POINTS][: self.pool_size]
+    def _stacked(self, meshes: Sequence[int]) -> Float[Tensor, "b k 3"]:
+        rows = (self.store.row(int(self.rows[mesh])) for mesh in meshes)
+        return torch.from_numpy(np.stack([row[POINTS][: self.pool_size] for row in rows]))
 
 
 def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
