@@ -6,19 +6,19 @@ import shutil
 import signal
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import track
 
-from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store, read_manifest
+from bpnp.datamodules.store import MANIFEST, Store, StoreError, is_store, new_store, open_store, read_manifest
 from bpnp.files import cache_folder, claimed, fingerprint
 
 Work = Callable[[Any, Path], None]  # writes the store of one part
@@ -56,23 +56,16 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
     Raises StoreError if `output` is something else or was made with other parameters, or if no part gives a row;
     ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.
     """
+    parts_folder = output.with_name(f".{output.name}.unfinished")
     if not is_store(output):
         if output.exists():
             raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
-        with _workplace(output, recipe, wait_for_others) as folder:
+        with claimed(parts_folder, wait=wait_for_others):
             if not is_store(output):  # another process may have made it
-                paths = make_parts(folder, recipe, processes=processes)
-                with new_store(output, recipe.kind, recipe.widths) as writer:
-                    writer.parameters |= recipe.parameters
-                    for path in paths:
-                        writer.extend(open_store(path, recipe.kind))
-                    if not len(writer):
-                        first = next(iter(writer.skipped.values()), "none found")
-                        raise StoreError(
-                            f"expected at least one usable {recipe.what} in {recipe.source}, got {len(writer.skipped)} "
-                            f"that are not; the first: {first}"
-                        )
-    shutil.rmtree(_parts_folder(output), ignore_errors=True)  # of a run that was killed when it had all but finished
+                _make(recipe, output, parts_folder, processes)
+    for path in parts_folder.glob(f"*/{MANIFEST}"):  # first: what a kill leaves of the rest is not used
+        path.unlink()
+    shutil.rmtree(parts_folder, ignore_errors=True)
     made = read_manifest(output)["parameters"]
     if different := sorted(key for key in recipe.parameters if made.get(key) != recipe.parameters[key]):
         raise StoreError(
@@ -100,73 +93,60 @@ def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
         some = "; ".join(list(store.skipped.values())[:3])  # the reasons name the files
         warnings.warn(
             f"left out {len(store.skipped)} of {len(store.skipped) + len(store)}, all listed in "
-            f"{output / 'manifest.json'}: {some}",
+            f"{output / MANIFEST}: {some}",
             stacklevel=2,
         )
     return store
 
 
-@contextmanager
-def _workplace(output: Path, recipe: Recipe, wait_for_others: bool) -> Iterator[Path]:
-    """The folder ``.<output>.unfinished`` for the parts, locked; parts made with other parameters are removed first.
-
-    It is removed at the end; when the body raises, or the process is killed, it stays for the next run to go on.
-    """
-    folder = _parts_folder(output)
-    with claimed(folder, wait=wait_for_others):
-        key, key_file = fingerprint(dict(recipe.parameters)), folder / "key"
-        if not key_file.exists() or key_file.read_text() != key:
-            _remove_parts(folder)
-            key_file.write_text(key)
-        for leftover in folder.glob(".[0-9]*"):  # of a part that was being written when the process was killed
-            shutil.rmtree(leftover)
-        for leftover in output.parent.glob(f".{output.name}.[0-9]*"):  # of the store
-            shutil.rmtree(leftover)
-        yield folder
-        _remove_parts(folder)
-        shutil.rmtree(folder, ignore_errors=True)
-
-
-def _parts_folder(output: Path) -> Path:
-    return output.with_name(f".{output.name}.unfinished")
-
-
-def _remove_parts(folder: Path) -> None:
-    (folder / "key").unlink(missing_ok=True)  # first: without it, what a kill leaves of the rest is not used
-    for path in folder.glob("[0-9]*"):
-        shutil.rmtree(path)
+def _make(recipe: Recipe, output: Path, folder: Path, processes: int) -> None:
+    """Write the store `output` from one store for each job, in `folder`; only those that are not there are made."""
+    # The names differ for other jobs and other parameters, whose parts a stopped run may have left.
+    jobs = {
+        folder / f"{i:06d}-{fingerprint([repr(job), dict(recipe.parameters)])[:16]}": job
+        for i, job in enumerate(recipe.jobs)
+    }
+    missing = {path: job for path, job in jobs.items() if not is_store(path)}
+    # What was being written or removed when a process was killed.
+    for leftover in [*folder.glob(".[0-9]*"), *output.parent.glob(f".{output.name}.[0-9]*"), *missing]:
+        shutil.rmtree(leftover, ignore_errors=True)
+    console, finished = Console(stderr=True), len(jobs) - len(missing)
+    with closing(_made(recipe, missing, processes)) as done:
+        for _ in track(done, f"reading {recipe.source}", len(jobs), finished, console=console, transient=True):
+            pass
+    with new_store(output, recipe.kind, recipe.widths) as writer:
+        writer.parameters |= recipe.parameters
+        for path in jobs:
+            writer.extend(open_store(path, recipe.kind))
+        if not len(writer):
+            first = next(iter(writer.skipped.values()), "none found")
+            raise StoreError(
+                f"expected at least one usable {recipe.what} in {recipe.source}, got {len(writer.skipped)} "
+                f"that are not; the first: {first}"
+            )
 
 
-def make_parts(folder: Path, recipe: Recipe, *, processes: int) -> list[Path]:
-    """The stores of all jobs, in their order; only those that `folder` does not have yet are made."""
-    # Parts of other jobs do not count.
-    paths = [folder / f"{i:06d}-{fingerprint(repr(job))[:16]}" for i, job in enumerate(recipe.jobs)]
-    missing = [i for i, path in enumerate(paths) if not path.exists()]
-    columns = (TextColumn(f"reading {recipe.source}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=len(paths), completed=len(paths) - len(missing))
-        if processes == 1:
-            for i in missing:
-                recipe.work(recipe.jobs[i], paths[i])
-                progress.advance(task)
-            return paths
-        context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
-        context.set_forkserver_preload([recipe.work.__module__])
-        with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
-            try:
-                with _interrupts_later():
-                    futures: list[Future[None]] = [pool.submit(recipe.work, recipe.jobs[i], paths[i]) for i in missing]
-                for future in as_completed(futures):
-                    future.result()
-                    progress.advance(task)
-            except BrokenProcessPool as error:
-                raise OSError(
-                    f"a process that was reading {recipe.source} was killed, possibly out of memory; the finished "
-                    "parts are kept: try again with fewer --processes"
-                ) from error
-            finally:
-                pool.shutdown(cancel_futures=True)
-    return paths
+def _made(recipe: Recipe, jobs: Mapping[Path, Any], processes: int) -> Generator[None, None, None]:
+    """Make the stores of jobs, and yield after each."""
+    if processes == 1:
+        for path, job in jobs.items():
+            recipe.work(job, path)
+            yield
+        return
+    context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
+    context.set_forkserver_preload([recipe.work.__module__])
+    with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
+        try:
+            with _interrupts_later():
+                futures = [pool.submit(recipe.work, job, path) for path, job in jobs.items()]
+            yield from (future.result() for future in as_completed(futures))
+        except BrokenProcessPool as error:
+            raise OSError(
+                f"a process that was reading {recipe.source} was killed, possibly out of memory; the finished "
+                "parts are kept: try again with fewer --processes"
+            ) from error
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 @contextmanager

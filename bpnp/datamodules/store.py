@@ -9,7 +9,7 @@ import json
 import os
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -91,27 +91,25 @@ def open_store(folder: str | Path, kind: str) -> Store:
             f"expected {kind} in format {FORMAT}, got {manifest['kind']} in format {manifest['format']} in {path}; "
             "try the other data module, or preparing again with this version"
         )
-    bulk: dict[str, NDArray[np.float32]] = {}
-    columns: dict[str, NDArray[Any]] = {}
-    for name, entry in manifest["columns"].items():
-        file = path / f"{name}.npy"
-        size = file.stat().st_size if file.is_file() else None
-        if size != entry["bytes"]:
-            found = "no such file" if size is None else f"{size} bytes"
-            raise StoreError(f"expected {file} of {entry['bytes']} bytes, got {found}; try copying or preparing again")
-        try:
-            column = np.asarray(
-                np.load(file, mmap_mode="r" if entry["bulk"] and entry["shape"][0] else None)
-            )  # no subclass: quicker
-        except ValueError as error:
-            raise StoreError(f"expected {file} as it was written, got no .npy file; try preparing again") from error
-        if (column.dtype.str, list(column.shape)) != (entry["dtype"], entry["shape"]):
-            raise StoreError(f"expected {file} of {entry['shape']}, got {column.shape}; try preparing again")
-        if not entry["bulk"] and checksum(np.ascontiguousarray(column).data) != entry["checksum"]:
-            raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")
-        (bulk if entry["bulk"] else columns)[name] = column
+    columns = {name: _column(path / f"{name}.npy", entry) for name, entry in manifest["columns"].items()}
+    bulk = {name: columns.pop(name) for name, entry in manifest["columns"].items() if entry["bulk"]}
     starts = {name: columns.pop(f"{name}_start") for name in bulk}
     return Store(path, kind, bulk, starts, columns, manifest["parameters"], manifest["skipped"])
+
+
+def _column(file: Path, entry: Mapping[str, Any]) -> NDArray[Any]:
+    """A column as its entry of the manifest describes it."""
+    size = file.stat().st_size if file.is_file() else None
+    if size != entry["bytes"]:
+        found = "no such file" if size is None else f"{size} bytes"
+        raise StoreError(f"expected {file} of {entry['bytes']} bytes, got {found}; try copying or preparing again")
+    with suppress(ValueError):  # of a broken header
+        mapped = entry["bulk"] and entry["shape"][0]  # no file can be mapped that has no points
+        column = np.asarray(np.load(file, mmap_mode="r" if mapped else None))  # no subclass: quicker
+        described = (column.dtype.str, list(column.shape)) == (entry["dtype"], entry["shape"])
+        if described and (entry["bulk"] or checksum(np.ascontiguousarray(column).data) == entry["checksum"]):
+            return column
+    raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
@@ -134,16 +132,14 @@ class StoreWriter:
     parameters: kept in the manifest, must be JSON. skipped: what was left out, and why; may be added to.
     """
 
-    def __init__(
-        self, folder: Path, bulk: Mapping[str, BinaryIO], widths: Mapping[str, int], *, durable: bool
-    ) -> None:  # fmt: skip
-        self.folder, self._files, self._widths, self._durable = folder, bulk, widths, durable
+    def __init__(self, folder: Path, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
+        self.folder, self._files, self._widths = folder, files, widths
         self._columns: dict[str, list[NDArray[Any]]] = defaultdict(list)
         self.parameters: dict[str, Any] = {}
         self.skipped: dict[str, str] = {}
         for name, width in widths.items():
             self._columns[f"{name}_start"].append(np.zeros(1, np.int64))
-            _write_header(bulk[name], np.empty((0, width), BULK))
+            _write_header(files[name], BULK, (0, width))
 
     def __len__(self) -> int:
         return sum(len(part) for part in self._columns["name"])
@@ -173,42 +169,28 @@ class StoreWriter:
     def finish(self, kind: str) -> None:
         """Write what is left: the small columns, and the manifest last."""
         entries: dict[str, dict[str, Any]] = {}
-        self._columns.setdefault("name", [np.empty(0, "S1")])
         for name, file in self._files.items():
-            whole = np.broadcast_to(np.zeros((), BULK), (int(self._end(name)), self._widths[name]))
             file.seek(0)
-            _write_header(file, whole)
-            self._sync(file)
-            entries[name] = {"bulk": True, "dtype": BULK.str, "shape": list(whole.shape)}
+            entries[name] = {"bulk": True, **_write_header(file, BULK, (int(self._end(name)), self._widths[name]))}
+            entries[name]["bytes"] = file.seek(0, os.SEEK_END)
+        self._columns.setdefault("name", [np.empty(0, "S1")])
         for name, parts in self._columns.items():
             column = np.concatenate(parts)
-            entries[name] = {"bulk": False, "dtype": column.dtype.str, "shape": list(column.shape)}
-            entries[name]["checksum"] = checksum(column.data)
             with (self.folder / f"{name}.npy").open("wb") as file:
-                _write_header(file, column)
+                entries[name] = {"bulk": False, **_write_header(file, column.dtype, column.shape)}
                 file.write(column.data)  # np.save hides the reason why a write fails
-                self._sync(file)
-        for name, entry in entries.items():
-            entry["bytes"] = (self.folder / f"{name}.npy").stat().st_size
+                entries[name] |= {"checksum": checksum(column.data), "bytes": file.tell()}
         manifest = {"format": FORMAT, "kind": kind, "rows": entries["name"]["shape"][0], "columns": entries}
         manifest |= {"parameters": self.parameters, "skipped": self.skipped}
-        with (self.folder / MANIFEST).open("wb") as file:
-            file.write(json.dumps(manifest | {"checksum": _checksum(manifest)}, indent=1).encode())
-            self._sync(file)
-
-    def _sync(self, file: BinaryIO) -> None:
-        file.flush()
-        if self._durable:
-            os.fsync(file.fileno())
+        content = json.dumps(manifest | {"checksum": _checksum(manifest)}, indent=1)
+        (self.folder / MANIFEST).write_text(content, encoding="utf-8")
 
     def _end(self, bulk: str) -> np.int64:
         return np.int64(self._columns[f"{bulk}_start"][-1][-1])
 
 
 @contextmanager
-def new_store(
-    folder: Path, kind: str, widths: Mapping[str, int], *, durable: bool = True
-) -> Iterator[StoreWriter]:  # fmt: skip
+def new_store(folder: Path, kind: str, widths: Mapping[str, int], *, durable: bool = True) -> Iterator[StoreWriter]:
     """A writer of the new `folder`, which is there, complete, when the block has ended without an error.
 
     widths: coordinates of a point in each bulk column. Points are written as they come; memory holds the other columns.
@@ -221,15 +203,18 @@ def new_store(
         temporary.mkdir()
         with ExitStack() as stack:
             files = {name: stack.enter_context((temporary / f"{name}.npy").open("wb")) for name in widths}
-            writer = StoreWriter(temporary, files, widths, durable=durable)
+            writer = StoreWriter(temporary, files, widths)
             yield writer
             writer.finish(kind)
+        for path in temporary.iterdir() if durable else ():
+            with path.open("rb") as written:
+                os.fsync(written.fileno())
 
 
-def _write_header(file: BinaryIO, column: NDArray[Any]) -> None:
-    """The header of a .npy file; numpy pads it, so that it has the same size for any number of rows."""
-    header = {"descr": column.dtype.str, "fortran_order": False, "shape": column.shape}
-    np.lib.format.write_array_header_1_0(file, header)
+def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) -> dict[str, Any]:
+    """Write the header of a .npy file and describe it; numpy pads it to the same size for any number of rows."""
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
+    return {"dtype": dtype.str, "shape": list(shape)}
 
 
 def _checksum(content: Mapping[str, Any]) -> int:
