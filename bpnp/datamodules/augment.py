@@ -138,15 +138,22 @@ def augment(batch: Batch, how: Augmentation, keys: Int[Tensor, " b"]) -> Batch:
     points3d, mask3d, place3d = _shuffled(points3d, side3d, stream(keys, Purpose.ORDER3D))
     slots2d = torch.arange(place2d.shape[1], device=place2d.device).expand_as(place2d)
     seen_as = torch.empty_like(place2d).scatter_(1, place2d, slots2d).gather(1, place3d.clamp(max=len(slots2d[0]) - 1))
-    batch = replace(
+    rotation, origin = batch.rotation, batch.origin
+    if how.rotate:  # a scene whose points p are turned: turn p
+        turn = rotations(stream(keys, Purpose.TURN))
+        points3d = (points3d.double() @ turn.mT).to(points3d)
+        rotation = rotation @ turn.mT.to(rotation)
+        origin = None if origin is None else (turn.to(origin) @ origin[..., None]).squeeze(-1)
+    return replace(
         batch,
         points2d=points2d,
         points3d=points3d,
         mask2d=mask2d,
         mask3d=mask3d,
         match3d=torch.where(place3d < true, seen_as, -1),
+        rotation=rotation,
+        origin=origin,
     )
-    return _turned(batch, rotations(stream(keys, Purpose.TURN))) if how.rotate else batch
 
 
 def check_clutter(clutter: float) -> None:
@@ -228,14 +235,3 @@ def picked(points: Float[Tensor, "b n d"], order: Int[Tensor, "b k"]) -> Float[T
     """The points at the places `order` of each row."""
     rows = torch.arange(len(points), device=points.device)[:, None] * points.shape[1]
     return points.flatten(0, 1).index_select(0, (order + rows).flatten()).view(*order.shape, points.shape[2])
-
-
-def _turned(batch: Batch, turn: Float[Tensor, "b 3 3"]) -> Batch:
-    """The pair in a scene whose points p are turned: turn p."""
-    assert batch.rotation is not None
-    return replace(
-        batch,
-        points3d=(batch.points3d.double() @ turn.mT).to(batch.points3d),
-        rotation=batch.rotation @ turn.mT.to(batch.rotation),
-        origin=None if batch.origin is None else (turn.to(batch.origin) @ batch.origin[..., None]).squeeze(-1),
-    )

@@ -18,19 +18,10 @@ GOLDEN, FIRST, SECOND = (value - 2**64 for value in (0x9E3779B97F4A7C15, 0xBF584
 PLACE_BITS = 22  # of a number to be sorted: four million points; 39 random bits are left above them
 
 
-class Purpose(IntEnum):
-    """What random numbers of a pair are for; see `stream`."""
-
-    SUBSET = 0
-    POSE = 1
-    NOISE = 2
-    AMOUNTS = 3
-    CHOICE = 4
-    OUTLIERS2D = 5
-    OUTLIERS3D = 6
-    TURN = 7
-    ORDER2D = 8
-    ORDER3D = 9
+# What random numbers of a pair are for; see `stream`.
+Purpose = IntEnum(
+    "Purpose", "SUBSET POSE NOISE AMOUNTS CHOICE OUTLIERS2D OUTLIERS3D TURN ORDER2D ORDER3D", start=0
+)  # fmt: skip
 
 
 def row_keys(index: Int[Tensor, " b"], *seeds: int) -> Int[Tensor, " b"]:
@@ -83,13 +74,11 @@ def permutations(
     numbers += torch.arange(count, device=keys.device)
     if group is not None:
         numbers += group << 61
-    return _sorted(numbers) & ((1 << PLACE_BITS) - 1)
-
-
-def _sorted(numbers: Tensor) -> Tensor:
     if numbers.device.type == "cpu":
-        return torch.from_numpy(np.sort(numbers.numpy(), axis=-1))  # 15 times faster than torch's
-    return numbers.sort(-1).values
+        numbers = torch.from_numpy(np.sort(numbers.numpy(), axis=-1))  # 15 times faster than torch's
+    else:
+        numbers = numbers.sort(-1).values
+    return numbers & ((1 << PLACE_BITS) - 1)
 
 
 def _wrapped(value: int) -> int:

@@ -1,8 +1,8 @@
 """From a source of pairs to batches: which pairs are in a batch, in any number of processes, and exact resuming."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,22 +20,12 @@ Key = tuple[int, int]  # (epoch, index): with the seed, all that a pair depends 
 POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 
-@dataclass(frozen=True)
-class PairKeys:
+class PairKeys(NamedTuple):
     """A batch to be made: the position of each pair in its data set, and its name."""
 
     epoch: int
-    index: Int[Tensor, " b"]
+    numbers: Int[Tensor, " b"]
     ids: tuple[str, ...]
-
-    def __len__(self) -> int:
-        return len(self.ids)
-
-    def to(self, *args: Any, **kwargs: Any) -> "PairKeys":
-        return replace(self, index=self.index.to(*args, **kwargs))
-
-    def pin_memory(self) -> "PairKeys":
-        return replace(self, index=self.index.pin_memory())
 
 
 class PairDataset(Dataset[Any]):
@@ -68,64 +58,13 @@ class PairDataset(Dataset[Any]):
     def batch(self, keys: PairKeys) -> Batch:
         """The pairs of `keys`, made on the device of its index."""
         epoch = keys.epoch if self.fresh else 0
-        pairs = replace(self.source.batch(keys.index, epoch), ids=keys.ids)
-        pairs = augment(pairs, self.augmentation, row_keys(keys.index, *self.seed, epoch))
-        rotation, translation = pairs.rotation, pairs.translation
-        assert rotation is not None
-        assert translation is not None
-        return replace(pairs, rotation=rotation.float(), translation=translation.float())
+        pairs = replace(self.source.batch(keys.numbers, epoch), ids=tuple(keys.ids))  # a list after a DataLoader
+        pairs = augment(pairs, self.augmentation, row_keys(keys.numbers, *self.seed, epoch))
+        return replace(pairs, **{name: getattr(pairs, name).float() for name in ("rotation", "translation")})
 
     def pair(self, index: int, epoch: int = 0) -> Batch:
         """One pair alone."""
-        keys = torch.tensor([index])
-        return self.batch(PairKeys(epoch, keys, self.source.names([index])))
-
-
-def training_batches(
-    sizes: NDArray[np.int64], *, batch_size: int, replicas: int, rng: np.random.Generator
-) -> list[NDArray[np.int64]]:
-    """One epoch of batches of similar sizes, in random order; the pairs left over by `batch_size` sit out the epoch.
-
-    The shuffled set is cut into pools of 50 batches, each pool is sorted by size and cut into batches. A set smaller
-    than one batch is one batch, a few of its pairs repeated where `replicas` does not divide it.
-    """
-    order = rng.permutation(len(sizes))
-    whole = len(order) - len(order) % batch_size
-    if whole == 0:
-        return [_fill(order, replicas)]
-    span = POOL_BATCHES * batch_size
-    pools = np.split(order[:whole], range(span, whole, span))
-    by_size = np.concatenate([_largest_first(pool, sizes) for pool in pools])
-    return list(rng.permutation(by_size.reshape(-1, batch_size)))
-
-
-def evaluation_batches(
-    sizes: NDArray[np.int64], *, batch_size: int, replicas: int, rng: np.random.Generator, max_cells: int | None
-) -> list[NDArray[np.int64]]:
-    """Every pair, sorted by size and cut into batches; then the batches are shuffled, so that the first few of them,
-    all that a limited run sees, are a fair sample.
-
-    A batch has at most `batch_size` pairs, as few as b * size^2 <= `max_cells` asks for (size: the larger side of its
-    largest pair), at least one for each replica. Pairs are repeated where `replicas` does not divide the last batch.
-    """
-    order = _largest_first(rng.permutation(len(sizes)), sizes)
-    batches = []
-    start = 0
-    while start < len(order):
-        fitting = batch_size if max_cells is None else min(batch_size, max_cells // int(sizes[order[start]]) ** 2)
-        stop = start + max(replicas, fitting - fitting % replicas)
-        batches.append(_fill(order[start:stop], replicas))
-        start = stop
-    return [batches[i] for i in rng.permutation(len(batches))]
-
-
-def _largest_first(order: NDArray[np.int64], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    return order[np.argsort(-sizes[order], kind="stable")]
-
-
-def _fill(batch: NDArray[np.int64], replicas: int) -> NDArray[np.int64]:
-    """The batch, repeated from its start up to a multiple of `replicas`."""
-    return np.resize(batch, -(-len(batch) // replicas) * replicas)
+        return self.batch(PairKeys(epoch, torch.tensor([index]), self.source.names([index])))
 
 
 class BucketSampler(DistributedSampler[list[Key]]):
@@ -135,6 +74,9 @@ class BucketSampler(DistributedSampler[list[Key]]):
     step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch) and
     gives the epoch in the keys; evaluation always visits every pair, in the same batches, as epoch 0.
     As a `DistributedSampler` it is left alone by Lightning, which calls `set_epoch`.
+
+    Pairs of a batch are of similar sizes, and the batches in random order, so that the first few, all that a limited
+    run sees, are a fair sample. Pairs are repeated where the processes do not divide the last batch.
 
     Raises ValueError for an empty set, a `batch_size` that the processes do not divide, or `max_cells` in training
     (a step keeps its number of pairs; a source bounds the size of its training pairs instead).
@@ -170,10 +112,43 @@ class BucketSampler(DistributedSampler[list[Key]]):
     def batches(self, epoch: int) -> list[NDArray[np.int64]]:
         """The batches of an epoch over all processes, as indices."""
         rng = np.random.default_rng([self.seed, epoch])
-        size, replicas = self.batch_size, self.num_replicas
-        if self.shuffle:
-            return training_batches(self.sizes, batch_size=size, replicas=replicas, rng=rng)
-        return evaluation_batches(self.sizes, batch_size=size, replicas=replicas, rng=rng, max_cells=self.max_cells)
+        order = rng.permutation(len(self.sizes))
+        batches = self._training_batches(order) if self.shuffle else self._evaluation_batches(order)
+        return [batches[i] for i in rng.permutation(len(batches))]
+
+    def _training_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """The shuffled set is cut into pools of 50 batches, each pool is sorted by size and cut into batches.
+
+        The pairs left over by `batch_size` sit out the epoch. A set smaller than one batch is one batch.
+        """
+        whole = len(order) - len(order) % self.batch_size
+        if whole == 0:
+            return [self._filled(order)]
+        span = POOL_BATCHES * self.batch_size
+        pools = np.split(order[:whole], range(span, whole, span))
+        return list(np.concatenate([self._largest_first(pool) for pool in pools]).reshape(-1, self.batch_size))
+
+    def _evaluation_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+        """A batch has at most `batch_size` pairs, as few as b * size^2 <= `max_cells` asks for (size: the larger side
+        of its largest pair), at least one for each process."""
+        order = self._largest_first(order)
+        batches: list[NDArray[np.int64]] = []
+        start = 0
+        while start < len(order):
+            fitting = self.batch_size
+            if self.max_cells is not None:
+                fitting = min(fitting, self.max_cells // int(self.sizes[order[start]]) ** 2)
+            stop = start + max(self.num_replicas, fitting - fitting % self.num_replicas)
+            batches.append(self._filled(order[start:stop]))
+            start = stop
+        return batches
+
+    def _largest_first(self, order: NDArray[np.int64]) -> NDArray[np.int64]:
+        return order[np.argsort(-self.sizes[order], kind="stable")]
+
+    def _filled(self, batch: NDArray[np.int64]) -> NDArray[np.int64]:
+        """The batch, repeated from its start up to a multiple of the number of processes."""
+        return np.resize(batch, -(-len(batch) // self.num_replicas) * self.num_replicas)
 
     def __len__(self) -> int:
         return self._length

@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -18,10 +19,16 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from bpnp.datamodules.store import MANIFEST, Store, StoreError, is_store, new_store, open_store, read_manifest
+from bpnp.datamodules.store import (
+    MANIFEST,
+    Store,
+    StoreError,
+    is_store,
+    new_store,
+    open_store,
+    read_manifest,
+)
 from bpnp.files import cache_folder, claimed, fingerprint
-
-Work = Callable[[Any, Path], None]  # writes the store of one part
 
 
 @dataclass(frozen=True)
@@ -35,7 +42,7 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Recipe:
-    """How a store is made: part after part, each by `work(job, folder)`, then all of them in one.
+    """How a store is made: part after part, each by `work(writer, *job)`, then all of them in one.
 
     kind, widths: as in `new_store`. parameters: kept in the store; what was made with others is another store.
     work and the jobs must be picklable if there are several processes. what, source: for messages.
@@ -44,8 +51,8 @@ class Recipe:
     kind: str
     widths: Mapping[str, int]
     parameters: Mapping[str, Any]
-    jobs: Sequence[Any]
-    work: Work
+    jobs: Sequence[tuple[Any, ...]]
+    work: Callable[..., None]
     what: str
     source: str
 
@@ -128,9 +135,10 @@ def _make(recipe: Recipe, output: Path, folder: Path, processes: int) -> None:
 
 def _made(recipe: Recipe, jobs: Mapping[Path, Any], processes: int) -> Generator[None, None, None]:
     """Make the stores of jobs, and yield after each."""
+    make = partial(_make_part, recipe.work, recipe.kind, recipe.widths)
     if processes == 1:
         for path, job in jobs.items():
-            recipe.work(job, path)
+            make(path, job)
             yield
         return
     context = multiprocessing.get_context("forkserver")  # a fork of this process would copy its threads' locks
@@ -138,7 +146,7 @@ def _made(recipe: Recipe, jobs: Mapping[Path, Any], processes: int) -> Generator
     with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
         try:
             with _interrupts_later():
-                futures = [pool.submit(recipe.work, job, path) for path, job in jobs.items()]
+                futures = [pool.submit(make, path, job) for path, job in jobs.items()]
             yield from (future.result() for future in as_completed(futures))
         except BrokenProcessPool as error:
             raise OSError(
@@ -147,6 +155,13 @@ def _made(recipe: Recipe, jobs: Mapping[Path, Any], processes: int) -> Generator
             ) from error
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def _make_part(
+    work: Callable[..., None], kind: str, widths: Mapping[str, int], path: Path, job: tuple[Any, ...]
+) -> None:
+    with new_store(path, kind, widths, durable=False) as writer:
+        work(writer, *job)
 
 
 @contextmanager

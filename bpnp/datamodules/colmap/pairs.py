@@ -73,7 +73,8 @@ class ColmapSource:
         rng = np.random.default_rng([*self.seed, epoch, index])
         free2d, free3d = self._free(scene, image)
         clutter2d = image.clutter2d[rng.choice(len(image.clutter2d), free2d, replace=False)]
-        chosen = np.concatenate([image.seen, _unseen(scene, image, free3d, rng)])
+        unseen = np.delete(np.arange(len(scene.points3d)), image.observed) if free3d else image.seen[:0]
+        chosen = np.concatenate([image.seen, rng.choice(unseen, free3d, replace=False)])
         origin = self.origins[index]
         return Pair(
             name=f"{scene.name}/{image.name}",
@@ -89,19 +90,8 @@ class ColmapSource:
     def _free(self, scene: Reconstruction, image: ImagePoints) -> tuple[int, int]:
         """Points without a partner on the 2D side, and on the 3D side."""
         wanted = self.clutter * len(image.seen)
-        available = len(image.clutter2d), len(scene.points3d) - len(image.observed)
-        return min(available[0], round(min(wanted, available[0]))), min(available[1], round(min(wanted, available[1])))
-
-
-def _unseen(
-    scene: Reconstruction, image: ImagePoints, count: int, rng: np.random.Generator
-) -> NDArray[np.int64]:  # fmt: skip
-    """`count` points of the scene that the image does not see."""
-    if count == 0:
-        return np.empty(0, np.int64)
-    mask = np.ones(len(scene.points3d), dtype=bool)
-    mask[image.observed] = False
-    return rng.choice(np.flatnonzero(mask), count, replace=False)
+        free3d = len(scene.points3d) - len(image.observed)
+        return round(min(wanted, len(image.clutter2d))), round(min(wanted, free3d))
 
 
 def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:

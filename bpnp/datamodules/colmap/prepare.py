@@ -11,7 +11,7 @@ from bpnp.datamodules.colmap.pairs import ColmapSource
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.datamodules.prepare import Prepared, Recipe, prepare
-from bpnp.datamodules.store import StoreError, new_store
+from bpnp.datamodules.store import StoreError, StoreWriter
 from bpnp.datamodules.stored_pairs import PAIRS, WIDTHS, add_pair, scene_rows
 from bpnp.files import files_as_they_are, fingerprint
 
@@ -43,13 +43,12 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
     return Prepared(output, {"scenes": len(scene_rows(store)), "pairs": len(store)}, store.skipped)
 
 
-def read_part(job: tuple[str, str, Path, int, float], output: Path) -> None:
-    """Write the store of one COLMAP model; an empty one if it cannot be used.
+def read_part(writer: StoreWriter, scene: str, name: str, folder: Path, min_points: int, clutter: float) -> None:
+    """The pairs of one COLMAP model; none if it cannot be used.
 
     What was not used of it is listed, not logged: there may be hundreds of models.
     """
-    scene, name, folder, min_points, clutter = job
-    with new_store(output, PAIRS, WIDTHS, durable=False) as writer, silent(logging.getLogger(__package__)):
+    with silent(logging.getLogger(__package__)):
         try:
             reconstruction = read_reconstruction(folder, name=name)
             source = ColmapSource([reconstruction], min_points=min_points, clutter=clutter)

@@ -8,8 +8,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from types import ModuleType
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,28 +30,11 @@ LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXE
 ENTRY = re.compile(rf"(?:.*/)?([^/]+)/(train|test)/([^/.][^/]*)(?:{'|'.join(map(re.escape, SUFFIXES))})", re.I)
 
 
-@runtime_checkable
-class MeshArchive(Protocol):
-    """Meshes by name, ``<class>/<split>/<stem>``; the training meshes come first. Can be sent to another process."""
-
-    @property
-    def names(self) -> Sequence[str]: ...
-
-    @property
-    def identity(self) -> str:
-        """Another one if a mesh is another."""
-
-    def part(self, start: int, stop: int) -> "MeshArchive":
-        """The meshes of names[start:stop]."""
-
-    def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
-        """`count` normalised surface samples (count, 3), a function of the mesh and its name. Raises MeshError."""
-
-
 @dataclass(frozen=True)
 class MeshFiles:
     """Meshes in files: each in its own (`place` None), as an entry of a zip, or as a row of an HDF5 file of sampled
-    points (``modelnet40_ply_hdf5_2048``). places: (file, place) of each name."""
+    points (``modelnet40_ply_hdf5_2048``). places: (file, place) of each name, ``<class>/<split>/<stem>``; the training
+    meshes come first."""
 
     places: dict[str, tuple[Path, str | int | None]]
 
@@ -62,12 +44,15 @@ class MeshFiles:
 
     @property
     def identity(self) -> str:
+        """Another one if a mesh is another."""
         return fingerprint([self.names, files_as_they_are(dict.fromkeys(path for path, _ in self.places.values()))])
 
     def part(self, start: int, stop: int) -> "MeshFiles":
+        """The meshes of names[start:stop]."""
         return MeshFiles(dict(list(self.places.items())[start:stop]))
 
     def samples(self, name: str, count: int, mode: Normalisation) -> NDArray[np.float64]:
+        """`count` normalised surface samples (count, 3), a function of the mesh and its name. Raises MeshError."""
         (path, place), rng = self.places[name], np.random.default_rng(zlib.crc32(name.encode()))
         if isinstance(place, int):
             return normalise(rng.permutation(_sampled(path, place, count))[:count], mode)
@@ -89,13 +74,19 @@ def _sampled(path: Path, row: int, count: int) -> NDArray[np.float64]:
     return points
 
 
-def open_archive(source: Path) -> MeshArchive:
+def open_archive(source: Path) -> MeshFiles:
     """The meshes of `source`: ModelNet40.zip, its folder, the folder of its HDF5 files, or any folder in its layout.
 
     Raises ValueError that names the file or folder: missing, empty, foreign, or h5py not installed.
     """
     if source.is_file():
-        return _zip_archive(source)
+        try:
+            entries = _named(_open(source).namelist())
+        except (zipfile.BadZipFile, OSError) as error:
+            raise ValueError(f"expected a zip of meshes, got {source} ({error}); try downloading it again") from error
+        if not entries:
+            raise ValueError(f"expected meshes {LAYOUT} in {source}, got none; try ModelNet40.zip")
+        return MeshFiles({name: (source, entry) for name, entry in entries.items()})
     if not source.is_dir():
         raise ValueError(f"expected a folder with {LAYOUT}, or ModelNet40.zip, got {source}, which is not there")
     inside = sorted(path for path in source.iterdir() if path.is_dir())
@@ -113,16 +104,6 @@ def _named(paths: Iterable[str]) -> dict[str, str]:
     entries = {f"{match[1]}/{match[2].lower()}/{match[3]}": match[0] for match in found if match}
     order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
     return {name: entries[name] for name in order}
-
-
-def _zip_archive(path: Path) -> MeshFiles:
-    try:
-        entries = _named(_open(path).namelist())
-    except (zipfile.BadZipFile, OSError) as error:
-        raise ValueError(f"expected a zip of meshes, got {path} ({error}); try downloading it again") from error
-    if not entries:
-        raise ValueError(f"expected meshes {LAYOUT} in {path}, got none; try ModelNet40.zip")
-    return MeshFiles({name: (path, entry) for name, entry in entries.items()})
 
 
 def _sampled_archive(folder: Path) -> MeshFiles:
@@ -149,18 +130,15 @@ def _sampled_archive(folder: Path) -> MeshFiles:
 
 
 def _open(path: Path) -> Any:
-    return _opened(path, path.stat().st_size, path.stat().st_mtime_ns)
+    """A file of many meshes, kept open for the next one; a file that has changed is another."""
+    return _opened(path, *files_as_they_are([path]))
 
 
 @lru_cache(maxsize=8)
-def _opened(path: Path, size: int, time: int) -> Any:
-    """A file of many meshes, kept open for the next one; a file that has changed is another."""
-    del size, time
-    return zipfile.ZipFile(path) if path.suffix != ".h5" else _h5py().File(path, "r")
-
-
-def _h5py() -> ModuleType:
+def _opened(path: Path, _: tuple[str, int, int]) -> Any:
+    if path.suffix != ".h5":
+        return zipfile.ZipFile(path)
     try:
-        return importlib.import_module("h5py")  # optional
+        return importlib.import_module("h5py").File(path, "r")  # optional
     except ImportError as error:
         raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error

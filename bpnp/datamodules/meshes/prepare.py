@@ -6,15 +6,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.meshes.archives import MeshArchive, open_archive
+from bpnp.datamodules.meshes.archives import MeshFiles, open_archive
 from bpnp.datamodules.meshes.procedural import ProceduralShapes
 from bpnp.datamodules.meshes.source import POINTS, SURFACES
 from bpnp.datamodules.meshes.surfaces import MeshError, Normalisation
 from bpnp.datamodules.prepare import Prepared, Recipe, cached, prepare
-from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store
+from bpnp.datamodules.store import Store, StoreError, StoreWriter, is_store, open_store
 
 MESHES_A_PART = 64
 WIDTHS = {POINTS: 3}
+MeshArchive = MeshFiles | ProceduralShapes
 
 
 def prepare_meshes(
@@ -44,17 +45,15 @@ def surfaces_recipe(archive: MeshArchive, *, points: int, normalisation: Normali
     )
 
 
-def sample_part(job: tuple[MeshArchive, int, Normalisation], folder: Path) -> None:
-    """Write the store of some meshes."""
-    archive, count, mode = job
-    with new_store(folder, SURFACES, WIDTHS, durable=False) as writer:
-        for name in archive.names:
-            try:
-                samples = archive.samples(name, count, mode)
-            except (MeshError, OSError) as error:
-                writer.skipped[name] = str(error)
-            else:
-                writer.add(name, {POINTS: samples}, radius=float(np.linalg.norm(samples, axis=-1).max()))
+def sample_part(writer: StoreWriter, archive: MeshArchive, count: int, mode: Normalisation) -> None:
+    """Sample all meshes of an archive."""
+    for name in archive.names:
+        try:
+            samples = archive.samples(name, count, mode)
+        except (MeshError, OSError) as error:
+            writer.skipped[name] = str(error)
+        else:
+            writer.add(name, {POINTS: samples}, radius=float(np.linalg.norm(samples, axis=-1).max()))
 
 
 def open_surfaces(

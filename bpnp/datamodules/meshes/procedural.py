@@ -42,7 +42,7 @@ def _part(rng: np.random.Generator, size: float) -> Mesh:
 
 @dataclass(frozen=True)
 class ProceduralShapes:
-    """The shapes of a split, as a `MeshArchive`. No shape belongs to two splits or two seeds.
+    """The shapes of a split, read as `MeshFiles` are. No shape belongs to two splits or two seeds.
 
     Shape i does not depend on their number. Raises ValueError for none.
     """
