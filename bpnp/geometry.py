@@ -33,6 +33,11 @@ def camera_centre(
     return -(rotation.mT @ translation.unsqueeze(-1)).squeeze(-1)
 
 
+def choose(chosen: Bool[Tensor, " b"], first: Tensor, second: Tensor) -> Tensor:
+    """The first tensor (b, ...) for the chosen samples, the second for the others."""
+    return torch.where(chosen.view(-1, *(1 for _ in first.shape[1:])), first, second)
+
+
 def hat(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """Skew matrix [v]x with [v]x w = v x w."""
     x, y, z = vector.unbind(-1)

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bpnp.geometry import retract
+from bpnp.geometry import choose, retract
 from bpnp.layers.objective import Columns, Derivatives, Rotations, Translations, dense_objective, derivatives
 
 EQUAL = 1e-13  # values of the objective (weights sum to one) that agree to this differ by rounding only
@@ -46,17 +46,12 @@ def newton(
         flat = (trial.value - current.value).abs() <= EQUAL
         lower = (trial.value < current.value) | (flat & (trial.gradient.norm(dim=-1) < current.gradient.norm(dim=-1)))
         accept = usable & lower
-        rotation, translation = _where(accept, new_rotation, rotation), _where(accept, new_translation, translation)
-        current = Derivatives(*(_where(accept, *pair) for pair in zip(trial, current, strict=True)))
+        rotation, translation = choose(accept, new_rotation, rotation), choose(accept, new_translation, translation)
+        current = Derivatives(*(choose(accept, *pair) for pair in zip(trial, current, strict=True)))
         raised = (10 * damping).clamp_min(1e-3)
         lowered = torch.where(damping > 1e-6, damping / 10, 0)
         damping = torch.where(active, torch.where(accept, lowered, raised), damping)
     return rotation, translation, iterations
-
-
-def _where(accept: Tensor, new: Tensor, old: Tensor) -> Tensor:
-    """`new` for the samples that accept it."""
-    return torch.where(accept.view(-1, *(1 for _ in old.shape[1:])), new, old)
 
 
 def lbfgs(

@@ -8,8 +8,14 @@ from bpnp.metrics.errors import (
     rotation_error,
     translation_error,
 )
-from bpnp.metrics.per_pair import MeanOverPairs
-from bpnp.metrics.pose_metrics import PoseQuartiles, PoseRecall, RecallThresholds, pose_quartiles, pose_recalls
+from bpnp.metrics.pose_metrics import (
+    MeanOverPairs,
+    PoseQuartiles,
+    PoseRecall,
+    RecallThresholds,
+    pose_quartiles,
+    pose_recalls,
+)
 
 __all__ = [
     "MeanOverPairs", "PoseErrors", "PoseQuartiles", "PoseRecall", "RecallThresholds", "centre_error", "pose_errors",

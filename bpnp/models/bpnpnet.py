@@ -11,11 +11,9 @@ from bpnp.layers.implicit import first_derivative
 from bpnp.layers.plan import cached_parts
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
-from bpnp.models.composition import AnyModule, chosen
-from bpnp.models.evaluation import Refinement, match_again, round_widths
+from bpnp.models.evaluation import Refinement, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets.features import ImageFeatures, SceneFeatures
-from bpnp.models.pose_head import pnp_pose, ransac_pose
-from bpnp.models.weights import TrainedNet
+from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
 

@@ -1,4 +1,4 @@
-"""What an evaluation adds to a network's poses: points matched again under the pose, and refinement.
+"""From an assignment to poses, and what an evaluation adds: points matched again under the pose, and refinement.
 
 Both judge a pair (i, j) by d_ij = r_ij^2 / (2 s^2), where r_ij is the chord between bearing i and the direction of
 R p_j + t and s the standard deviation of the residuals in radians: -log of a normal density but for a constant.
@@ -14,8 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.geometry import bearings, chords
-from bpnp.models.pose_head import pnp_pose
+from bpnp.geometry import bearings, choose, chords
 from bpnp.models.search_solver import refine
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -27,6 +26,23 @@ FARTHEST = 12.0  # nats; d of a pair five widths apart, beyond which pairs are a
 TRUST = 0.7  # weight of the assignment in `log_support`; the rest is uniform
 ALONE = 0.2  # share of the image points without a partner
 WIDTH = 0.01  # s of `log_support`, radians: RANSAC's default threshold
+
+
+def ransac_pose(ransac: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch) -> Pose:
+    """A robust first pose from the most probable pairs; no gradient reaches the assignment.
+
+    ransac: a module with the arguments of `bpnp.layers.RansacPnP`.
+    """
+    return Pose(*ransac(assignment.detach(), batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
+
+
+def pnp_pose(pnp: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch, start: Pose) -> Pose:
+    """The pose that best explains the whole assignment, from a start; differentiable in the assignment.
+
+    pnp: a module with the arguments of `bpnp.layers.WeightedPnP`.
+    """
+    rays = bearings(batch.points2d)
+    return Pose(*pnp(assignment, rays, batch.points3d, start.rotation, start.translation))
 
 
 def residual_energy(
@@ -163,9 +179,6 @@ def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
 
 def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
     """The first pose of the chosen samples, the second of the others."""
-
-    def pick(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(chosen.reshape(-1, *[1] * (a.ndim - 1)), a, b)
-
-    stats = SolveStats(*map(pick, vars(first.stats).values(), vars(second.stats).values()))
-    return Pose(pick(first.rotation, second.rotation), pick(first.translation, second.translation), stats)
+    fields = ((pose.rotation, pose.translation, *vars(pose.stats).values()) for pose in (first, second))
+    rotation, translation, *stats = (choose(chosen, *pair) for pair in zip(*fields, strict=True))
+    return Pose(rotation, translation, SolveStats(*stats))

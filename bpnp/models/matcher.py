@@ -13,13 +13,11 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.composition import AnyModule, chosen
-from bpnp.models.evaluation import Refinement
+from bpnp.models.evaluation import Refinement, pnp_pose, ransac_pose
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.nets.normalisation import centred, principal_axes, robust_frame
 from bpnp.models.nets.pointwise import Pointwise
-from bpnp.models.pose_head import pnp_pose, ransac_pose
-from bpnp.models.weights import TrainedNet
+from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each

@@ -1,10 +1,16 @@
-"""Checkpoint files, read as data and never as code; the weights of this package; and the networks of both."""
+"""Checkpoint files, read as data and never as code; the weights of this package; and the networks of both.
 
+A module is described by the name of its class and its constructor's arguments, each kept by the module as an attribute
+of the same name; an argument that is a module is described likewise. A description holds dicts, lists, tuples, strings
+and numbers only. Building one imports nothing: the classes are looked up by name among those that the caller knows.
+"""
+
+import inspect
 import pickle
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor, nn
@@ -12,13 +18,13 @@ from torch import Tensor, nn
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
-from bpnp.models.composition import built, class_name, described, differences
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets.features import ImageFeatures, PointFeatures, SceneFeatures
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
+PLAIN = (bool, int, float, str, type(None))
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
 
 Net = TypeVar("Net", bound="TrainedNet")
@@ -138,3 +144,85 @@ def fitting_state(content: Mapping[str, Any], solver: nn.Module) -> dict[str, Te
         told = ", ".join(differences(saved, own)) or "other weights"
         raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")
     return state
+
+
+@runtime_checkable
+class AnyModule(Protocol):
+    """The type of an option that takes any `nn.Module`: the help of `nn.Module` itself would list all of torch's."""
+
+    def __call__(self, *arguments: Any, **options: Any) -> Any: ...
+
+
+def chosen(given: AnyModule | None, default: type[nn.Module]) -> nn.Module:
+    """The module that was given, or the default class with its default options."""
+    if given is None:
+        return default()
+    if not isinstance(given, nn.Module):
+        raise ValueError(f"expected a module, got {given!r:.80}; try a subclass of torch.nn.Module")
+    return given
+
+
+def described(module: nn.Module) -> dict[str, Any]:
+    """``{"class": name, "settings": {argument: value}}`` of a module.
+
+    The settings are None where the module does not keep its arguments: such a module has weights, and cannot be built.
+    """
+    settings: dict[str, Any] = {}
+    for name, parameter in inspect.signature(type(module)).parameters.items():
+        if parameter.kind in (parameter.VAR_POSITIONAL, parameter.VAR_KEYWORD):
+            continue
+        value = getattr(module, name, parameter.empty)
+        if isinstance(value, nn.Module):
+            value = described(value)
+        elif not _is_plain(value):
+            return {"class": class_name(type(module)), "settings": None}
+        settings[name] = value
+    return {"class": class_name(type(module)), "settings": settings}
+
+
+def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
+    """The module of a description. Raises ValueError for a class that is not among `classes`, or unusable settings."""
+    if not is_description(description):
+        raise ValueError(f"expected the class and the settings of a module, got {description!r:.80}")
+    known = {class_name(cls): cls for cls in classes}
+    name, settings = description["class"], description["settings"]
+    if name not in known:
+        raise ValueError(f"expected a class among {', '.join(sorted(known))}, got {name!r}; try it in `parts`")
+    if settings is None:
+        raise ValueError(
+            f"expected the settings of {name}, got none; try a class that keeps each constructor argument as an "
+            "attribute of its name"
+        )
+    arguments = {key: built(value, classes) if is_description(value) else value for key, value in settings.items()}
+    try:
+        return known[name](**arguments)
+    except TypeError as error:
+        raise ValueError(f"expected settings of {name}, got {error}") from error
+
+
+def differences(first: Any, second: Any, name: str = "") -> Iterator[str]:
+    """Settings of the first of two descriptions that the second has not, as `features2d.channels=32`."""
+    if not (is_description(first) and is_description(second)) or first["class"] != second["class"]:
+        if first != second:
+            yield f"{name}={first['class'] if is_description(first) else first}"
+        return
+    theirs = second["settings"] or {}
+    for key, value in (first["settings"] or {}).items():
+        yield from differences(value, theirs.get(key), f"{name}.{key}" if name else key)
+
+
+def class_name(cls: type) -> str:
+    """Its own name for a class of this package, whose files may move; with its module for any other."""
+    return cls.__name__ if cls.__module__.startswith("bpnp.") else f"{cls.__module__}.{cls.__qualname__}"
+
+
+def is_description(value: Any) -> bool:
+    return isinstance(value, Mapping) and set(value) == {"class", "settings"}
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, (list, tuple)):
+        return all(map(_is_plain, value))
+    if isinstance(value, dict):
+        return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
+    return type(value) in PLAIN

@@ -50,7 +50,7 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
         return Losses(matching_likelihood_loss(prediction, batch), everyone)
     if kind == "reprojection":
         pose = prediction.poses["pnp"]
-        return Losses(self_supervised_loss(prediction.assignment, batch, pose), pose.stats.converged)
+        return Losses(reprojection_loss(prediction.assignment, batch, pose), pose.stats.converged)
     known = correspondence_losses(prediction, batch, angle=angle)
     if known is None:
         raise ValueError(
@@ -161,20 +161,8 @@ def pose_loss(
     return rotation_angle(rotation_gt, rotation) + torch.linalg.vector_norm(translation - translation_gt, dim=-1)
 
 
-def reprojection_loss(
-    assignment: Float[Tensor, "b m n"],
-    points2d: Float[Tensor, "b m 2"],
-    points3d: Float[Tensor, "b n 3"],
-    rotation: Float[Tensor, "b 3 3"],
-    translation: Float[Tensor, "b 3"],
-) -> Float[Tensor, " b"]:
-    """sum_ij P_ij angle(f_i, R p_j + t) in radians (Eq. 2 with P for C): no correspondence and no pose is given."""
-    directions = transform(rotation, translation, points3d)
-    return (assignment * angle_between(bearings(points2d).unsqueeze(2), directions.unsqueeze(1))).sum((-2, -1))
-
-
-def self_supervised_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
-    """`reprojection_loss` under a pose that was solved from the assignment, a mean over the mass that it assigns.
+def reprojection_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
+    """sum_ij P_ij angle(f_i, R p_j + t) / sum_ij P_ij in radians (Eq. 2 with P for C), a pose solved from P.
 
     Neither the true pose nor the true pairs are looked at (paper section 5). The gradient reaches the assignment itself
     and, through a differentiable solver, the pose. A sample whose pose did not converge has loss zero and no gradient:
@@ -183,6 +171,7 @@ def self_supervised_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose:
     solved = pose.stats.converged
     rotation = torch.where(solved[:, None, None], pose.rotation, torch.eye(3).to(pose.rotation))
     translation = torch.where(solved[:, None], pose.translation, 0)
+    directions = transform(rotation, translation, batch.points3d)
+    angles = angle_between(bearings(batch.points2d).unsqueeze(2), directions.unsqueeze(1))
     real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
-    angles = reprojection_loss(assignment * real, batch.points2d, batch.points3d, rotation, translation)
-    return torch.where(solved, angles / assignment.sum((-2, -1)), 0)
+    return torch.where(solved, (assignment * real * angles).sum((-2, -1)) / assignment.sum((-2, -1)), 0)

@@ -14,9 +14,8 @@ from torchmetrics import MetricCollection
 from bpnp.layers.implicit import BackwardStats
 from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.models.composition import AnyModule, chosen, described
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.weights import TrainedNet, fitting_state, read_checkpoint
+from bpnp.models.weights import AnyModule, TrainedNet, chosen, described, fitting_state, read_checkpoint
 from bpnp.training.losses import (
     Losses,
     MatchingLoss,

@@ -13,9 +13,9 @@ from bpnp.models.evaluation import (
     FEATURE_WEIGHT,
     cost_under_pose,
     match_again,
+    pnp_pose,
     round_widths,
 )
-from bpnp.models.pose_head import pnp_pose
 
 MU = 0.1
 

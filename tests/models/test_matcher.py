@@ -10,8 +10,8 @@ from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.models import Matcher, TrainedNet
-from bpnp.models.composition import described
 from bpnp.models.nets.attention import Attention, Neighbourhood
+from bpnp.models.weights import described
 from bpnp.training.losses import matching_likelihood_loss
 
 

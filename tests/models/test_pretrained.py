@@ -14,8 +14,7 @@ from small_data import small_net
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers, SfmSceneDataModule
 from bpnp.metrics import rotation_error
-from bpnp.models.composition import described
-from bpnp.models.weights import LEARNED, pretrained_names, pretrained_path
+from bpnp.models.weights import LEARNED, described, pretrained_names, pretrained_path
 
 ROOT = Path(__file__).parents[2]
 

@@ -12,9 +12,8 @@ from torch import Tensor, nn
 from bpnp import Batch, BPnPNet, Matcher
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP
 from bpnp.models import Refinement, TrainedNet
-from bpnp.models.composition import built, described, differences
 from bpnp.models.nets import ImageFeatures, SceneFeatures
-from bpnp.models.weights import PARTS, fitting_state
+from bpnp.models.weights import PARTS, built, described, differences, fitting_state
 
 
 class Flat(nn.Module):

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import rotation_angle
 from bpnp.robust import scoring
-from bpnp.robust.local_refinement import refine_locally
+from bpnp.robust.consensus import refine_locally
 from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals, truncated_scores
 
 

@@ -24,7 +24,7 @@ METHODS, FUNCTIONS = {"item", "cpu", "tolist", "numpy", "nonzero"}, {"bool", "in
 FILES = [
     *sorted((PACKAGE / "layers").glob("*.py")),
     *sorted((PACKAGE / "models/nets").glob("*.py")),
-    *(PACKAGE / f"models/{name}.py" for name in ("bpnpnet", "matcher", "pose_head")),
+    *(PACKAGE / f"models/{name}.py" for name in ("bpnpnet", "matcher")),
     *(PACKAGE / f"training/{name}.py" for name in ("losses",)),
 ]
 # Calls that may read a value back, by function.

@@ -8,7 +8,7 @@ from small_data import small_net
 
 from bpnp import Batch, Pose, Prediction
 from bpnp.models import Matcher
-from bpnp.training.losses import matching_likelihood_loss, matching_losses, self_supervised_loss
+from bpnp.training.losses import matching_likelihood_loss, matching_losses, reprojection_loss
 from bpnp.training.task import BlindPnPTask
 
 
@@ -26,16 +26,16 @@ def test_the_angle_under_the_solved_pose_is_a_mean_over_the_assigned_mass() -> N
         seen = planted.rotation[0] @ planted.points3d[0, j] + planted.translation[0]
         total += math.acos(float(planted.bearings[0, i] @ seen / seen.norm())) / 6
     for mass in (1.0, 0.3):
-        loss = self_supervised_loss(mass * wrong, planted.batch(), solved(planted, [True]))
+        loss = reprojection_loss(mass * wrong, planted.batch(), solved(planted, [True]))
         assert float(loss[0]) == pytest.approx(total, rel=1e-9)
-    right = self_supervised_loss(planted.permutation(), planted.batch(), solved(planted, [True]))
+    right = reprojection_loss(planted.permutation(), planted.batch(), solved(planted, [True]))
     assert float(right[0]) < 1e-6
 
 
 def test_a_sample_without_a_pose_has_no_such_loss_and_no_gradient() -> None:
     planted = plant(2, 6)
     plan = planted.permutation().roll(1, -1).requires_grad_()
-    losses = self_supervised_loss(plan, planted.batch(), solved(planted, [True, False]))
+    losses = reprojection_loss(plan, planted.batch(), solved(planted, [True, False]))
     (gradient,) = torch.autograd.grad(losses.sum(), plan)
     assert losses[0] > 0
     assert losses[1] == 0
@@ -48,7 +48,7 @@ def test_samples_without_a_pose_do_not_dilute_the_mean_of_a_training_step() -> N
     plan = planted.permutation().roll(1, -1)
     prediction = Prediction(plan, poses={"pnp": solved(planted, [True, False])})
     task = BlindPnPTask(small_net(8, 1), matching_loss="reprojection")
-    alone = self_supervised_loss(plan, planted.batch(), solved(planted, [True, True]))[0]
+    alone = reprojection_loss(plan, planted.batch(), solved(planted, [True, True]))[0]
     torch.testing.assert_close(task.losses(prediction, planted.batch()).total.mean(), alone)
 
 

@@ -11,7 +11,7 @@ from bpnp.checks import check_positive
 from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
 from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement
-from bpnp.robust.local_refinement import refine_locally
+from bpnp.robust.consensus import refine_locally
 from bpnp.robust.p3p import p3p
 from bpnp.robust.scoring import Pairs
 

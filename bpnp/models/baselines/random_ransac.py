@@ -52,23 +52,18 @@ class RandomRansac(PairSolver):
 
     def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         m, n = len(pair.points2d), len(pair.points3d)
-        best, tried, most, pairs = None, 0, 0, 0
+        seed, best, tried, most, pairs = 2 * pair_seed(self.seed, pair.index), None, 0, 0, 0
         while tried < self.max_hypotheses and not deadline.passed() and not self._enough(pairs, m, n, tried):
             count = int(min(TRIPLES, self.max_hypotheses - tried))
-            found = self._best_of(pair, *self._triples(pair, count, tried))
+            pools = (points.new_full((1, count), len(points)) for points in (pair.points2d, pair.points3d))
+            triples = (distinct_triples(pool, seed + i, skip=tried)[0] for i, pool in enumerate(pools))
+            found = self._best_of(pair, *triples)
             tried += count
             if found is not None and found[2] > most:
                 best, most, pairs = found[:2], found[2], found[3]
         if best is None:
             return Answer(iterations=tried)
         return Answer(best, tried, 1 - most / (m + n), self._enough(pairs, m, n, tried))
-
-    def _triples(self, pair: SinglePair, count: int, tried: int) -> tuple[Int[Tensor, "h 3"], Int[Tensor, "h 3"]]:
-        """Three different points of each side for every hypothesis."""
-        seed = 2 * pair_seed(self.seed, pair.index)
-        pools = (points.new_full((1, count), len(points)) for points in (pair.points2d, pair.points3d))
-        triples2d, triples3d = (distinct_triples(pool, seed + i, skip=tried)[0] for i, pool in enumerate(pools))
-        return triples2d, triples3d
 
     def _best_of(
         self, pair: SinglePair, triples2d: Int[Tensor, "h 3"], triples3d: Int[Tensor, "h 3"]

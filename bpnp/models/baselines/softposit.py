@@ -67,18 +67,17 @@ class SoftPOSIT(PairSolver):
         together = max(1, CHUNK // (len(pair.points2d) * len(pair.points3d)))
         best, most, finished = Answer(), -1, True
         for turned, shift in zip(rotation.split(together), translation.split(together), strict=True):
-            if deadline.passed():
-                finished = False
-                break
             points = pair.points2d, pair.points3d
             found = softposit(*points, turned, shift, max_steps=self.max_steps, deadline=deadline)
-            finished = finished and found.finished
+            finished = found.finished
             counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
             score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
             i = int(score.argmax())
             if int(score[i]) > most:
                 most, pose = int(score[i]), (found.rotation[i], found.translation[i])
                 best = Answer(pose, found.steps, float(found.residual[i]), bool(found.accepted[i]))
+            if not finished:
+                break
         return best._replace(converged=best.converged and finished)
 
     def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
@@ -86,7 +85,13 @@ class SoftPOSIT(PairSolver):
             rotation = roma.euler_to_rotmat("xyz", torch.full((3,), 22.5, dtype=torch.float64), degrees=True)
             return rotation.unsqueeze(0).to(pair.points3d), pair.points3d.new_tensor([[0.0, 0.0, 4.5]])
         generator = torch.Generator().manual_seed(pair_seed(self.seed, pair.index))
-        return near_truth(pair, generator) if self.start == "near_truth" else random_poses(pair, self.starts, generator)
+        if self.start == "near_truth":
+            return near_truth(pair, generator)
+        # The scene's centre on the viewing ray of the image's, at the weak-perspective distance.
+        rotation = random_rotations(self.starts, generator).to(pair.points3d)
+        ray = torch.nn.functional.pad(pair.points2d.mean(0), (0, 1), value=1.0)
+        centred = weak_perspective_distance(pair.points2d, pair.points3d) * ray
+        return rotation, centred - rotation @ pair.points3d.mean(0)
 
 
 def near_truth(pair: SinglePair, generator: torch.Generator) -> tuple[Tensor, Tensor]:
@@ -99,14 +104,6 @@ def near_truth(pair: SinglePair, generator: torch.Generator) -> tuple[Tensor, Te
     step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
     rotation, translation = retract(step.flatten().to(pair.points3d), pair.rotation, pair.translation)
     return rotation.unsqueeze(0), translation.unsqueeze(0)
-
-
-def random_poses(pair: SinglePair, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Uniform rotations, the scene's centre on the viewing ray of the image's, at the weak-perspective distance."""
-    rotation = random_rotations(count, generator).to(pair.points3d)
-    ray = torch.nn.functional.pad(pair.points2d.mean(0), (0, 1), value=1.0)
-    centred = weak_perspective_distance(pair.points2d, pair.points3d) * ray
-    return rotation, centred - rotation @ pair.points3d.mean(0)
 
 
 class Annealed(NamedTuple):
@@ -150,7 +147,9 @@ def softposit(
     beta, step = BETA_START, 0
     limit = STEPS if max_steps is None else min(STEPS, max_steps)
     while step < limit and not deadline.passed():
-        rows, depth = _scaled_rows(scene, turned, shift)
+        # Q1 . S_k and Q2 . S_k (s, 2, n), and w_k (s, n)
+        scaled = torch.cat([turned, shift.unsqueeze(-1)], -1) @ scene.mT / shift[:, 2, None, None]
+        rows, depth = scaled[:, :2], scaled[:, 2]
         kernel = _kernel(image, rows, depth, beta)
         u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))
         matched = (v.unsqueeze(-1) * (kernel.mT @ (u.unsqueeze(-1) * moments2d))).double()  # (s, n, 4)
@@ -189,12 +188,6 @@ def slack_scalings(
         if bool(((u * total - 1).abs().sum(-1) < tolerance).all()):
             break
     return u, v
-
-
-def _scaled_rows(scene: Tensor, rotation: Tensor, translation: Tensor) -> tuple[Tensor, Tensor]:
-    """Q1 . S_k and Q2 . S_k (s, 2, n), and w_k (s, n)."""
-    rows = torch.cat([rotation, translation.unsqueeze(-1)], -1) @ scene.mT / translation[:, 2, None, None]
-    return rows[:, :2], rows[:, 2]
 
 
 def _kernel(image: Tensor, rows: Tensor, depth: Tensor, beta: float) -> Tensor:

@@ -76,7 +76,8 @@ def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"
     centres = _centre(points.sum(0, keepdim=True), len(points), spherical)
     labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
     for _ in range(ITERATIONS):
-        nearest, assigned = _distances(points, centres, spherical).min(-1)
+        away = angle_between(points.unsqueeze(1), centres) if spherical else torch.cdist(points, centres)
+        nearest, assigned = away.min(-1)
         if bool((assigned == labels).all()):
             outermost = int(nearest.argmax())
             if float(nearest[outermost]) <= limit:
@@ -86,12 +87,6 @@ def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"
         weights, sums = _totals(points, labels)
         centres = _centre(sums, weights.unsqueeze(-1), spherical)
     return labels
-
-
-def _distances(points: Tensor, centres: Tensor, spherical: bool) -> Tensor:
-    if spherical:
-        return angle_between(points.unsqueeze(1), centres.unsqueeze(0))
-    return torch.cdist(points, centres)
 
 
 def _centre(sums: Tensor, weights: Tensor | int, spherical: bool) -> Tensor:
