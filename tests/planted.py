@@ -1,9 +1,13 @@
 """Planted problems: point sets whose pose and correspondences are known."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
+import numpy as np
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp.geometry import bearings, project, random_rotations, retract, transform
@@ -95,3 +99,13 @@ def plant(
 
 def _normal(generator: torch.Generator, *shape: int) -> Tensor:
     return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+
+def directions(points: Any) -> Any:
+    """Unit vectors along points (..., 3)."""
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def degrees_between(one: Any, other: Any) -> float:
+    """Angle between two rotations (3, 3)."""
+    return math.degrees(Rotation.from_matrix(one @ other.T).magnitude())

@@ -8,13 +8,12 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.evidence.image_statistics import solid_angle
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Nearby, SearchSettings
-from bpnp.search.starts import Array, GravityPrior, Prior, angular_spread
+from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
@@ -41,7 +40,7 @@ class Scene:
         bulk = points3d[in_bulk]
         self.centre = bulk.mean(0)
         self.size = max(float(np.sqrt(((bulk - self.centre) ** 2).sum(-1).mean())), 1e-30)
-        self.frame = _turned_to(bearings.mean(0))
+        self.frame = turned_to(bearings.mean(0))
         order2d = self.rng.permutation(len(bearings))
         self.offsets = (bearings @ self.frame.T - FORWARD)[order2d].astype(np.float32)
         order = self.rng.permutation(len(points3d))
@@ -50,8 +49,7 @@ class Scene:
         self.image = side_of(self.offsets, sets.scores2d, sets.labels2d, None, order2d)
         self.seen = side_of(self.points3d, sets.scores3d, sets.labels3d, sets.cones3d, order)
         self.image, self.seen = with_partners(self.image, self.seen), with_partners(self.seen, self.image)
-        self.spread = angular_spread(self.offsets)
-        self.solid_angle = solid_angle(self.offsets.astype(np.float64), ddof=0)
+        self.spread, self.solid_angle = sets.image.spread, sets.image.solid_angle
         self.shift_weight = np.array([1, 1, min(1, SHIFT_ALONG * self.spread)], np.float32)
         fine = settings.fine
         self.smallest_scale = min(fine.smallest_scale, fine.relative_smallest * self.spread)
@@ -92,16 +90,6 @@ class Scene:
     def sides(self, bearings: int | None = None, points: int | None = None) -> tuple[WeightedBearings, WeightedPoints]:
         """All points of both sides, or so many of them."""
         return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
-
-
-def _turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A rotation (3, 3) that turns `axis` to (0, 0, 1); none if there is no axis, for bearings all around."""
-    length = float(np.linalg.norm(axis))
-    if length < 1e-6:
-        return np.eye(3)
-    forward = axis / length
-    right = np.linalg.svd(forward[None])[2][1]
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def degenerate(points: NDArray[np.float64]) -> bool:

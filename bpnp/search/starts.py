@@ -97,6 +97,11 @@ def draw_poses(
     return rotation.astype(np.float32), translation.astype(np.float32)
 
 
-def angular_spread(offsets: Array) -> float:
-    """Root mean square distance of the bearings from their mean, radians for a narrow view."""
-    return max(float(np.sqrt(offsets.var(0, dtype=np.float64).sum())), 1e-12)
+def turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A rotation (3, 3) that turns `axis` to (0, 0, 1); none if there is no axis, for bearings all around."""
+    length = float(np.linalg.norm(axis))
+    if length < 1e-6:
+        return np.eye(3)
+    forward = axis / length
+    right = np.linalg.svd(forward[None])[2][1]
+    return np.stack([right, np.cross(forward, right), forward])

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.candidates import Candidates, best_distinct, merged
@@ -16,7 +17,7 @@ from bpnp.search.settings import DEFAULT
 def scene() -> Scene:
     rng = np.random.default_rng(0)
     rays = np.column_stack([rng.uniform(-0.4, 0.4, (30, 2)), np.ones(30)])
-    rays /= np.linalg.norm(rays, axis=-1, keepdims=True)
+    rays = directions(rays)
     return Scene(PointSets(rays, rng.normal(size=(30, 3))), 0, DEFAULT)
 
 
@@ -49,7 +50,7 @@ def test_a_pose_without_a_score_is_left_out(scene: Scene) -> None:
 def test_a_narrow_view_hardly_tells_poses_at_different_distances_apart() -> None:
     rng = np.random.default_rng(0)
     rays = np.column_stack([rng.uniform(-1e-3, 1e-3, (30, 2)), np.ones(30)])
-    narrow = Scene(PointSets(rays / np.linalg.norm(rays, axis=-1, keepdims=True), rng.normal(size=(30, 3))), 0, DEFAULT)
+    narrow = Scene(PointSets(directions(rays), rng.normal(size=(30, 3))), 0, DEFAULT)
     same = poses([0, 0], [2.0, 1.0], [1, 1])
     same.translation[:, 2] = [1000, 1001]
     assert len(best_distinct(same, narrow, 8)) == 1

@@ -1,9 +1,8 @@
 """Poses that rest on one wrong match, beside the planted one."""
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
+from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.few.arrays import ImageArrays, scene_arrays
@@ -14,14 +13,6 @@ from bpnp.search.point_sets import PointSets
 from bpnp.solving.matches import fit_pose
 
 Array = NDArray[np.float64]
-
-
-def directions(points: Array) -> Array:
-    return points / np.linalg.norm(points, axis=-1, keepdims=True)
-
-
-def degrees(one: Array, other: Array) -> float:
-    return math.degrees(Rotation.from_matrix(one @ other.T).magnitude())
 
 
 def test_a_wrong_match_that_holds_the_pose_is_exchanged() -> None:
@@ -44,9 +35,9 @@ def test_a_wrong_match_that_holds_the_pose_is_exchanged() -> None:
             lambda r, t, taken=taken: directions(taken @ r.T + t), rays, rotation, translation, scale=1e-3
         )  # fmt: skip
         run.refine(run.enter(*held), 1.0)
-        if degrees(run.best_pose()[0], rotation) > 2:
+        if degrees_between(run.best_pose()[0], rotation) > 2:
             wrong += 1
             run.vary_best()
-            mended += degrees(run.best_pose()[0], rotation) < 1.5
+            mended += degrees_between(run.best_pose()[0], rotation) < 1.5
     assert wrong > 25
     assert mended > 0.8 * wrong

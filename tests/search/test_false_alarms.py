@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.evidence.false_alarms import alarms_of, log10_false_alarms
@@ -16,20 +17,16 @@ Array = NDArray[np.float64]
 SHIFT = np.array([0.1, -0.2, 6.0])
 
 
-def rays_of(camera: Array) -> Array:
-    return camera / np.linalg.norm(camera, axis=1, keepdims=True)
-
-
 def planted(rng: np.random.Generator, count: int, noise: float = 4e-4) -> tuple[Array, Array, Array]:
     """Bearings of `count` points with noise in radians, the points, and the rotation; the translation is SHIFT."""
     points = rng.uniform(-1, 1, (count, 3))
     rotation = Rotation.random(random_state=rng).as_matrix()
-    rays = rays_of(points @ rotation.T + SHIFT)
-    return rays_of(rays + noise * rng.standard_normal(rays.shape)), points, rotation
+    rays = directions(points @ rotation.T + SHIFT)
+    return directions(rays + noise * rng.standard_normal(rays.shape)), points, rotation
 
 
 def scattered(rng: np.random.Generator, count: int, width: float) -> Array:
-    return rays_of(np.column_stack([rng.uniform(-width, width, (count, 2)), np.ones(count)]))
+    return directions(np.column_stack([rng.uniform(-width, width, (count, 2)), np.ones(count)]))
 
 
 def evidence(rays: Array, points: Array, rotation: Array, floor: float | None = 2e-4, **known: Any) -> float:
@@ -96,7 +93,7 @@ def test_labels_and_normals_exclude_partners() -> None:
     assert evidence(rays, points, rotation, labels2d=own, labels3d=(own + 1) % 3) > 0
     anything = evidence(rays, points, rotation, labels2d=np.full(12, -1), labels3d=own)
     assert anything == pytest.approx(free)
-    away = rays_of(points @ rotation.T + SHIFT) @ rotation
+    away = directions(points @ rotation.T + SHIFT) @ rotation
     assert evidence(rays, points, rotation, normals3d=-away) == pytest.approx(free)
     assert evidence(rays, points, rotation, normals3d=away) > 0
 

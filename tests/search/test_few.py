@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.robust.p3p import p3p
@@ -21,10 +22,6 @@ from bpnp.search.starts import GravityPrior, PosePrior
 Array = NDArray[np.float64]
 RADIUS = 2e-3
 NOISE = 4e-4
-
-
-def directions(points: Array) -> Array:
-    return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
 def planted(
@@ -44,10 +41,6 @@ def planted(
 def solved(rays: Array, points: Array, *, is_safe: Any = None, deadline: float = math.inf, **known: Any) -> FewPoses:
     sets = PointSets(rays, points, **known)
     return enumerate_poses(sets, radius=RADIUS, is_safe=is_safe, deadline=deadline)
-
-
-def degrees(one: Array, other: Array) -> float:
-    return math.degrees(Rotation.from_matrix(one @ other.T).magnitude())
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +101,7 @@ def test_planted_poses_are_found(seen: int, hidden: int, background: int) -> Non
             np.random.default_rng(seed), seen, hidden=hidden, background=background
         )
         poses = solved(rays, points)
-        errors = [degrees(r, rotation) for r in poses.rotation]
+        errors = [degrees_between(r, rotation) for r in poses.rotation]
         assert min(errors) < 3
         found += errors[0] < 3
         if errors[0] < 3 and seen > 5:
@@ -166,7 +159,7 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     assert poses.exhausted
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
-    assert degrees(poses.rotation[matches.argmax()], rotation) < 1e-3
+    assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
 
 
 def test_labels_allow_only_their_own() -> None:
@@ -176,7 +169,7 @@ def test_labels_allow_only_their_own() -> None:
     labels2d = np.where(match >= 0, labels3d[match], rng.integers(0, 4, len(rays)))
     labels2d[0] = -1
     poses = solved(rays, points, labels2d=labels2d, labels3d=labels3d)
-    assert degrees(poses.rotation[0], rotation) < 3
+    assert degrees_between(poses.rotation[0], rotation) < 3
     for chosen in poses.match:
         pairs = (chosen >= 0) & (labels2d >= 0)
         np.testing.assert_array_equal(labels2d[pairs], labels3d[chosen[pairs]])
@@ -194,12 +187,12 @@ def test_points_that_face_away_are_not_matched() -> None:
         facing = (camera * (points @ rotation.T)).sum(-1) < -0.2 * np.linalg.norm(camera, axis=-1)
         rays = directions(camera[facing]) + NOISE * rng.standard_normal((facing.sum(), 3))
         poses = solved(directions(rays), points, normals3d=points)
-        assert degrees(poses.rotation[0], rotation) < 3
+        assert degrees_between(poses.rotation[0], rotation) < 3
         for r, t, match in zip(poses.rotation, poses.translation, poses.match, strict=True):
             seen = points[match[match >= 0]]
             assert (((seen @ r.T + t) * (seen @ r.T)).sum(-1) < 0).all()
         inside_out = solved(directions(rays), points, normals3d=-points)
-        assert all(degrees(r, rotation) > 3 for r in inside_out.rotation)
+        assert all(degrees_between(r, rotation) > 3 for r in inside_out.rotation)
 
 
 def test_every_twin_of_a_symmetric_constellation_is_a_candidate() -> None:
@@ -212,7 +205,7 @@ def test_every_twin_of_a_symmetric_constellation_is_a_candidate() -> None:
     quarter = Rotation.from_rotvec([0, 0, math.pi / 2]).as_matrix()
     for turns in range(4):
         twin = rotation @ np.linalg.matrix_power(quarter, turns)
-        assert min(degrees(r, twin) for r in poses.rotation) < 1
+        assert min(degrees_between(r, twin) for r in poses.rotation) < 1
     assert margin(poses) < 1
 
 
@@ -267,12 +260,12 @@ def test_what_is_known_of_the_pose_finds_it_among_few_points(kind: str) -> None:
             "pose": PosePrior(tilt @ rotation, translation + 0.03 * unit(rng), 1.0, 0.03),
         }[kind]
         poses = solved(rays, points, prior=prior)
-        assert degrees(poses.rotation[0], rotation) < 2
+        assert degrees_between(poses.rotation[0], rotation) < 2
         assert poses.solved == 0 or kind != "pose"
         assert poses.solved < 40_000
         for r in poses.rotation:
             tilted = math.degrees(math.acos(float((tilt @ rotation @ up) @ (r @ up))))
-            off = tilted if kind == "gravity" else degrees(r, tilt @ rotation)
+            off = tilted if kind == "gravity" else degrees_between(r, tilt @ rotation)
             assert off < 4.5
 
 
@@ -283,7 +276,7 @@ def test_the_few_seen_of_many_points_are_found_wherever_they_lie() -> None:
         rays, points, rotation, _, _ = planted(rng, 5, hidden=29)
         tilt = Rotation.from_rotvec(0.01 * unit(rng)).as_matrix()
         poses = solved(rays, points, prior=GravityPrior(tilt @ rotation @ up, up, 1.0))
-        right += any(degrees(r, rotation) < 3 for r in poses.rotation)
+        right += any(degrees_between(r, rotation) < 3 for r in poses.rotation)
     assert right >= 19
 
 
@@ -292,7 +285,7 @@ def test_three_points_and_gravity_fix_a_pose() -> None:
     rays, points, rotation, _, _ = planted(rng, 3, noise=0.0)
     up = np.array([0.0, 1, 0])
     poses = solved(rays, points, prior=GravityPrior(rotation @ up, up, 0.5))
-    assert degrees(poses.rotation[0], rotation) < 0.1
+    assert degrees_between(poses.rotation[0], rotation) < 0.1
 
 
 def test_a_wrong_prior_hides_no_pose_that_it_allows() -> None:
@@ -300,7 +293,7 @@ def test_a_wrong_prior_hides_no_pose_that_it_allows() -> None:
     rays, points, rotation, translation, _ = planted(np.random.default_rng(15), 9, background=2)
     turn = Rotation.from_rotvec([0.0, math.radians(30), 0]).as_matrix()
     poses = solved(rays, points, prior=PosePrior(turn @ rotation, translation, 15.0, 1.0))
-    assert degrees(poses.rotation[0], rotation) < 1
+    assert degrees_between(poses.rotation[0], rotation) < 1
 
 
 def test_unrelated_points_have_no_margin() -> None:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -18,16 +19,12 @@ TURN, SHIFT = Rotation.from_rotvec([0.2, -0.3, 0.1]), np.array([0.1, 0.05, 5.0])
 NOISE = 3e-4 * RNG.standard_normal((40, 3))
 
 
-def rays(camera: Array) -> Array:
-    return np.asarray(camera / np.linalg.norm(camera, axis=-1, keepdims=True))
-
-
 def fitted(image: Array) -> tuple[Rotation, Array, float]:
     """The pose of known pairs by a general solver, and the scale of its residuals."""
 
     def residuals(pose: Array) -> Array:
         moved = (TURN * Rotation.from_rotvec(pose[:3])).apply(POINTS) + SHIFT + pose[3:]
-        return (image - rays(moved)).ravel()
+        return (image - directions(moved)).ravel()
 
     end = least_squares(residuals, np.zeros(6), xtol=1e-12)
     return TURN * Rotation.from_rotvec(end.x[:3]), SHIFT + end.x[3:], float(np.sqrt(2 * end.cost / (2 * 40 - 6)))
@@ -39,7 +36,7 @@ def test_the_misfit_says_how_far_off_the_pose_is(wrong: str) -> None:
     camera = TURN.apply(scene) + SHIFT
     if wrong == "focal length":
         camera = camera * (1.04, 1.04, 1)
-    image = rays(camera + NOISE)
+    image = directions(camera + NOISE)
     turn, shift, scale = fitted(image)
     misfit = systematic_misfit(PointSets(image, POINTS), turn.as_matrix(), shift, scale, 40.0)
     if wrong == "nothing":

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import Deadline
@@ -30,7 +31,7 @@ def cluttered(seed: int, true: int = 80, outliers: int = 220) -> tuple[Array, Ar
     points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
     seen = plane + 1e-3 * rng.standard_normal(plane.shape)
     rays = np.column_stack([seen, np.ones(len(seen))])
-    bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    bearings = directions(rays)
     image = np.r_[:true, true : true + outliers]
     scene = np.r_[:true, true + outliers : true + 2 * outliers]
     return bearings[rng.permutation(image)], points[rng.permutation(scene)], rotation, translation
@@ -45,16 +46,12 @@ def off(rotation: Array, translation: Array, points: Array, rng: np.random.Gener
     return PosePrior(turned, moved, 4.0, 0.2)
 
 
-def angle(a: Array, b: Array) -> float:
-    return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
     bearings, points, rotation, translation = cluttered(seed)
     prior = off(rotation, translation, points, np.random.default_rng(seed))
     found = search_poses(PointSets(bearings, points, prior=prior))
-    assert angle(found.best[0], rotation) < 0.3
+    assert degrees_between(found.best[0], rotation) < 0.3
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
 
 
@@ -75,7 +72,7 @@ def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
     assert abs(raster.values[inside].mean()) < 0.1 * raster.values[inside].std()
     right = scene.enter(rotation, translation)
     camera = scene.points3d @ right[0].T + right[1]
-    u = camera / np.linalg.norm(camera, axis=-1, keepdims=True)
+    u = directions(camera)
     at = ((2 * u[:, :2] / (1 + u[:, 2:]) + raster.half) * raster.per_cell).astype(int)
     expected = raster.values[at[:, 1], at[:, 0]].sum()
 
@@ -139,5 +136,5 @@ def test_a_lost_search_looks_around_its_best_poses() -> None:
     lost = search_poses(PointSets(bearings, points), settings=replace(DEFAULT, beside=()))
     assert lost.verdict == "failed"
     found = search_poses(PointSets(bearings, points))
-    assert angle(found.best[0], rotation) < 0.3
+    assert degrees_between(found.best[0], rotation) < 0.3
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)

@@ -6,6 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
@@ -89,7 +90,7 @@ def test_after_the_deadline_repetitions_are_still_compared() -> None:
     """Nothing is annealed then."""
     scene = stairs(np.random.default_rng(9)) + (0, 0, 4)
     seen = scene[24:72]
-    sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), scene, floor=2e-4)
+    sets = PointSets(directions(seen), scene, floor=2e-4)
     found = replace(Candidates.unscored(np.eye(3)[None], np.zeros((1, 3)), hits=9), scale=np.array([1e-3]))
     scene_of = partial(Scene, sets, 0, DEFAULT, Deadline.after(0.0))
     sure = SearchResult(found, "confident", "", 9)
@@ -102,7 +103,7 @@ def test_points_that_do_not_repeat_count_against_a_shift_and_those_that_do_not_w
     door = np.random.default_rng(8).uniform(0, 1, (6, 3)) + [2, 1.5, 8]
 
     def behind(points: Array) -> Array:
-        sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+        sets = PointSets(directions(points), points)
         best = np.eye(3), np.zeros(3)
         shifts = np.eye(3)[None], np.array([[-2.0, 0, 0]])
         return decades_behind(sets, best, shifts, shifts, 1e-3)
@@ -115,7 +116,7 @@ def test_points_that_do_not_repeat_count_against_a_shift_and_those_that_do_not_w
 def test_only_different_poses_are_rivals() -> None:
     """A step of a fine lattice is no different pose, in the sense of the verdict; there are hundreds of longer ones."""
     points = lattice(16, 16) * (1 / 6) + (0, 0, 2)
-    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    sets = PointSets(directions(points), points)
     (rotations, translations), compared = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
     moved = np.linalg.norm(rotations @ sets.middle + translations - sets.middle, axis=-1)
     turned = Rotation.from_matrix(rotations).magnitude()
@@ -126,7 +127,7 @@ def test_only_different_poses_are_rivals() -> None:
 
 def test_the_half_turn_of_a_lattice_is_found() -> None:
     points = lattice(5, 4) + (0, 0, 6)
-    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    sets = PointSets(directions(points), points)
     (rotations, translations), _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
     angles = np.degrees(Rotation.from_matrix(rotations).magnitude())
     best = int(np.argmax(angles))
@@ -137,7 +138,7 @@ def test_the_half_turn_of_a_lattice_is_found() -> None:
 
 def test_scattered_points_have_none() -> None:
     points = np.random.default_rng(5).uniform(-1, 1, (200, 3)) + (0, 0, 6)
-    sets = PointSets(points / np.linalg.norm(points, axis=1, keepdims=True), points)
+    sets = PointSets(directions(points), points)
     (rotations, _), compared = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
     assert len(rotations) == 0
     assert compared

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.annealing import anneal_on_points
@@ -21,13 +22,9 @@ TRANSLATION = np.array([0.1, -0.1, 5.0])
 NOISE = 1e-3
 
 
-def angle(a: Array, b: Array) -> float:
-    return float(np.degrees(Rotation.from_matrix(a @ b.T).magnitude()))
-
-
 def rays(image: Array) -> Array:
     homogeneous = np.column_stack([image, np.ones(len(image))])
-    return np.asarray(homogeneous / np.linalg.norm(homogeneous, axis=1, keepdims=True))
+    return np.asarray(directions(homogeneous))
 
 
 def wall(seed: int, side: int = 250, seen: int = 120, background: int = 120) -> tuple[PointSets, Array]:
@@ -75,10 +72,10 @@ def scored(seed: int) -> tuple[PointSets, Array]:
 def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
     sets, rotation = known(seed)
     informed = search_poses(sets)
-    assert angle(informed.best[0], rotation) < 0.5
+    assert degrees_between(informed.best[0], rotation) < 0.5
     assert informed.verdict == "confident"
     blind = search_poses(PointSets(sets.bearings, sets.points3d))
-    assert angle(blind.best[0], rotation) > 5
+    assert degrees_between(blind.best[0], rotation) > 5
     assert blind.verdict == "failed"
 
 
@@ -95,14 +92,14 @@ def test_the_order_of_the_points_does_not_matter(known) -> None:
         **{name: None if values is None else values[j] for name, values in of_scene.items()},
     )  # fmt: skip
     for found in (search_poses(sets), search_poses(mixed)):
-        assert angle(found.best[0], rotation) < 0.5
+        assert degrees_between(found.best[0], rotation) < 0.5
 
 
 def test_nothing_known_is_what_equal_scores_and_one_label_say() -> None:
     bearings, points, rotation, number = cluttered(3, 40)
     one = np.zeros_like(number)
     bare = search_poses(PointSets(bearings, points))
-    assert angle(bare.best[0], rotation) < 0.5
+    assert degrees_between(bare.best[0], rotation) < 0.5
     said = search_poses(
         PointSets(bearings, points, scores2d=np.ones(140), scores3d=np.ones(140), labels2d=one, labels3d=one)
     )

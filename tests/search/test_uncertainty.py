@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import directions
 from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
@@ -18,22 +19,18 @@ SHIFT = np.array([0.1, -0.2, 6.0])
 NOISE = 1e-3
 
 
-def rays_of(camera: Array) -> Array:
-    return camera / np.linalg.norm(camera, axis=-1, keepdims=True)
-
-
 def noisy(rays: Array, rng: np.random.Generator, noise: float = NOISE) -> Array:
-    return rays_of(rays + noise * rng.standard_normal(rays.shape))
+    return directions(rays + noise * rng.standard_normal(rays.shape))
 
 
 @pytest.mark.parametrize("count", [6, 20])
 def test_it_is_the_spread_of_fits_to_repeated_noise(count: int) -> None:
     rng = np.random.default_rng(count)
     points, rotation = rng.uniform(-1, 1, (count, 3)), Rotation.random(random_state=count).as_matrix()
-    rays = rays_of(points @ rotation.T + SHIFT)
+    rays = directions(points @ rotation.T + SHIFT)
     turns = []
     for _ in range(60):
-        found, _ = fit_pose(lambda r, t: rays_of(points @ r.T + t), noisy(rays, rng), rotation, SHIFT, scale=NOISE)
+        found, _ = fit_pose(lambda r, t: directions(points @ r.T + t), noisy(rays, rng), rotation, SHIFT, scale=NOISE)
         turns.append(Rotation.from_matrix(found @ rotation.T).as_rotvec())
     spread = math.sqrt(np.linalg.eigvalsh(np.cov(np.array(turns).T))[-1])
     sigmas = [rotation_sigma(PointSets(noisy(rays, rng), points), rotation, SHIFT, NOISE) for _ in range(20)]
@@ -43,7 +40,7 @@ def test_it_is_the_spread_of_fits_to_repeated_noise(count: int) -> None:
 
 def log_likelihood(rays: Array, points: Array, rotation: Array, translation: Array, area: float) -> float:
     """Of the mixture that the assignment comes from, all scene points within 4 NOISE."""
-    distance2 = ((rays[:, None] - rays_of(points @ rotation.T + translation)) ** 2).sum(-1)
+    distance2 = ((rays[:, None] - directions(points @ rotation.T + translation)) ** 2).sum(-1)
     density = np.exp(-distance2 / (2 * NOISE**2)) * (distance2 < (4 * NOISE) ** 2)
     density = density.sum(1) * (1 - OUTLIERS) / (len(points) * 2 * math.pi * NOISE**2)
     return float(np.log(density + OUTLIERS / area).sum())
@@ -53,7 +50,7 @@ def test_points_as_dense_as_their_residuals_fix_less_than_their_number_says() ->
     """400 points with 15 others within 4 standard deviations of each: a tenth of their information is left."""
     rng = np.random.default_rng(3)
     points = 0.1 * rng.uniform(-1, 1, (400, 3))
-    rays = noisy(rays_of(points + SHIFT), rng)
+    rays = noisy(directions(points + SHIFT), rng)
     sets = PointSets(rays, points)
     middle = np.median(points, 0)
 
@@ -75,7 +72,7 @@ def test_points_as_dense_as_their_residuals_fix_less_than_their_number_says() ->
 def test_a_bound_is_exceeded_once_in_a_thousand_by_students_law() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (8, 3))
-    sets = PointSets(noisy(rays_of(points + SHIFT), rng), points)
+    sets = PointSets(noisy(directions(points + SHIFT), rng), points)
     sigma = rotation_sigma(sets, np.eye(3), SHIFT, NOISE)
     for count, free in ((4, 2), (8, 10), (500, 994)):
         bound = rotation_bound(sets, np.eye(3), SHIFT, NOISE, float(count))
@@ -86,7 +83,7 @@ def test_a_bound_is_exceeded_once_in_a_thousand_by_students_law() -> None:
 def test_a_prior_bounds_what_the_points_leave_loose() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([1e-4 * rng.standard_normal((5, 2)), rng.uniform(-1, 1, 5)])  # nearly on one line
-    rays = noisy(rays_of(points + [0, 0, 6.0]), rng)
+    rays = noisy(directions(points + [0, 0, 6.0]), rng)
     free = rotation_sigma(PointSets(rays, points), np.eye(3), np.array([0, 0, 6.0]), NOISE)
     known = PointSets(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
     assert free > math.radians(60)
@@ -99,7 +96,7 @@ def test_a_prior_bounds_what_the_points_leave_loose() -> None:
 def test_points_that_are_not_seen_fix_nothing() -> None:
     rng = np.random.default_rng(2)
     points = rng.uniform(-1, 1, (8, 3))
-    rays = rays_of(points + SHIFT)
-    away = rays_of(points + SHIFT)  # normals away from the camera
+    rays = directions(points + SHIFT)
+    away = directions(points + SHIFT)  # normals away from the camera
     assert rotation_sigma(PointSets(rays, points, away), np.eye(3), SHIFT, NOISE) == math.inf
     assert rotation_sigma(PointSets(-rays, points), np.eye(3), SHIFT, NOISE) == math.inf

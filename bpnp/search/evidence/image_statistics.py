@@ -21,7 +21,8 @@ class ImageStatistics:
     """Of bearings (m, 3).
 
     centre: their mean (3,). spread: root mean square distance from it. axes: (3, 2) principal axes on the tangent
-    plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians.
+    plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
+    most 4 pi.
     scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
     chosen: (k,) places of the image points that are looked at. together: (k, S) how many lie within `TOGETHER` scales.
     """
@@ -33,7 +34,8 @@ class ImageStatistics:
         self.spread = max(float(np.sqrt((centred**2).sum(-1).mean())), 1e-12)
         variance, axes = np.linalg.eigh(centred.T @ centred / max(m - 1, 1))
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
-        self.solid_angle = _filled(variance[1:])
+        area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
+        self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
         smallest = max(floor or 0.0, FLOOR * self.spread)
         largest = max(COARSEST * math.sqrt(self.solid_angle / m), 2 * smallest)
         steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
@@ -41,21 +43,6 @@ class ImageStatistics:
         self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
         crowd = nearest(bearings, bearings[self.chosen], TOGETHER * largest)
         self.together = (crowd[:, None] <= TOGETHER * self.scales[:, None]).sum(-1)
-
-
-def solid_angle(bearings: Array, *, ddof: int = 1) -> float:
-    """Steradians that bearings fill: of the rectangle with their principal standard deviations, 4 pi at most.
-
-    ddof: 1 for the variances of what few bearings are a sample of, 0 for those of the bearings themselves.
-    """
-    centred = bearings - bearings.mean(0)
-    variance = np.linalg.eigvalsh(centred.T @ centred / max(len(bearings) - ddof, 1))[1:]
-    return _filled(variance)
-
-
-def _filled(variance: Array) -> float:
-    """Steradians of the rectangle with these two principal variances."""
-    return float(np.clip(12 * math.sqrt(max(float(variance.prod()), 0.0)), 1e-24, 4 * math.pi))
 
 
 def nearest(directions: Array, bearings: Array, radius: float) -> Array:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.search.few.triangles import triangle_table, triples_between
+from bpnp.search.starts import turned_to
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -68,7 +69,7 @@ class ImageArrays:
     """
 
     def __init__(self, bearings: Array, radius: float | Array, labels2d: Labels | None, reach: float) -> None:
-        self.turn = onto_z(bearings.mean(0))
+        self.turn = turned_to(bearings.mean(0))
         rays = bearings @ self.turn.T
         inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
         self.rays = np.ascontiguousarray(np.column_stack([rays, inverse]))
@@ -167,18 +168,6 @@ def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, NDArray[np.i
     cell = row * CELLS + column
     order = np.argsort(cell, kind="stable")
     return np.append(low, per_cell), np.searchsorted(cell[order], np.arange(CELLS**2 + 1)), item[order]
-
-
-def onto_z(direction: Array) -> Array:
-    """A rotation that takes a direction to the z axis; any if it is zero."""
-    length = float(np.linalg.norm(direction))
-    if length < 1e-9:
-        return np.eye(3)
-    x, y, z = direction / length
-    if z < -0.999999:
-        return np.diag([1.0, -1.0, -1.0])
-    c = 1 / (1 + z)
-    return np.array([[1 - x * x * c, -x * y * c, -x], [-x * y * c, 1 - y * y * c, -y], [x, y, z]])
 
 
 def _area(flat: Array, radius: float) -> float:

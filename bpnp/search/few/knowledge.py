@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.few.arrays import ImageArrays, SceneArrays, onto_z
+from bpnp.search.few.arrays import ImageArrays, SceneArrays
 from bpnp.search.point_sets import PointSets
-from bpnp.search.starts import GravityPrior, PosePrior, Prior
+from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
 Array = NDArray[np.float64]
 SIGMAS = 4.0  # of a prior, beyond which no pose is looked for
@@ -51,7 +51,7 @@ def knowledge_of(sets: PointSets, scene: SceneArrays, image: ImageArrays) -> Kno
         camera = image.turn @ camera
         sigma = math.radians(prior.sigma_deg)
         directions = _rows(up[None], camera[None], sigma)
-        from_camera, from_scene = onto_z(camera), onto_z(up)
+        from_camera, from_scene = turned_to(camera), turned_to(up)
         rays, points = image.rays[:, :3] @ from_camera.T, scene.arrays[0] @ from_scene.T
         upright = np.ascontiguousarray(rays), np.ascontiguousarray(points), from_camera.T.copy(), from_scene
         return Knowledge(directions, place, turned, upright, 2, 0.0)
