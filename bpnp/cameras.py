@@ -149,13 +149,9 @@ def read_text_model(folder: Path) -> Any:
     return model
 
 
+@cache
 def camera_models() -> Mapping[int, tuple[str, int]]:
     """Name and number of parameters of each COLMAP camera model, by its id."""
-    return _models()
-
-
-@cache
-def _models() -> Mapping[int, tuple[str, int]]:
     pycolmap = _pycolmap()
     return {
         int(model): (name, len(pycolmap.Camera.create_from_model_id(1, model, 1.0, 1, 1).params))

@@ -137,11 +137,3 @@ def stacked(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torc
         if not value.isfinite().all():
             raise ValueError(f"expected finite `{name}`, got {value.tolist()} in pair {i}")
     return torch.stack([v.to(dtype) for v in values])
-
-
-def padded(sets: list[Tensor], size: int, value: int = 0) -> Tensor:
-    """One tensor (b, size, ...) of sets of different sizes."""
-    result = sets[0].new_full((len(sets), size, *sets[0].shape[1:]), value)
-    for i, values in enumerate(sets):
-        result[i, : len(values)] = values
-    return result

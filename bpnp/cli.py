@@ -91,32 +91,21 @@ def help_text() -> str:
     )
 
 
-def _config_file(name: str) -> str:
-    """The file of a configuration, which may be a packaged one. Raises ValueError if there is none."""
-    path = packaged_config(name)
-    if not os.path.isfile(path):
-        _known(name, config_names(), "a configuration file or the name of a packaged one")
-    return path
-
-
 def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
-    """The arguments with the file in place of the name of a packaged configuration."""
-    found = list(arguments)
-    for i, text in enumerate(arguments):
-        if text in ("-c", "--config") and i + 1 < len(arguments):
-            found[i + 1] = _config_file(arguments[i + 1])
-        elif text.startswith("--config="):
-            found[i] = f"--config={_config_file(text.removeprefix('--config='))}"
-    return found
+    """The arguments with the file in place of the name of a packaged configuration. ValueError if there is none."""
+    words = [part for text in arguments for part in (text.split("=", 1) if text.startswith("--config=") else [text])]
+    for i, before in enumerate(words[:-1], 1):
+        if before in ("-c", "--config"):
+            words[i] = packaged_config(words[i])
+            if not os.path.isfile(words[i]):
+                _known(words[i], config_names(), "a configuration file or the name of a packaged one")
+    return words
 
 
 def _quieten() -> None:
     """Third-party advice that does not apply here."""
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(
-        lambda record: "Tip:" not in record.getMessage()
-    )
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*Using `DistributedSampler` with the dataloaders.*")
-    warnings.filterwarnings("ignore", message=".*Experiment logs directory .* exists and is not empty.*")
-    warnings.filterwarnings("ignore", message=".*LeafSpec.*")
-    warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
+    advice = logging.getLogger("lightning.pytorch.utilities.rank_zero")
+    advice.addFilter(lambda record: "Tip:" not in record.getMessage())
+    for part in ("does not have many workers", "Using `DistributedSampler` with the dataloaders", "LeafSpec",
+                 "Experiment logs directory .* exists and is not empty", "smaller than the logging interval"):  # fmt: skip
+        warnings.filterwarnings("ignore", message=f".*{part}.*")

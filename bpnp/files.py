@@ -6,7 +6,7 @@ import json
 import os
 import shutil
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,28 @@ def written_whole(path: Path) -> Iterator[Path]:
             shutil.rmtree(temporary)
         else:
             temporary.unlink(missing_ok=True)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text whole or not at all, with line ends as they are."""
+    with written_whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="")
+    return path
+
+
+def keep_settings(path: Path, settings: Mapping[str, Any]) -> None:
+    """Write what the results of a folder were made with. Raises ValueError if those in it were made with other ones."""
+    text = json.dumps(settings, indent=1, sort_keys=True, default=str) + "\n"
+    if not path.is_file():
+        write_text(path, text)
+        return
+    wanted, kept = json.loads(text), json.loads(path.read_text(encoding="utf-8"))
+    other = sorted(key for key in wanted.keys() | kept.keys() if wanted.get(key) != kept.get(key))
+    if other:
+        raise ValueError(
+            f"expected {path.parent} without results of other settings, got other {', '.join(other)}; try another "
+            "--output"
+        )
 
 
 @contextmanager

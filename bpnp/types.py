@@ -12,8 +12,9 @@ from typing import Any, TypeVar, cast
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
 
-from bpnp.checks import Arrays, checked_match, checked_points, listed, padded, stacked
+from bpnp.checks import Arrays, checked_match, checked_points, listed, stacked
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")
@@ -159,8 +160,8 @@ class Batch(Tensors):
         if matches is not None:
             matches = [checked_match(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]
         return cls(
-            points2d=padded(sets2d, m),
-            points3d=padded(sets3d, n),
+            points2d=pad_sequence(sets2d, batch_first=True),
+            points3d=pad_sequence(sets3d, batch_first=True),
             mask2d=torch.stack([torch.arange(m) < len(x) for x in sets2d]),
             mask3d=torch.stack([torch.arange(n) < len(x) for x in sets3d]),
             focal=stacked("focal", focals, (), dtype),
@@ -168,7 +169,7 @@ class Batch(Tensors):
             ids=tuple(map(str, range(size))) if ids is None else tuple(ids),
             rotation=None if rotations is None else stacked("rotation", rotations, (3, 3), dtype),
             translation=None if translations is None else stacked("translation", translations, (3,), dtype),
-            match3d=None if matches is None else padded(matches, n, -1),
+            match3d=None if matches is None else pad_sequence(matches, batch_first=True, padding_value=-1),
         )
 
 

@@ -35,28 +35,23 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
-def test_every_index_is_visited_once(threads: int, count: int) -> None:
-    seen = np.zeros(count, int)
-    in_threads(lambda first, last: np.add.at(seen, np.arange(first, last), 1), count)
+def test_every_index_is_visited_once_and_no_share_is_empty(threads: int, count: int) -> None:
+    seen, shares = np.zeros(count, int), list[int]()
+
+    def work(first: int, last: int) -> None:
+        seen[first:last] += 1
+        shares.append(last - first)
+
+    in_threads(work, count)
     assert (seen == 1).all()
+    assert len(shares) == max(min(threads, count), 1)
+    assert count == 0 or min(shares) >= 1
 
 
-def test_no_thread_has_an_empty_share(threads: int) -> None:
-    shares: list[int] = []
-    in_threads(lambda first, last: shares.append(last - first), 2)
-    assert sum(shares) == 2
-    assert min(shares) >= 1
-    assert len(shares) == min(threads, 2)
-
-
-def test_shares_run_at_the_same_time() -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(3)
-    together = threading.Barrier(3, timeout=20)
-    try:
-        in_threads(lambda _first, _last: together.wait(), 3)
-    finally:
-        torch.set_num_threads(before)
+@pytest.mark.parametrize("threads", [3], indirect=True)
+def test_shares_run_at_the_same_time(threads: int) -> None:
+    together = threading.Barrier(threads, timeout=20)
+    in_threads(lambda _first, _last: together.wait(), threads)
 
 
 def test_an_error_in_any_share_is_raised(threads: int) -> None:
@@ -80,11 +75,10 @@ def _square(results: "multiprocessing.Queue[float]") -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*multi-threaded.*")
+@pytest.mark.parametrize("threads", [2], indirect=True)
+@pytest.mark.usefixtures("threads")
 def test_a_fork_has_threads_of_its_own() -> None:
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
     in_threads(lambda _first, _last: None, 10)
-    torch.set_num_threads(before)
     context = multiprocessing.get_context("fork")
     results = context.Queue()
     child = context.Process(target=_square, args=(results,))
@@ -105,13 +99,18 @@ def package(tmp_path: Path) -> Path:
     return folder.parent
 
 
-def doubled(package: Path, cache: str) -> tuple[str, str]:
-    """What a process prints and logs that calls the loop."""
+def started(package: Path, cache: str, before: str = "") -> "subprocess.Popen[str]":
+    """A process that calls the loop of the package after the statements `before`."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
     environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": cache, "HOME": cache}
-    ask = [sys.executable, "-c", "from bpnp.loop import double; print(double(4), double(5))"]
-    ended = subprocess.run(ask, env=environment, cwd=package, capture_output=True, text=True, check=True)
-    return ended.stdout, ended.stderr
+    ask = [sys.executable, "-c", f"from bpnp.loop import double\n{before}print(double(4), double(5))"]
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen(ask, env=environment, cwd=package, **streams)  # type: ignore[call-overload,no-any-return]
+
+
+def doubled(package: Path, cache: str) -> tuple[str, str]:
+    """What such a process prints and logs."""
+    return started(package, cache).communicate(timeout=120)
 
 
 def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(package: Path, tmp_path: Path) -> None:
@@ -132,24 +131,13 @@ def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> 
 
 def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, tmp_path: Path) -> None:
     """All find the loop's value, and what they leave in the cache is whole: the next one compiles nothing."""
-    cache = str(tmp_path / "cache")
-    environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
-    environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": cache, "HOME": cache}
-    gate = tmp_path / "gate"
+    cache, gate = str(tmp_path / "cache"), tmp_path / "gate"
     gate.mkdir()
-    ask = (
-        f"import os, time\nfrom bpnp.loop import double\nopen(f'{gate}/{{os.getpid()}}', 'w').close()\n"
+    wait = (
+        f"import os, time\nopen(f'{gate}/{{os.getpid()}}', 'w').close()\n"
         f"while len(os.listdir('{gate}')) < 3: time.sleep(0.001)\n"
     )
-    together = [
-        subprocess.Popen(
-            [sys.executable, "-c", ask + "print(double(4), double(5))"], env=environment, cwd=package,
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-        for _ in range(3)
-    ]  # fmt: skip
-    for process in together:
+    for process in [started(package, cache, wait) for _ in range(3)]:
         printed, logged = process.communicate(timeout=120)
-        assert process.returncode == 0, logged
-        assert printed == "8 10\n"
+        assert (process.returncode, printed) == (0, "8 10\n"), logged
     assert doubled(package, cache) == ("8 10\n", "")

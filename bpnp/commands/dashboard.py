@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from rich.console import Console
+from bpnp.commands.output import say
 
 
 def wandb_results(
@@ -20,11 +20,10 @@ def wandb_results(
     from bpnp.report.dashboards import workspace as dashboard
     from bpnp.report.runs import named_runs
 
-    console = Console()
     for name, folder in named_runs(runs).items():
         written = log_results(folder, project=project, name=name, directory=directory)
-        console.print(f"logged {name} to {written}", markup=False, highlight=False, soft_wrap=True)
+        say(f"logged {name} to {written}")
     if workspace is not None:
         saved = dashboard(workspace, project)
         saved.save()
-        console.print(f"saved {saved.url}", markup=False, highlight=False, soft_wrap=True)
+        say(f"saved {saved.url}")

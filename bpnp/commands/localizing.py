@@ -1,18 +1,11 @@
 """`bpnp localize`: new photos in a map, or the images of a COLMAP model as if their poses were unknown."""
 
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Any, Literal
 
-from bpnp.commands.output import console
-from bpnp.files import claimed
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from bpnp.localization.in_maps import Attempt, PhotoOptions
-    from bpnp.localization.localized import Localized
-    from bpnp.maps.scene_map import SceneMap
+from bpnp.commands.output import console, progress, say
+from bpnp.files import claimed, keep_settings
 
 
 def localize(
@@ -64,131 +57,101 @@ def localize(
         seed: of the rotation and of the search.
         device: such as cuda; cpu by default.
     """
+    shared = {"solver": solver, "seed": seed, "time_limit": time_limit}
     if map is not None and model is None:
-        from bpnp.localization.in_maps import PhotoOptions
-        from bpnp.localization.point_files import read_camera
-        from bpnp.maps.regions import read_pairs
-
-        options = PhotoOptions(
-            camera=None if camera is None else read_camera(camera),
-            pairs=None if views is None else read_pairs(views),
-            features=keypoints,
-            leave_one_out=leave_one_out,
-            solver=solver,
-            seed=seed,
-            time_limit=time_limit,
-        )
-        asked = {"map": str(map), "camera": camera, "views": str(views), "keypoints": str(keypoints)}
-        asked |= {"leave_one_out": str(leave_one_out), "solver": solver}
-        asked |= {"seed": str(seed), "time_limit": str(time_limit)}
-        _localize_photos(map, photos or [], options, asked, output, cluster, pictures=not no_pictures)
+        given = {"camera": camera, "views": views, "keypoints": keypoints, "leave_one_out": leave_one_out, **shared}
+        _localize_photos(map, photos or [], given, output, cluster, pictures=not no_pictures)
     elif model is not None and map is None:
-        _localize_images(
-            model, image, points, clutter, output, no_pictures, solver, inlier_threshold, time_limit, seed, device
-        )  # fmt: skip
+        options = {"inlier_threshold": inlier_threshold, "device": device, **shared}
+        _localize_images(model, (image, points, clutter), options, output, pictures=not no_pictures)
     else:
         raise ValueError("expected MAP PHOTO... or --model MODEL, got " + ("neither" if map is None else "both"))
 
 
 def _localize_photos(
-    place: Path,
-    photos: list[Path],
-    options: "PhotoOptions",
-    asked: dict[str, str | None],
-    output: Path,
-    cluster: str | None,
-    *,
-    pictures: bool,
+    place: Path, photos: list[Path], given: Mapping[str, Any], output: Path, cluster: str | None, *, pictures: bool
 ) -> None:
     """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
     from bpnp.localization.in_maps import (
+        PhotoOptions,
         attempts,
-        check_settings,
-        finished_solution,
-        kept,
+        finished_solutions,
+        keep,
         photo_files,
         photos_table,
         write_poses,
-    )  # fmt: skip
-    from bpnp.localization.slow_progress import SlowProgress
+    )
+    from bpnp.localization.point_files import read_camera
+    from bpnp.maps.regions import read_pairs
     from bpnp.maps.scene_map import SceneMap
 
+    camera, views, features, *rest = given.values()
+    options = PhotoOptions(
+        None if camera is None else read_camera(camera), None if views is None else read_pairs(views), features, *rest
+    )
     files, scene = photo_files(photos), SceneMap.from_colmap(place)
-    with claimed(output), SlowProgress("localizing", total=len(files)) as progress:
-        check_settings(output, asked)
-        earlier = {name: finished_solution(output, name) for name in files}
-        done = {name: solution for name, solution in earlier.items() if solution is not None}
-        errors: dict[str, str] = {}
+    out, errors = console(), dict[str, str]()
+    with claimed(output), progress() as shown:
+        if not any((output / "solutions").glob("*.json")):
+            (output / "settings.json").unlink(missing_ok=True)
+        keep_settings(output / "settings.json", {"map": place, **given})
+        done = finished_solutions(output, files)
+        task = shown.add_task("localizing", total=len(files), completed=len(done))
         left = {name: photo for name, photo in files.items() if name not in done}
-        progress.advance(len(done))
-        found = attempts(scene, left, options) if cluster is None else _on_cluster(scene, left, options, cluster)
         try:
-            for name, result in found:
-                progress.describe(f"localized {name}")
-                try:
-                    done[name] = kept(output, name, files[name], result, picture=pictures)
-                except (ValueError, OSError) as error:
-                    errors[name] = str(error)
-                progress.advance()
+            for name, found in (attempts if cluster is None else _attempts_on(cluster))(scene, left, options):
+                shown.update(task, description=f"localized {name}", advance=1)
+                if isinstance(found, str):
+                    errors[name] = found
+                else:
+                    keep(output, name, files[name], found, picture=pictures)
+                    done[name] = found
         finally:
             write_poses(output, done)
-    out = console()
     if done:
         out.print(photos_table({name: done[name] for name in files if name in done}))
     for name, reason in errors.items():
-        out.print(f"{name}: {reason}", markup=False, highlight=False, soft_wrap=True)
-    out.print(f"wrote poses.txt, solutions/ in {output}", markup=False, highlight=False, soft_wrap=True)
+        say(f"{name}: {reason}", to=out)
+    say(f"wrote poses.txt, solutions/ in {output}", to=out)
     if errors:
         name, reason = next(iter(errors.items()))
         raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
 
 
-def _on_cluster(
-    scene: "SceneMap", files: dict[str, Path], options: "PhotoOptions", cluster: str
-) -> "Iterator[Attempt]":
+def _attempts_on(cluster: str) -> Any:
+    """As `attempts`, on the workers of a cluster."""
+    from functools import partial
+
     try:
         from bpnp.localization.on_cluster import attempts_on_cluster
     except ImportError as error:
         raise ValueError(f"expected Dask for --cluster, got {error}; try `pip install 'bpnp[cluster]'`") from error
-    return attempts_on_cluster(scene, files, options, cluster)
+    return partial(attempts_on_cluster, cluster=cluster)
 
 
 def _localize_images(
-    model: Path,
-    image: str,
-    points: Literal["seen", "clutter", "all"],
-    clutter: float,
-    output: Path,
-    no_pictures: bool,
-    solver: str,
-    inlier_threshold: float | None,
-    time_limit: float | None,
-    seed: int,
-    device: str | None,
+    model: Path, chosen: tuple[str, str, float], options: Mapping[str, Any], output: Path, *, pictures: bool
 ) -> None:
-    """The images of a model."""
-    from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-    from bpnp.localization.from_models import draw_image, image_source, localize_image, model_photos, write_localized
-    from bpnp.localization.localized import localized_table, summary
-    from bpnp.localization.slow_progress import SlowProgress
+    """The images of a model. chosen: which, which points, and how much clutter. options: of `bpnp.solve`."""
+    from bpnp.localization.from_models import (
+        draw_image,
+        image_source,
+        localize_image,
+        localized_table,
+        read_model,
+        summary,
+        write_localized,
+    )
 
-    source = image_source(read_reconstruction(model), image, points, clutter, seed)
-    draw = None if no_pictures else partial(draw_image, *model_photos(model))
-    done: list["Localized"] = []
-    with claimed(output), SlowProgress("localizing", total=len(source.images)) as progress:
-        for index, (_, own) in enumerate(source.images):
-            progress.describe(own.name)
-            solution, result = localize_image(
-                source, index, solver=solver, inlier_threshold=inlier_threshold, seed=seed, time_limit=time_limit,
-                device=device,
-            )  # fmt: skip
-            done.append(result)
-            write_localized(output, done, {"model": str(model), "points": points, "seed": seed})
-            if draw is not None:
-                draw(solution, result, output / "pictures")
-            progress.advance()
-    out = console()
+    scene, find = read_model(model)
+    source = image_source(scene, *chosen, options["seed"])
+    settings, done, out = {"model": str(model), "points": chosen[1], "seed": options["seed"]}, [], console()
+    with claimed(output), progress() as shown:
+        for index in shown.track(range(len(source.images)), description="localizing"):
+            done.append(localize_image(source, index, **options))
+            write_localized(output, done, settings)
+            if pictures:
+                draw_image(find, scene, done[-1], output / "pictures")
     out.print(localized_table(done))
     out.print(summary(done), highlight=False, soft_wrap=True)
-    written = ", ".join(["results.json", "images.txt", *([] if draw is None else ["pictures/"])])
-    out.print(f"wrote {written} in {output}", markup=False, highlight=False, soft_wrap=True)
+    say(f"wrote {', '.join(['results.json', 'images.txt', *['pictures/'] * pictures])} in {output}", to=out)

@@ -4,8 +4,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.console import Console
-
+from bpnp.commands.output import say
 from bpnp.commands.parser import at_least
 
 if TYPE_CHECKING:
@@ -77,11 +76,8 @@ def prepare_released(source: Path, *, output: Path = Path("data/preprocessed"), 
 
 
 def _show(prepared: "Prepared") -> None:
-    console = Console()
-    counts = ", ".join(f"{count:,} {what}" for what, count in prepared.counts.items())
-    console.print(f"{prepared.folder}: {counts}", highlight=False, soft_wrap=True)
+    say(f"{prepared.folder}: {', '.join(f'{count:,} {what}' for what, count in prepared.counts.items())}")
     if prepared.skipped:
-        listed = prepared.folder / "manifest.json"
-        console.print(f"left out {len(prepared.skipped)}, all listed in {listed}; such as:", soft_wrap=True)
+        say(f"left out {len(prepared.skipped)}, all listed in {prepared.folder / 'manifest.json'}; such as:")
         for name, reason in list(prepared.skipped.items())[:10]:
-            console.print(f"  {name}: {reason}", highlight=False, soft_wrap=True, markup=False)
+            say(f"  {name}: {reason}")

@@ -43,9 +43,10 @@ def report(
 
     paths = list(named_runs(runs).values())
     if html is not None:
-        say(write_page(paths, html, paper=paper, photo=None if photos is None else photo_finder(photos)))
+        page = write_page(paths, html, paper=paper, photo=None if photos is None else photo_finder(photos))
+        say(f"wrote {page}")
     if recall is not None:
-        say(save_figure(recall_curve(paths), recall))
+        say(f"wrote {save_figure(recall_curve(paths), recall)}")
     print_tables(paths, console(), paper=paper, untrained=untrained)
 
 
@@ -93,7 +94,7 @@ def view(
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", own.id) or str(own.index)
         figure = plot_pair(own, estimate=estimate, lines=LINES[lines], photo=photo and photo(own.id, box_of(own)))
         written = save_figure(figure, output or folder / "views" / f"{name}.png")
-        say(written)
+        say(f"wrote {written}")
         if open:
             webbrowser.open(written.absolute().as_uri())
 

@@ -5,9 +5,8 @@ from typing import Any
 
 from rich.console import Console
 
-from bpnp.commands.output import console, say
-
-Vector = tuple[float, float, float]
+from bpnp.commands.output import console, progress, say
+from bpnp.files import write_text
 
 
 def solve(
@@ -67,23 +66,35 @@ def solve(
         seed: of the search.
         device: such as cuda; cpu by default.
     """
-    from bpnp.localization.point_files import read_camera, read_image, read_scene
-    from bpnp.localization.priors import known_pose
-    from bpnp.localization.slow_progress import SlowProgress
-    from bpnp.localization.solved import solution_table, write_text
+    from bpnp.localization.point_files import read_camera, read_image, read_prior, read_scene
+    from bpnp.localization.solved import solution_table
+    from bpnp.report.figures import SUFFIXES, save_figure
+    from bpnp.report.pictures import read_photo, solution_picture
+    from bpnp.search.starts import GravityPrior
     from bpnp.solving.solve import solve as find_pose
 
-    image_points, labels2d = read_image(points2d)
-    scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
-    known = known_pose(prior, prior_degrees, prior_distance, up_camera, up_scene, up_degrees)
+    if (up_camera is None) != (up_scene is None):
+        raise ValueError("expected --up_camera and --up_scene together, got one of them")
+    if prior is not None and up_camera is not None:
+        raise ValueError("expected --prior or --up_camera with --up_scene, got both")
     if image is not None and camera is None:
         raise ValueError(f"expected --image with a COLMAP model as --camera, got {image!r} alone")
-    lens = None if camera is None else read_camera(camera, image)
-    _prepare(output, picture)
-    if photo is not None and (picture is None or lens is None):
+    if photo is not None and (picture is None or camera is None):
         raise ValueError("expected --photo with --picture and --camera, got it without")
-    under = None if photo is None else _photo(photo)
-    with SlowProgress("searching the pose") as progress:
+    if picture is not None and picture.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
+    known: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
+    if up_camera is not None and up_scene is not None:
+        known = GravityPrior(up_camera, up_scene, up_degrees)
+    image_points, labels2d = read_image(points2d)
+    scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
+    lens = None if camera is None else read_camera(camera, image)
+    under = None if photo is None else read_photo(photo)
+    for path in (output, picture):  # raises before the search where its result could not be written
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+    with progress(items=False) as shown:
+        task = shown.add_task("searching the pose", total=None)
         solution = find_pose(
             image_points,
             scene_points,
@@ -98,37 +109,19 @@ def solve(
             seed=seed,
             time_limit=time_limit,
             device=device,
-            progress=lambda _, batch, __: progress.describe(f"searching the pose, round {batch}"),
+            progress=lambda _, batch, __: shown.update(task, description=f"searching the pose, round {batch}"),
         )
     if json:
-        console().print(solution.to_json(), markup=False, highlight=False, soft_wrap=True)
+        say(solution.to_json())
     else:
         console().print(solution_table(solution))
-    said = Console(stderr=True) if json else console()
+    said = Console(stderr=True) if json else None
     if output is not None:
-        say(write_text(output, solution.to_json() + "\n"), to=said)
+        write_text(output, solution.to_json() + "\n")
+        say(f"wrote {output}", to=said)
     if picture is not None:
-        from bpnp.report.figures import save_figure
-        from bpnp.report.pictures import solution_picture
-
-        say(save_figure(solution_picture(solution, title=points2d.stem, photo=under), picture), to=said)
+        figure = solution_picture(solution, title=points2d.stem, photo=under)
+        say(f"wrote {save_figure(figure, picture)}", to=said)
     if colmap is not None:
-        say(solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name), to=said)
-
-
-def _photo(path: Path) -> Any:
-    from bpnp.report.pictures import read_photo
-
-    return read_photo(path)
-
-
-def _prepare(output: Path | None, picture: Path | None) -> None:
-    """Raise before the search where its result could not be written."""
-    if picture is not None:
-        from bpnp.report.figures import SUFFIXES
-
-        if picture.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
-    for path in (output, picture):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
+        written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)
+        say(f"wrote {written}", to=said)

@@ -4,9 +4,7 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from rich.progress import Progress
-
-from bpnp.commands.output import console, say
+from bpnp.commands.output import console, progress, say
 from bpnp.commands.parser import at_least
 from bpnp.configs import packaged_config
 from bpnp.files import claimed
@@ -71,15 +69,15 @@ def table(
             held.enter_context(claimed(block.folder))
             block.claim()
         missing = sum(len(block.missing()) for block in blocks)
-        with Progress(console=out, disable=missing == 0, transient=True) as progress:
-            bar = progress.add_task("pairs", total=missing)
+        with progress() as shown:
+            task = shown.add_task("pairs", total=missing)
             for tested in run(blocks, processes=processes):
-                progress.advance(bar, tested)
+                shown.advance(task, tested)
         lines = [line for ratio, own in lists for line in lines_of(own, ratio, len(every))]
     published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else _paper(paper)
     out.print(terminal(lines, published))
     for path in write_tables(output, lines, published):
-        say(path, to=out)
+        say(f"wrote {path}", to=out)
 
 
 def _paper(wanted: str) -> Paper | None:

@@ -112,7 +112,7 @@ class BpnpCLI(LightningCLI):
         """Say where the checkpoints are."""
         for path in sorted(Path(_checkpoint_folder(self.trainer.default_root_dir)).glob("*.ckpt")):
             if self.trainer.is_global_zero and not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
-                say(path)
+                say(f"wrote {path}")
 
     def _check_checkpoint(self, subcommand: str) -> None:
         """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""

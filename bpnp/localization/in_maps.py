@@ -1,6 +1,5 @@
 """Photos localised in a map, one after the other, into a folder; an interrupted run resumes."""
 
-import json
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from rich.text import Text
-from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Lens, camera_from
-from bpnp.localization.solved import write_text
+from bpnp.files import write_text
 from bpnp.maps.colmap_database import is_database, read_database
 from bpnp.maps.keypoints import Keypoints, detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
+from bpnp.report.exports import pose_text
 from bpnp.report.figures import save_figure
 from bpnp.report.pictures import VERDICTS, read_photo, solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
@@ -45,9 +44,13 @@ class PhotoOptions:
 def photo_files(given: Iterable[Path]) -> dict[str, Path]:
     """Photos by name: the files given, and those in given folders. Raises ValueError for none, or one name twice."""
     files: dict[str, Path] = {}
-    for path in _expanded(given):
-        if files.setdefault(path.name, path) != path:
-            raise ValueError(f"expected photos of different names, got {files[path.name]} and {path}")
+    for path in given:
+        if not path.exists():
+            raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
+        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
+        for file in inside:
+            if files.setdefault(file.name, file) != file:
+                raise ValueError(f"expected photos of different names, got {files[file.name]} and {file}")
     if not files:
         raise ValueError("expected one or more photos, or folders with some, got none")
     return files
@@ -65,7 +68,7 @@ def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOption
             f"expected photos of {lens.camera.width} x {lens.camera.height} pixels as --camera says, got {name} of "
             f"{size[0]} x {size[1]}; try a camera with the focal length and the centre of this size"
         )
-    found = detected_keypoints(photo) if options.features is None else _read_keypoints(options.features, name, size)
+    found = _keypoints(name, photo, options.features, size)
     views = None if options.pairs is None else options.pairs.get(name)
     if options.pairs is not None and not views:
         raise ValueError(f"expected views for {name} among the pairs, got none; try without --views")
@@ -89,52 +92,33 @@ def attempts(scene: SceneMap, files: Mapping[str, Path], options: PhotoOptions) 
         yield name, attempt(scene, name, photo, options)
 
 
-def solution_file(folder: Path, name: str) -> Path:
-    """Where the solution of a photo is kept."""
-    return folder / "solutions" / f"{_safe(name)}.json"
+def finished_solutions(folder: Path, names: Iterable[str]) -> dict[str, Solution]:
+    """The solutions of an earlier run; of files that are not whole none."""
+    done = {}
+    for name in names:
+        try:
+            done[name] = Solution.from_json(_solution_file(folder, name))
+        except (ValueError, FileNotFoundError):
+            continue
+    return done
 
 
-def finished_solution(folder: Path, name: str) -> Solution | None:
-    """The solution of an earlier run, None if there is none that is whole."""
-    path = solution_file(folder, name)
-    try:
-        return Solution.from_json(path) if path.is_file() else None
-    except ValueError:
-        return None
-
-
-def check_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Keep the settings of a folder's results. Raises ValueError if it has results of other ones."""
-    path, text = folder / "settings.json", json.dumps(settings, indent=1, sort_keys=True) + "\n"
-    if path.is_file() and path.read_text(encoding="utf-8") != text and any((folder / "solutions").glob("*.json")):
-        raise ValueError(f"expected an --output without results of other settings, got {folder}; try another folder")
-    write_text(path, text)
+def keep(folder: Path, name: str, photo: Path, solution: Solution, *, picture: bool) -> None:
+    """Write solutions/<name>.json and, if wanted, pictures/<name>.png: the matches over the photo."""
+    if picture:
+        figure = solution_picture(solution, title=f"{name}: {solution.view}", photo=read_photo(photo))
+        save_figure(figure, folder / "pictures" / f"{_safe(name)}.png")
+    write_text(_solution_file(folder, name), solution.to_json() + "\n")
 
 
 def write_poses(folder: Path, solutions: Mapping[str, Solution]) -> None:
     """poses.txt: a line for each confident photo, in the frame of the map."""
-    lines = []
-    for name, solution in sorted(solutions.items()):
-        if solution.verdict == "confident":
-            x, y, z, w = Rotation.from_matrix(solution.rotation).as_quat(canonical=True).tolist()
-            lines.append(" ".join([name, *map(repr, (w, x, y, z, *solution.translation.tolist()))]) + "\n")
+    lines = [
+        f"{name} {pose_text(own.rotation, own.translation)}\n"
+        for name, own in sorted(solutions.items())
+        if own.verdict == "confident"
+    ]
     write_text(folder / "poses.txt", POSES_HEADER + "".join(lines))
-
-
-def kept(folder: Path, name: str, photo: Path, result: Solution | str, *, picture: bool) -> Solution:
-    """Write a solution, and its picture if wanted. Raises ValueError with the reason if there is no solution."""
-    if isinstance(result, str):
-        raise ValueError(result)
-    if picture:
-        draw_photo(folder, name, photo, result)
-    write_text(solution_file(folder, name), result.to_json() + "\n")
-    return result
-
-
-def draw_photo(folder: Path, name: str, photo: Path, solution: Solution) -> None:
-    """pictures/<name>.png: keypoints, reprojected points and matches over the photo."""
-    figure = solution_picture(solution, title=f"{name}: {solution.view}", photo=read_photo(photo))
-    save_figure(figure, folder / "pictures" / f"{_safe(name)}.png")
 
 
 def photos_table(solutions: Mapping[str, Solution]) -> FittedTable:
@@ -147,18 +131,14 @@ def photos_table(solutions: Mapping[str, Solution]) -> FittedTable:
     return FittedTable("", ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec"), [rows])
 
 
-def _read_keypoints(file: Path, name: str, size: tuple[int, int]) -> Keypoints:
-    return read_database(file, name, size) if is_database(file) else read_features(file, name, size)
+def _keypoints(name: str, photo: Path, features: Path | None, size: tuple[int, int]) -> Keypoints:
+    if features is None:
+        return detected_keypoints(photo)
+    return read_database(features, name, size) if is_database(features) else read_features(features, name, size)
 
 
-def _expanded(given: Iterable[Path]) -> Iterator[Path]:
-    for path in given:
-        if path.is_dir():
-            yield from sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
-        elif path.is_file():
-            yield path
-        else:
-            raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
+def _solution_file(folder: Path, name: str) -> Path:
+    return folder / "solutions" / f"{_safe(name)}.json"
 
 
 def _safe(name: str) -> str:

@@ -1,5 +1,6 @@
-"""Files of points and cameras, as arrays."""
+"""Files of points, cameras and rough poses, as arrays."""
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,101 +11,51 @@ if TYPE_CHECKING:
     from bpnp.datamodules.colmap.model_files import ModelRecords
 
 Array = npt.NDArray[np.float64]
-TEXTS = (".csv", ".txt", ".xyz")
+Labels = npt.NDArray[np.int64]
+ARRAYS = (".npy", ".csv", ".txt", ".xyz")
 COLMAP_POINTS, COLMAP_CAMERAS = "points3D", "cameras"  # the files of a COLMAP model, .bin or .txt
 NORMAL, LABEL = ("nx", "ny", "nz"), "label"
+# After x, y, z in a file that does not name its columns, by their number.
+COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
 
 
-def read_points(path: Path, width: int | None = None, *, surface: int | None = None, seed: int = 0) -> Array:
-    """The points (k, width) of a file; width None for image points, which have two columns, or three if they are rays.
+def read_image(path: Path) -> tuple[Array, Labels | None]:
+    """Image points (m, 2) or unit bearings (m, 3), and labels (m,) where a column is named label.
 
-    width 3: also a COLMAP model, its folder or its points3D. width None: of four and more columns the first two.
-    .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces, the first line may
-    name them, and # starts a comment; for 3D points also .ply and meshes (.obj, .off, .stl, .glb): their different
-    vertices, or `surface` points drawn from their triangles.
-    Raises ValueError that names the file and what is wrong in it.
+    path: .npy or text as for `read_scene`. Of four and more columns the first two are taken: a detector's rows go on
+    with scale and angle. Raises ValueError as `read_scene`.
     """
-    if width == 3 and (path.is_dir() or path.stem == COLMAP_POINTS):
-        return _colmap(path).points3d
-    if not path.is_file():
-        raise ValueError(f"expected a file of points, got no file {path}")
-    suffix = path.suffix.lower()
-    meshes: tuple[str, ...] = ()
-    if width == 3 and suffix not in (".npy", *TEXTS):
-        from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
-
-        meshes = SUFFIXES
-        if suffix in meshes:
-            if surface is not None:
-                return sample_surface(read_mesh(path), surface, np.random.default_rng(seed))
-            return read_vertices(path)
-    if surface is not None:
-        raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
-    if suffix == ".npy":
-        points = _npy(path)
-    elif suffix in TEXTS:
-        points, _ = _columns(path)
-    else:
-        known = (".npy", *TEXTS, *meshes)
-        raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
-    widths = (2, 3) if width is None else (width,)
-    if width is None and points.ndim == 2 and points.shape[1] > 3:
-        return points[:, :2]  # keypoints: x, y, scale and more
-    if points.ndim != 2 or points.shape[1] not in widths:
-        columns = " or ".join(map(str, widths))
-        hint = " (are the two files swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
-        raise ValueError(f"expected points with {columns} columns in {path}, got shape {points.shape}{hint}")
-    return points
+    _check_suffix(path, ARRAYS)
+    values, names = _columns(path)
+    if LABEL in names:
+        points, _, labels = _annotated(path, values, names, ("x", "y"))
+        return points, labels
+    if values.shape[1] < 2:
+        raise ValueError(f"expected points with 2 or 3 columns in {path}, got shape {values.shape}")
+    return values if values.shape[1] == 3 else values[:, :2], None
 
 
-def read_scene(
-    path: Path, *, surface: int | None = None, seed: int = 0
-) -> tuple[Array, Array | None, npt.NDArray[np.int64] | None]:
+def read_scene(path: Path, *, surface: int | None = None, seed: int = 0) -> tuple[Array, Array | None, Labels | None]:
     """Points (n, 3) of a file, and their outward normals (n, 3) and labels (n,) where it has them.
 
-    As `read_points`; a text may have columns nx, ny, nz and label beside x, y, z: by the names in its first line, or
-    without names after the coordinates, in this order (4, 6 or 7 columns).
+    path: .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces; the first
+    line may name them, else they are x, y, z, then nx, ny, nz or label or both; # starts a comment. Also .ply and
+    meshes (.obj, .off, .stl, .glb): their different vertices, or `surface` points drawn from their triangles; and a
+    COLMAP model, its folder or its points3D. Raises ValueError that names the file and what is wrong in it.
     """
-    colmap = path.stem == COLMAP_POINTS
-    if colmap or path.suffix.lower() not in TEXTS or surface is not None or not path.is_file():
-        return read_points(path, 3, surface=surface, seed=seed), None, None
-    return _annotated(path, ("x", "y", "z"))
+    if path.is_dir() or path.stem == COLMAP_POINTS:
+        return _colmap(path).points3d, None, None
+    if path.suffix.lower() not in ARRAYS:
+        from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
 
-
-def read_image(path: Path) -> tuple[Array, npt.NDArray[np.int64] | None]:
-    """Image points (m, 2) or unit bearings (m, 3), and labels (m,) where a column of a text is named label."""
-    if path.suffix.lower() not in TEXTS or not path.is_file() or LABEL not in (_columns(path)[1] or ()):
-        return read_points(path), None
-    points, _, labels = _annotated(path, ("x", "y"))
-    return points, labels
-
-
-def _annotated(
-    path: Path, coordinates: tuple[str, ...]
-) -> tuple[Array, Array | None, npt.NDArray[np.int64] | None]:  # fmt: skip
-    values, names = _columns(path)
-    if names is None:
-        shapes = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
-        if values.shape[1] not in shapes:
-            known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
-            raise ValueError(
-                f"expected {known} in {path}, got shape {values.shape}"
-                f"{' (are the two files swapped?)' if values.shape[1] == 2 else ''}"
-            )
-        names = [*coordinates, *shapes[values.shape[1]]]
-    place = {name: column for column, name in enumerate(names)}
-    if not set(coordinates) <= set(place):
-        hint = " (are the two files swapped?)" if len(names) == 2 else ""
-        raise ValueError(f"expected columns {', '.join(coordinates)} in {path}, got {', '.join(names)}{hint}")
-    points = values[:, [place[name] for name in coordinates]]
-    normals = values[:, [place[name] for name in NORMAL]] if set(NORMAL) <= set(place) else None
-    if LABEL not in place:
-        return points, normals, None
-    labels = values[:, place[LABEL]]
-    fractions = labels[labels != np.round(labels)]
-    if len(fractions):
-        raise ValueError(f"expected integers in the column label of {path}, got {fractions[0]:g}")
-    return points, normals, labels.astype(np.int64)
+        _check_suffix(path, (*ARRAYS, *SUFFIXES))
+        if surface is None:
+            return read_vertices(path), None, None
+        return sample_surface(read_mesh(path), surface, np.random.default_rng(seed)), None, None
+    _check_suffix(path, ARRAYS)
+    if surface is not None:
+        raise ValueError(f"expected a mesh to draw {surface} points from, got {path}; try without --surface")
+    return _annotated(path, *_columns(path), ("x", "y", "z"))
 
 
 def read_camera(text: str, image: str | None = None) -> Any:
@@ -121,18 +72,61 @@ def read_camera(text: str, image: str | None = None) -> Any:
     if image is not None:
         raise ValueError(f"expected --image with a COLMAP model as --camera, got it with {text!r}")
     if path.is_file():
-        return _npy(path) if path.suffix.lower() == ".npy" else _columns(path)[0]
-    words = text.replace(",", " ").split()
-    try:
-        numbers = [float(word) for word in words[1:]]
-    except ValueError:
-        numbers = []
-    if not numbers or not words[0].replace("_", "").isalnum() or words[0][0].isdigit():
+        return _columns(path)[0]
+    model, *words = text.replace(",", " ").split() or [""]
+    numbers = [_number(word) for word in words]
+    if not numbers or None in numbers or not model.replace("_", "").isalnum() or model[0].isdigit():
         raise ValueError(
             f"expected --camera as a file with a 3x3 matrix or as MODEL,PARAMETERS such as SIMPLE_PINHOLE,800,320,240; "
             f"got {text!r}"
         )
-    return _described(words[0].upper(), numbers)
+    from bpnp.cameras import camera_models
+
+    counts = dict(camera_models().values())
+    sized = len(numbers) == counts.get(model.upper(), len(numbers)) + 2
+    return (model.upper(), *numbers[:2], numbers[2:]) if sized else (model.upper(), numbers)
+
+
+def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
+    """The rough pose in a JSON file with `rotation` and `translation`, as wide as `degrees` and `distance`; the path of
+    anything else, a checkpoint. Raises ValueError for JSON without a pose."""
+    from bpnp.search.starts import PosePrior
+
+    if path.suffix.lower() != ".json":
+        return path
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {error}") from error
+    return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)
+
+
+def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
+    if not path.is_file():
+        raise ValueError(f"expected a file of points, got no file {path}")
+    if path.suffix.lower() not in known:
+        raise ValueError(f"expected a file that ends in {', '.join(known)}, got {path}")
+
+
+def _annotated(
+    path: Path, values: Array, names: list[str], coordinates: tuple[str, ...]
+) -> tuple[Array, Array | None, Labels | None]:  # fmt: skip
+    hint = " (are the two files swapped?)" if values.shape[1] == 2 else ""
+    if not names and values.shape[1] not in COLUMNS:
+        known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
+        raise ValueError(f"expected {known} in {path}, got shape {values.shape}{hint}")
+    place = {name: column for column, name in enumerate(names or (*coordinates, *COLUMNS[values.shape[1]]))}
+    if not set(coordinates) <= set(place):
+        raise ValueError(f"expected columns {', '.join(coordinates)} in {path}, got {', '.join(names)}{hint}")
+    points = values[:, [place[name] for name in coordinates]]
+    normals = values[:, [place[name] for name in NORMAL]] if set(NORMAL) <= set(place) else None
+    if LABEL not in place:
+        return points, normals, None
+    labels = values[:, place[LABEL]]
+    if len(fractions := labels[labels != np.round(labels)]):
+        raise ValueError(f"expected integers in the column label of {path}, got {fractions[0]:g}")
+    return points, normals, labels.astype(np.int64)
 
 
 def _colmap(path: Path) -> "ModelRecords":
@@ -155,58 +149,39 @@ def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     return camera.model, *camera.size, camera.params
 
 
-def _described(model: str, numbers: list[float]) -> tuple[Any, ...]:
-    """With width and height there are two numbers more than the model has parameters."""
-    from bpnp.cameras import camera_models
-
-    count = dict(camera_models().values()).get(model)
-    if count is not None and len(numbers) == count + 2:
-        return model, *numbers[:2], numbers[2:]
-    return model, numbers
-
-
-def _npy(path: Path) -> Array:
+def _columns(path: Path) -> tuple[Array, list[str]]:
+    """The numbers (k, c) of a .npy or a text, and the names of its columns if its first line has one for each."""
     try:
-        array = np.load(path, allow_pickle=False)
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiu":
-            raise ValueError(f"{type(array).__name__} of {getattr(array, 'dtype', 'no numbers')}")
-        return array.astype(np.float64)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"expected an array of numbers in {path}, got {error}") from error
-
-
-def _columns(path: Path) -> tuple[Array, list[str] | None]:
-    """The numbers of a text, and the names of its columns if the first line has one for each."""
-    try:
+        if path.suffix.lower() == ".npy":
+            array = np.load(path, allow_pickle=False)
+            array = array[:, 0] if array.ndim == 3 and array.shape[1] == 1 else array  # OpenCV's points are (k, 1, 2)
+            if array.dtype.kind not in "fiu" or array.ndim != 2:
+                raise ValueError(f"{array.dtype} of shape {array.shape}")
+            return array.astype(np.float64), []
         text = path.read_text(encoding="utf-8-sig")
-    except (UnicodeDecodeError, OSError) as error:
-        raise ValueError(f"expected text with numbers in {path}, got {error}") from error
+    except (ValueError, OSError, EOFError) as error:
+        raise ValueError(f"expected rows of numbers in {path}, got {error}") from error
     rows: list[list[float]] = []
-    names: list[str] | None = None
-    for number, line in enumerate(text.splitlines(), 1):
+    names: list[str] = []
+    for place, line in enumerate(text.splitlines(), 1):
         content = line.partition("#")[0].strip()
-        if not content:
-            continue
-        separator = next((mark for mark in (",", ";") if mark in content), None)
-        words = content.split(separator)
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            if not rows and not any(_is_number(word) for word in words):
-                names = [word.strip().lower() for word in words]
-                continue
-            raise ValueError(f"expected numbers in line {number} of {path}, got {line[:60]!r}") from None
-        if rows and len(row) != len(rows[0]):
-            raise ValueError(f"expected {len(rows[0])} numbers in line {number} of {path}, got {len(row)}")
-        rows.append(row)
+        words = content.split(next((mark for mark in ",;" if mark in content), None)) if content else []
+        numbers = [number for word in words if (number := _number(word)) is not None]
+        if words and not numbers and not rows:
+            names = [word.strip().lower() for word in words]
+        elif len(numbers) < len(words):
+            raise ValueError(f"expected numbers in line {place} of {path}, got {line[:60]!r}")
+        elif rows and words and len(numbers) != len(rows[0]):
+            raise ValueError(f"expected {len(rows[0])} numbers in line {place} of {path}, got {len(numbers)}")
+        elif words:
+            rows.append(numbers)
     if not rows:
         raise ValueError(f"expected lines of numbers in {path}, got none")
-    return np.array(rows), names if names is not None and len(names) == len(rows[0]) else None
+    return np.array(rows), names if len(names) == len(rows[0]) else []
 
 
-def _is_number(word: str) -> bool:
+def _number(word: str) -> float | None:
     try:
-        float(word)
+        return float(word)
     except ValueError:
-        return False
-    return True
+        return None

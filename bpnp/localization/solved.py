@@ -1,26 +1,23 @@
-"""A solution in words: as lines of a table, and as a file."""
+"""A solution as lines of a table."""
 
-from pathlib import Path
 from typing import Any
 
 from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.files import written_whole
+from bpnp.report.pictures import VERDICTS
 from bpnp.solving.solution import Solution
-
-COLOURS = {"confident": "green", "ambiguous": "yellow", "failed": "red"}
 
 
 def solution_table(solution: Solution) -> Table:
-    """A solution as lines of a table."""
+    """Verdict, pose and matches; the next candidates, and how long it took."""
     table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
     table.add_column(no_wrap=True, style="dim")
     table.add_column(overflow="fold")
-    table.add_row("verdict", Text.assemble((solution.verdict, COLOURS[solution.verdict]), f": {solution.reason}"))
+    table.add_row("verdict", Text.assemble((solution.verdict, VERDICTS[solution.verdict]), f": {solution.reason}"))
     if solution.found:
-        for row, name in zip(solution.rotation, ("rotation", "", ""), strict=True):
+        for name, row in zip(("rotation", "", ""), solution.rotation, strict=True):
             table.add_row(name, _numbers(row))
         table.add_row("translation", _numbers(solution.translation))
         table.add_row("camera centre", _numbers(solution.centre))
@@ -37,13 +34,6 @@ def solution_table(solution: Solution) -> Table:
         table.add_row("left out", f"{solution.stats.dropped2d} 2D points that could not be undistorted")
     table.add_row("seconds", f"{solution.seconds:.2f}")
     return table
-
-
-def write_text(path: Path, text: str) -> Path:
-    """Write a file whole or not at all."""
-    with written_whole(path) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="")
-    return path
 
 
 def _numbers(values: Any) -> str:

@@ -13,11 +13,17 @@ import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Lens, camera_from
-from bpnp.files import written_whole
+from bpnp.files import write_text, written_whole
 
 Array = npt.NDArray[np.float64]
 NOMINAL_FOCAL = 1000.0  # pixels, of a solution without a camera
 GREY = "128 128 128"
+
+
+def pose_text(rotation: Array, translation: Array) -> str:
+    """A pose as COLMAP's text files have it: qw qx qy qz tx ty tz."""
+    x, y, z, w = Rotation.from_matrix(rotation).as_quat(canonical=True).tolist()
+    return " ".join(map(repr, (w, x, y, z, *translation.tolist())))
 
 
 def write_colmap(
@@ -36,8 +42,7 @@ def write_colmap(
     for i, j in solution.match_places.tolist():
         if i in place:
             ids[place[i]], tracks[j] = j + 1, place[i]
-    x, y, z, w = Rotation.from_matrix(solution.rotation).as_quat(canonical=True).tolist()
-    pose = " ".join(map(repr, (w, x, y, z, *solution.translation.tolist())))
+    pose = pose_text(solution.rotation, solution.translation)
     seen = " ".join(f"{u!r} {v!r} {j}" for (u, v), j in zip(kept.tolist(), ids.tolist(), strict=True))
     errors = _residuals(solution, lens)
 
@@ -75,9 +80,7 @@ def write_nerfstudio(
     content = {"camera_model": model if model != "PINHOLE" else "OPENCV", "w": width, "h": height}
     content |= dict(zip(fields[model], parameters, strict=True))
     content |= {"frames": [{"file_path": name, "transform_matrix": pose.tolist()}]}
-    with written_whole(path) as temporary:
-        temporary.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-    return path
+    return write_text(path, json.dumps(content, indent=1) + "\n")
 
 
 def log_to_rerun(solution: Any, entity: str, *, camera: Any, size: tuple[int, int] | None) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from bpnp.files import written_whole
+from bpnp.files import write_text
 from bpnp.report.figures import save_figure
 from bpnp.report.runs import mean_and_spread
 from bpnp.report.tables.published import Paper
@@ -56,9 +56,7 @@ def lines_of(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Lin
 def write_tables(folder: Path, lines: Sequence[Line], paper: Paper | None) -> list[Path]:
     written = []
     for name, write in (("table.csv", as_csv), ("table.md", as_markdown), ("table.tex", as_latex)):
-        with written_whole(folder / name) as temporary:
-            temporary.write_text(write(lines, paper), encoding="utf-8", newline="")
-        written.append(folder / name)
+        written.append(write_text(folder / name, write(lines, paper)))
     if any(line.rho is not None for line in lines):
         written.append(save_figure(sweep_figure(lines), folder / "outliers.png"))
     return written

@@ -3,7 +3,6 @@
 Finished pairs are in the results folders at once, so that a run that is stopped or killed loses none of them.
 """
 
-import json
 import logging
 import multiprocessing
 import os
@@ -21,7 +20,7 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from torch.utils.data import DataLoader
 
-from bpnp.files import written_whole
+from bpnp.files import keep_settings
 from bpnp.report.folder import append_rows, finished_rows, write_results
 from bpnp.report.results import Results, rows_from, summarise
 from bpnp.report.samples import PairView, read_views, select_views, thin, views_from, write_views
@@ -47,19 +46,7 @@ class Block:
 
     def claim(self) -> None:
         """Start or resume. Raises ValueError if the folder holds results of another method or of other data."""
-        path = self.folder / IDENTITY
-        identity = json.loads(json.dumps({"method": self.method.identity, "data": self.data}, default=str))
-        if not path.is_file():
-            with written_whole(path) as temporary:
-                temporary.write_text(json.dumps(identity, indent=2) + "\n", encoding="utf-8")
-            return
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        differing = sorted(key for key in identity.keys() | kept.keys() if identity.get(key) != kept.get(key))
-        if differing:
-            raise ValueError(
-                f"expected {self.folder} of the same method and data, got other {', '.join(differing)}; "
-                "try another --output"
-            )
+        keep_settings(self.folder / IDENTITY, {"method": self.method.identity, "data": self.data})
 
     def missing(self) -> list[int]:
         """The wanted pairs that are not finished: those that lack an estimate of the others."""

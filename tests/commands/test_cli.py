@@ -78,6 +78,7 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
         (["report", "nowhere"], "expected a results folder"),
+        (["report", "nowhere", "--paper", "modelnet"], "expected paper as modelnet40 or megadepth, got 'modelnet'"),
     ],
 )
 def test_a_users_mistake_is_one_clear_error(

@@ -39,8 +39,9 @@ def test_every_image_is_where_the_model_has_it(
 
 
 def test_images_txt_is_read_by_colmap(tmp_path: Path) -> None:
-    """With the model's cameras beside it pycolmap has to find the planted poses."""
+    """With the model's cameras beside it pycolmap has to find the planted poses; a model inside it is ignored."""
     truth = plant_model(tmp_path / "model", text=True)
+    plant_model(tmp_path / "model" / "first", seed=1)
     run(tmp_path / "model", tmp_path / "out", "--no-pictures")
     (tmp_path / "out" / "cameras.txt").write_bytes((tmp_path / "model" / "cameras.txt").read_bytes())
     (tmp_path / "out" / "points3D.txt").write_text("# none\n")

@@ -6,13 +6,17 @@ import numpy as np
 import pytest
 import trimesh
 
-from bpnp.localization.point_files import read_camera, read_image, read_points, read_scene
+from bpnp.localization.point_files import read_camera, read_image, read_scene
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
 
 def rows(points: np.ndarray, separator: str) -> str:
     return "\n".join(separator.join(map(repr, row)) for row in points.tolist())
+
+
+def points_of(path: Path, **options: int) -> np.ndarray:
+    return read_scene(path, **options)[0]
 
 
 @pytest.mark.parametrize(
@@ -28,38 +32,38 @@ def rows(points: np.ndarray, separator: str) -> str:
 )
 def test_columns_of_text(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
-    np.testing.assert_array_equal(read_points(tmp_path / name, 3), POINTS)
-    np.testing.assert_array_equal(read_points(tmp_path / name), POINTS)
+    np.testing.assert_array_equal(points_of(tmp_path / name), POINTS)
+    np.testing.assert_array_equal(read_image(tmp_path / name)[0], POINTS)
 
 
 def test_arrays_of_numpy(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
     for dtype in (np.float32, np.float64, np.int32, ">f8"):
-        np.save(tmp_path / "a.npy", POINTS.astype(dtype))
-        np.testing.assert_array_equal(read_points(tmp_path / "a.npy", 3), POINTS.astype(dtype).astype(np.float64))
-    np.save(tmp_path / "a.npy", POINTS[:, :2])
-    assert read_points(tmp_path / "a.npy").shape == (20, 2)
+        np.save(path, POINTS.astype(dtype))
+        np.testing.assert_array_equal(points_of(path), POINTS.astype(dtype).astype(np.float64))
+    for shape in ((20, 2), (20, 1, 2)):  # OpenCV's
+        np.save(path, POINTS[:, :2].reshape(shape))
+        np.testing.assert_array_equal(read_image(path)[0], POINTS[:, :2])
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_a_cloud_keeps_its_order(encoding: str, tmp_path: Path) -> None:
     cloud = np.concatenate([POINTS, POINTS[:2]]).astype(np.float32)
     (tmp_path / "cloud.ply").write_bytes(trimesh.PointCloud(cloud).export(file_type="ply", encoding=encoding))
-    np.testing.assert_allclose(read_points(tmp_path / "cloud.ply", 3), cloud, atol=1e-6)
+    np.testing.assert_allclose(points_of(tmp_path / "cloud.ply"), cloud, atol=1e-6)
 
 
 @pytest.mark.parametrize("suffix", [".off", ".ply", ".obj", ".stl", ".glb"])
 def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) -> None:
-    box = trimesh.creation.box(extents=(2, 4, 6))
-    box.export(tmp_path / f"box{suffix}")
-    corners = read_points(tmp_path / f"box{suffix}", 3)
-    assert {tuple(corner) for corner in corners.tolist()} == {
-        (x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)
-    }
+    path = tmp_path / f"box{suffix}"
+    trimesh.creation.box(extents=(2, 4, 6)).export(path)
+    corners = points_of(path)
+    assert {tuple(own) for own in corners.tolist()} == {(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)}
     assert len(corners) == 8
-    surface = read_points(tmp_path / f"box{suffix}", 3, surface=500, seed=1)
+    surface = points_of(path, surface=500, seed=1)
     assert surface.shape == (500, 3)
     np.testing.assert_allclose((np.abs(surface) / [1, 2, 3]).max(-1), 1, atol=1e-6)
-    assert (read_points(tmp_path / f"box{suffix}", 3, surface=500, seed=1) == surface).all()
+    assert (points_of(path, surface=500, seed=1) == surface).all()
 
 
 @pytest.mark.parametrize(
@@ -70,11 +74,13 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
         ("a.csv", b"1,2,3\nx,y,z\n", "numbers in line 2"),
         ("a.csv", b"", "lines of numbers in .*a.csv, got none"),
         ("a.csv", b"x,y,z\n", "lines of numbers"),
-        ("a.csv", b"1,2\n3,4\n", r"3 columns in .*got shape \(2, 2\) \(are the two files swapped\?\)"),
-        ("a.csv", b"1,2,3,4\n", r"3 columns in .*got shape \(1, 4\)"),
-        ("a.txt", b"\xff\xfe\x00", "text with numbers"),
-        ("a.npy", b"not numpy", "array of numbers in .*a.npy"),
-        ("a.npy", b"", "array of numbers in .*a.npy"),
+        ("a.csv", b"1,2\n3,4\n", r"3 to 4 or .*got shape \(2, 2\) \(are the two files swapped\?\)"),
+        ("a.csv", b"1,2,3,4,5\n", r"3 to 4 or 6 to 7 columns .*got shape \(1, 5\)$"),
+        ("a.csv", b"a,b,label\n1,2,3\n", "expected columns x, y, z in .*a.csv, got a, b, label"),
+        ("a.csv", b"x,y,z,label\n1,2,3,0.5\n", "expected integers in the column label"),
+        ("a.txt", b"\xff\xfe\x00", "rows of numbers in .*a.txt"),
+        ("a.npy", b"not numpy", "rows of numbers in .*a.npy"),
+        ("a.npy", b"", "rows of numbers in .*a.npy"),
         ("a.jpg", b"", "a file that ends in .npy, .csv, .txt, .xyz, .glb, .obj, .off, .ply, .stl"),
         ("a.ply", b"", "a.ply: expected a mesh, got an empty file"),
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
@@ -86,21 +92,26 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
 def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=message):
-        read_points(tmp_path / name, 3)
+        read_scene(tmp_path / name)
 
 
 def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "a.npy"
     with pytest.raises(ValueError, match="got no file .*nowhere.npy"):
-        read_points(tmp_path / "nowhere.npy", 3)
-    np.save(tmp_path / "a.npy", np.array([{"a": 1}], dtype=object))
-    with pytest.raises(ValueError, match="array of numbers"):
-        read_points(tmp_path / "a.npy", 3)
-    np.save(tmp_path / "a.npy", POINTS)
+        read_scene(tmp_path / "nowhere.npy")
+    for content in (np.array([{"a": 1}], dtype=object), np.zeros(3), np.zeros((4, 3, 3))):
+        np.save(path, content)
+        with pytest.raises(ValueError, match="rows of numbers"):
+            read_scene(path)
+    np.save(path, POINTS)
     with pytest.raises(ValueError, match="a mesh to draw 9 points from"):
-        read_points(tmp_path / "a.npy", 3, surface=9)
+        read_scene(path, surface=9)
+    np.save(path, POINTS[:, :1])
+    with pytest.raises(ValueError, match=r"2 or 3 columns in .*, got shape \(20, 1\)"):
+        read_image(path)
     trimesh.creation.box().export(tmp_path / "a.ply")
     with pytest.raises(ValueError, match="ends in .npy, .csv, .txt, .xyz, got"):
-        read_points(tmp_path / "a.ply")
+        read_image(tmp_path / "a.ply")
 
 
 def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
@@ -148,16 +159,3 @@ def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> N
     points, labels = read_image(image)
     np.testing.assert_array_equal(points, [[10, 20], [30, 40]])
     np.testing.assert_array_equal(labels, [7, 8])
-
-
-def test_columns_that_mean_nothing_are_named(tmp_path: Path) -> None:
-    path = tmp_path / "points.csv"
-    for text, message in (
-        ("1 2 3 4 5\n", r"expected 3 to 4 or 6 to 7 columns .* got shape \(1, 5\)"),
-        ("1 2\n", "are the two files swapped"),
-        ("a,b,label\n1,2,3\n", "expected columns x, y, z in .*points.csv, got a, b, label"),
-        ("x,y,z,label\n1,2,3,0.5\n", "expected integers in the column label"),
-    ):
-        path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_scene(path)

@@ -9,15 +9,12 @@ import pytest
 import trimesh
 from PIL import Image
 from planted import plant
-from rich.progress import Progress
 from scipy.spatial.transform import Rotation
 
 import bpnp
 from bpnp import Solution
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.localization import slow_progress
-from bpnp.localization.slow_progress import SlowProgress
 from bpnp.report.pictures import solution_picture
 
 PLANTED = plant(1, 40, seed=2)
@@ -155,18 +152,6 @@ def test_an_interruption_is_one_line(
         main(["solve", *write(tmp_path)])
     assert stop.value.code == 130
     assert capsys.readouterr().err == "bpnp: interrupted\n"
-
-
-def test_progress_is_shown_only_where_it_is_slow(monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[str] = []
-    monkeypatch.setattr(Progress, "start", lambda _: started.append("shown"))
-    for patience, expected in ((1000.0, []), (0.0, ["shown"])):
-        monkeypatch.setattr(slow_progress, "PATIENCE", patience)
-        with SlowProgress("searching") as progress:
-            progress.describe("on it")
-            if not patience:
-                progress._timer.join(10)
-        assert started == expected
 
 
 def test_the_picture_shows_every_match(tmp_path: Path) -> None:
