@@ -107,5 +107,5 @@ def _quieten() -> None:
     advice = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     advice.addFilter(lambda record: "Tip:" not in record.getMessage())
     for part in ("does not have many workers", "Using `DistributedSampler` with the dataloaders", "LeafSpec",
-                 "Experiment logs directory .* exists and is not empty", "smaller than the logging interval"):  # fmt: skip
+                 "logs directory .* exists and is not empty", "smaller than the logging interval"):  # fmt: skip
         warnings.filterwarnings("ignore", message=f".*{part}.*")

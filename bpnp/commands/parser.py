@@ -18,18 +18,31 @@ OVERRIDES = "overrides"  # parameter that receives the options `--data.NAME=VALU
 class OneLineParser(ArgumentParser):
     """A parser whose errors are one line: what is wrong, and the option that was probably meant."""
 
-    of_words = False  # of a typed function: the values are words, of a kind that can be named
-
     def error(self, message: str, ex: Exception | None = None) -> NoReturn:
-        text = " ".join(message.split())
-        if self.of_words and (wrong := re.search(r'Parser key "(\w+)".*(?:Given|Got) value: (.*)$', text)):
-            (action,) = (action for action in self._actions if action.dest == wrong[1])
-            text = f"expected {wrong[1]} as {_described(getattr(action, '_typehint', action.type))}, got {wrong[2]!r}"
+        text = plain(message)
         _, found, unknown = text.rpartition("nrecognized arguments: ")
         known = [option for action in self._actions for option in action.option_strings]
         close = difflib.get_close_matches(re.split("[= ]", unknown)[0], known, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         raise ValueError(text + hint) from ex
+
+
+def plain(message: str) -> str:
+    """A message of jsonargparse in a line, without the None that is allowed as well and the value it was made from."""
+    text = " ".join(message.split())
+    key = re.match(r'Parser key "([\w.]+)"[^:]*: ', text)
+    name, text = (key[1], text[key.end() :]) if key else ("", text)
+    union = re.search(r"Errors: (.*) Given value type: .*? Given value: (.*)$", text)
+    told = []
+    for part in dict.fromkeys(re.split(r"(?:^| )- ", union[1]) if union else [text]):
+        kind = re.fullmatch(r"Expected an? (?:<class '([\w.]+)'>|typing.Literal\[(.*)\])(?:. Got value: (.*))?", part)
+        if kind and name and kind[1] != "NoneType":
+            words = (kind[1] or kind[2]).replace("'", "").replace(", ", " or ")
+            told.append(f"expected {name} as {words}, got {kind[3] or (union and union[2])!r}")
+        elif part and not kind:
+            told.append(plain(part) if union else part)
+    reason = "; ".join(told)
+    return f"{name}: {reason}" if name and f"expected {name} as" not in reason else reason
 
 
 def run_command(name: str, command: Callable[..., None], arguments: Sequence[str]) -> None:
@@ -67,7 +80,6 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
     parser = OneLineParser(
         prog=f"bpnp {name}", description=description, allow_abbrev=False, formatter_class=HelpFormatter
     )
-    parser.of_words = True
     hints = typing.get_type_hints(command)
     for parameter in inspect.signature(command).parameters.values():
         if parameter.name == OVERRIDES:
@@ -97,13 +109,6 @@ def at_least(least: int, **given: float | int | None) -> None:
 def first_line(command: Callable[..., None]) -> str:
     """What a command does, in a line."""
     return (inspect.getdoc(command) or "").splitlines()[0]
-
-
-def _described(kind: Any) -> str:
-    """The types or the words that an annotation allows."""
-    kinds = [option for option in typing.get_args(kind) or (kind,) if option is not type(None)]
-    words = typing.get_args(kinds[0]) if typing.get_origin(kinds[0]) is typing.Literal else kinds
-    return " or ".join(word if isinstance(word, str) else word.__name__ for word in words)
 
 
 def _word(kind: Any) -> tuple[Any, str | int | None]:

@@ -68,8 +68,6 @@ def solve(
     """
     from bpnp.localization.point_files import read_camera, read_image, read_prior, read_scene
     from bpnp.localization.solved import solution_table
-    from bpnp.report.figures import SUFFIXES, save_figure
-    from bpnp.report.pictures import read_photo, solution_picture
     from bpnp.search.starts import GravityPrior
     from bpnp.solving.solve import solve as find_pose
 
@@ -81,15 +79,19 @@ def solve(
         raise ValueError(f"expected --image with a COLMAP model as --camera, got {image!r} alone")
     if photo is not None and (picture is None or camera is None):
         raise ValueError("expected --photo with --picture and --camera, got it without")
-    if picture is not None and picture.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
+    if picture is not None:
+        from bpnp.report.figures import SUFFIXES, save_figure  # matplotlib, where something is drawn
+        from bpnp.report.pictures import read_photo, solution_picture
+
+        if picture.suffix.lower() not in SUFFIXES:
+            raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
     known: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
     if up_camera is not None and up_scene is not None:
         known = GravityPrior(up_camera, up_scene, up_degrees)
     image_points, labels2d = read_image(points2d)
     scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
     lens = None if camera is None else read_camera(camera, image)
-    under = None if photo is None else read_photo(photo)
+    under = None if photo is None or picture is None else read_photo(photo)
     for path in (output, picture):  # raises before the search where its result could not be written
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

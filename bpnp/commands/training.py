@@ -17,7 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import bpnp.datamodules
 from bpnp.commands.output import say
-from bpnp.commands.parser import OneLineParser
+from bpnp.commands.parser import OneLineParser, plain
 from bpnp.commands.training_help import GROUPS
 from bpnp.files import claimed
 from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
@@ -155,18 +155,28 @@ def run_training(arguments: Sequence[str], *, help_of: str | None = None) -> Non
             parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
             args=list(arguments),
         )
-    except (MisconfigurationException, TrainingDivergedError) as error:
-        raise ValueError(str(error)) from error
+    except (MisconfigurationException, TrainingDivergedError, ValueError) as error:
+        raise ValueError(plain(str(error))) from error
 
 
 def _names_a_task(arguments: Sequence[str]) -> bool:
     """Whether the options or a configuration file name a LightningModule in place of BlindPnPTask."""
     words = [word for text in arguments for word in text.split("=", 1)]
     files = [Path(value) for name, value in pairwise(words) if name in ("-c", "--config")]
-    contents = [yaml.safe_load(file.read_text(encoding="utf-8")) for file in files if file.is_file()]
-    models = [content.get("model") for content in contents if isinstance(content, dict)]
+    models = [_options_in(file).get("model") for file in files if file.is_file()]
     named = any(isinstance(model, str) or (isinstance(model, dict) and "class_path" in model) for model in models)
     return named or not {"--model", "--model.class_path"}.isdisjoint(words)
+
+
+def _options_in(file: Path) -> dict[str, Any]:
+    """The content of a configuration file. Raises ValueError that names a file without options."""
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected YAML in {file}, got {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"expected options such as `model:` and `data:` in {file}, got {content!r:.60}")
+    return content
 
 
 def _options_help(parser: LightningArgumentParser, command: str, beginnings: tuple[str, ...]) -> str:

@@ -23,8 +23,9 @@ from bpnp.files import write_text
 from bpnp.metrics.errors import centre_error, rotation_error
 from bpnp.report.exports import pose_text
 from bpnp.report.figures import save_figure
+from bpnp.report.palette import VERDICTS
 from bpnp.report.photos import PhotoFinder, picture_box
-from bpnp.report.pictures import VERDICTS, solution_picture
+from bpnp.report.pictures import solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.result_tables import number
 from bpnp.solving.solution import Solution

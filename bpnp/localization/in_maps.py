@@ -16,7 +16,8 @@ from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
 from bpnp.report.exports import pose_text
 from bpnp.report.figures import save_figure
-from bpnp.report.pictures import VERDICTS, read_photo, solution_picture
+from bpnp.report.palette import VERDICTS
+from bpnp.report.pictures import read_photo, solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.result_tables import number
 from bpnp.solving.solution import Solution

@@ -6,7 +6,7 @@ from rich import box
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.report.pictures import VERDICTS
+from bpnp.report.palette import VERDICTS
 from bpnp.solving.solution import Solution
 
 

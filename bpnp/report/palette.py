@@ -19,6 +19,7 @@ INKS = {
     "wrong": ("#b3261e", "#ff8a80"),
 } | {f"c{i}": pair for i, pair in enumerate(zip(LIGHT, DARK, strict=True))}
 QUIET = INKS["quiet"][0]
+VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bpnp.cameras import Camera, in_front
-from bpnp.report.palette import LIGHT, QUIET
+from bpnp.report.palette import LIGHT, QUIET, VERDICTS
 from bpnp.report.photos import Box, picture_box
 from bpnp.report.samples import Array
 
@@ -15,7 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches
 LINE = 130  # characters
 

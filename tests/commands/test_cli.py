@@ -1,5 +1,6 @@
 import contextlib
 import inspect
+import re
 import subprocess
 import sys
 from importlib.metadata import version
@@ -70,8 +71,11 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
         (["fit", *MESHES, "--trainer.max_epoch=3"], "did you mean --trainer.max_epochs?"),
         (["fit"], "required: fit.data"),
         (["fit", *MESHES, "--model.learning_rat=3"], "unrecognized arguments: --model.learning_rat"),
-        (["fit", *MESHES, "--model.learning_rate=fast"], "learning_rate"),
-        (["fit", *MESHES, "--data.nonsense=3"], "Option 'nonsense' is not accepted"),
+        (["fit", *MESHES, "--model.learning_rate=fast"], "error: expected model.learning_rate as float, got 'fast'\n"),
+        (["fit", *MESHES, "--data.nonsense=3"], "error: data: Option 'nonsense' is not accepted\n"),
+        (["fit", *MESHES, "--data.num_points=many"], "error: data: expected num_points as int, got 'many'\n"),
+        (["fit", *MESHES, "--data.batch_size=0"], "error: expected `batch_size` of 1 or more, got 0\n"),
+        (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing'\n"),
         (["fit", *MESHES, "--data.root=nowhere"], "expected a folder with <class>/{train,test}"),
         (["fit", *MESHES, "--config=nowhere.yaml"], "expected a configuration file or the name of a packaged one"),
         (["fit", "--config", "quickstrat"], "got 'quickstrat'; did you mean quickstart?"),
@@ -143,10 +147,19 @@ def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, capsys: pytest
         assert "expected a folder that no other process writes to" in fails(arguments, capsys)
 
 
-def test_an_unknown_key_in_a_file_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    config = tmp_path / "typo.yaml"
-    config.write_text("model:\n  learning_rat: 1.0e-4\ndata: bpnp.datamodules.MeshDataModule\n")
-    assert "learning_rat" in fails(["fit", f"--config={config}"], capsys)
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("model:\n  learning_rat: 1.0e-4\ndata: bpnp.datamodules.MeshDataModule\n", "learning_rat"),
+        ("", "expected options such as `model:` and `data:` in .*wrong.yaml, got None"),
+        ("model: [1", "expected YAML in .*wrong.yaml, got while parsing a flow sequence"),
+    ],
+)
+def test_a_broken_configuration_is_named(
+    content: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "wrong.yaml").write_text(content)
+    assert re.search(message, fails(["fit", f"--config={tmp_path}/wrong.yaml"], capsys))
 
 
 def test_a_checkpoint_that_is_none_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

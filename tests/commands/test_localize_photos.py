@@ -63,7 +63,7 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
     capsys.readouterr()
     with pytest.raises(SystemExit):
         main([*command, "--leave-one-out", "--seed", "1"])
-    assert "expected an --output without results of other settings" in capsys.readouterr().err
+    assert "without results of other settings, got other seed; try another --output" in capsys.readouterr().err
 
 
 def failing(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
@@ -93,4 +93,4 @@ def test_bad_input_is_one_clear_error(
         "--output", str(tmp_path / "views"),
     )  # fmt: skip
     assert "expected names of views of the map, got nowhere.jpg" in error
-    assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] == "False"
+    assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] is False
