@@ -10,7 +10,7 @@ from bpnp.commands.output import console, say
 from bpnp.report.tables.published import Paper
 
 if TYPE_CHECKING:
-    from bpnp.report.figures import Lines
+    from bpnp.report.pictures import Lines
     from bpnp.report.samples import PairView
 
 LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3d", "none": None}
@@ -75,7 +75,6 @@ def view(
     from bpnp.report.figures import plot_pair, save_figure
     from bpnp.report.photos import box_of
     from bpnp.report.runs import named_runs
-    from bpnp.report.solutions import read_solution
 
     wanted = pairs or []
     if output is not None and len(wanted) > 1:
@@ -86,7 +85,7 @@ def view(
         raise ValueError(f"expected no pair beside the solution {run}, got {wanted[0]!r}")
     photo = None if photos is None else photo_finder(photos)
     if run.is_file():
-        views, folder = [read_solution(run)], run.absolute().parent
+        views, folder = [_solution(run)], run.absolute().parent
     else:
         (folder,) = named_runs([run]).values()
         views = chosen_views(folder, wanted)
@@ -97,6 +96,19 @@ def view(
         say(f"wrote {written}")
         if open:
             webbrowser.open(written.absolute().as_uri())
+
+
+def _solution(path: Path) -> "PairView":
+    """The view of a solution's file. Raises ValueError that names the file."""
+    from bpnp.report.solutions import solution_view
+    from bpnp.solving.solution import Solution
+
+    try:
+        return solution_view(Solution.from_json(path), title=path.stem)
+    except ValueError as error:
+        pictures = path.parent / "pictures"
+        there = f"; the pictures of `bpnp localize` are in {pictures}" if pictures.is_dir() else ""
+        raise ValueError(f"{path}: {error}{there}") from error
 
 
 def chosen_views(folder: Path, wanted: Sequence[str]) -> list["PairView"]:

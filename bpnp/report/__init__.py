@@ -5,34 +5,34 @@ from typing import TYPE_CHECKING
 from bpnp.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from bpnp.report.figures import plot_pair, recall_curve, save_figure
+    from bpnp.report.figures import plot_pair, plot_scene, recall_curve, save_figure
     from bpnp.report.folder import read_results, write_results
     from bpnp.report.page.write import write_page
+    from bpnp.report.pictures import plot_image, plot_residuals
     from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
     from bpnp.report.runs import table
     from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
-    from bpnp.report.solutions import view_of
+    from bpnp.report.solutions import solution_view, view_of
     from bpnp.report.tables.result_tables import learning_table, recall_table, report, results_table
     from bpnp.report.training_log import TrainingLog, read_training_log
 
 __all__ = [
-    "PairRow", "PairView", "Results", "TrainingLog", "cause_shares", "count_inliers", "learning_table", "plot_pair",
-    "read_results", "read_training_log", "read_views", "recall_curve", "recall_table", "report", "results_table",
-    "rows_from", "save_figure", "select_views", "summarise", "table", "view_of", "views_from", "write_page",
-    "write_results", "write_views",
+    "PairRow", "PairView", "Results", "TrainingLog", "cause_shares", "count_inliers", "learning_table", "plot_image",
+    "plot_pair", "plot_residuals", "plot_scene", "read_results", "read_training_log", "read_views", "recall_curve",
+    "recall_table", "report", "results_table", "rows_from", "save_figure", "select_views", "solution_view", "summarise",
+    "table", "view_of", "views_from", "write_page", "write_results", "write_views",
 ]  # fmt: skip
 
-__getattr__, __dir__ = lazy_names(
-    __name__,
-    {
-        "bpnp.report.figures": ("plot_pair", "recall_curve", "save_figure"),
-        "bpnp.report.folder": ("read_results", "write_results"),
-        "bpnp.report.page.write": ("write_page",),
-        "bpnp.report.results": ("PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"),
-        "bpnp.report.runs": ("table",),
-        "bpnp.report.samples": ("PairView", "read_views", "select_views", "views_from", "write_views"),
-        "bpnp.report.solutions": ("view_of",),
-        "bpnp.report.tables.result_tables": ("learning_table", "recall_table", "report", "results_table"),
-        "bpnp.report.training_log": ("TrainingLog", "read_training_log"),
-    },
-)
+MODULES = {
+    "bpnp.report.figures": ("plot_pair", "plot_scene", "recall_curve", "save_figure"),
+    "bpnp.report.folder": ("read_results", "write_results"),
+    "bpnp.report.page.write": ("write_page",),
+    "bpnp.report.pictures": ("plot_image", "plot_residuals"),
+    "bpnp.report.results": ("PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"),
+    "bpnp.report.runs": ("table",),
+    "bpnp.report.samples": ("PairView", "read_views", "select_views", "views_from", "write_views"),
+    "bpnp.report.solutions": ("solution_view", "view_of"),
+    "bpnp.report.tables.result_tables": ("learning_table", "recall_table", "report", "results_table"),
+    "bpnp.report.training_log": ("TrainingLog", "read_training_log"),
+}
+__getattr__, __dir__ = lazy_names(__name__, MODULES)

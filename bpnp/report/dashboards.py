@@ -14,15 +14,10 @@ import numpy as np
 
 from bpnp.report.figures import plot_pair, recall_curve
 from bpnp.report.folder import read_results
+from bpnp.report.page.charts import RECALLS, recall_chart
 from bpnp.report.results import CAUSES, PairRow, Results, cause_shares
 from bpnp.report.samples import FEW, PairView, read_views
 
-CURVES = (
-    ("rotation_error_deg", "rotation error, degrees", 20.0),
-    ("translation_error", "translation error, scene units", 1.0),
-    ("reprojection_error_deg", "reprojection error, degrees", 2.0),
-)
-POINTS = 101
 MOST_PICTURES = 12
 
 
@@ -30,7 +25,7 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
     """Log a results folder to W&B and return the folder of the run, below `directory`.
 
     Scalars "test/<estimate>/rotation_q1_deg" and so on, the first estimate's also without its name; tables "quartiles",
-    "causes" and "pairs"; recall curves as tables with a line plot and as a picture; pictures of the worst kept pairs.
+    "causes" and "pairs"; recall curves as plotly charts and as a picture; pictures of the worst kept pairs.
     Raises ValueError if the folder cannot be read.
     """
     import wandb
@@ -133,23 +128,8 @@ def _tables(results: Results) -> dict[str, Any]:
 
 
 def _curves(results: Results) -> dict[str, Any]:
-    import wandb
-
-    plots = {}
-    for key, label, limit in CURVES:
-        limits = np.linspace(0, limit, POINTS)
-        shares = [
-            _shares([getattr(r, key) for r in results.rows if r.estimate == e], limits) for e in results.estimates
-        ]
-        plots[f"test/recall_curve/{key}"] = wandb.plot.line_series(
-            limits.tolist(), shares, keys=list(results.estimates), title="share of pairs within", xname=label
-        )
-    return plots
-
-
-def _shares(errors: Sequence[float], limits: Any) -> list[float]:
-    known = np.sort([error for error in errors if not np.isnan(error)])
-    return [float(share) for share in np.searchsorted(known, limits, side="right") / max(len(known), 1)]
+    charts = {f"test/recall_curve/{error}": recall_chart({"test": results}, error) for error in RECALLS}
+    return {key: chart for key, chart in charts.items() if chart is not None}
 
 
 def _pictures(results: Results, views: Sequence[PairView]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from torch import Tensor
 
+from bpnp.cameras import Camera
 from bpnp.files import written_whole
 from bpnp.metrics import rotation_error
 from bpnp.types import Batch, Prediction
@@ -22,6 +23,12 @@ from bpnp.types import Batch, Prediction
 FORMAT = 2
 FILE = "points.npz"
 FEW, MANY = 24, 1000
+IDS = ("ids2d", "ids3d")
+POINTS: dict[str, tuple[Any, ...]] = {  # columns of all pairs one after the other: type and width
+    "points2d": (np.float32, 2),
+    "points3d": (np.float32, 3),
+    **dict.fromkeys(("match3d", "assigned3d", *IDS), (np.int32,)),
+}
 
 Array = npt.NDArray[Any]
 
@@ -34,7 +41,8 @@ class PairView:
     assigned3d: (n,) the 2D point to which the solver's assignment gives most of each 3D point, -1 if it has none.
     pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
     error: rotation error of the first estimate in degrees, by which the worst are chosen. ids2d, ids3d: the places of
-    the points in the pair as it was solved, if only some of them are here; None for all.
+    the points in the pair as it was solved, if only some of them are here; None for all. camera: in whose pixels the
+    pair is drawn, None for normalised coordinates; it is not kept on disk.
     """
 
     index: int
@@ -48,6 +56,7 @@ class PairView:
     error: float = 180.0
     ids2d: Array | None = None
     ids3d: Array | None = None
+    camera: Camera | None = None
 
     def numbers(self) -> tuple[Array, Array]:
         """`ids2d` and `ids3d`, counted where they are None."""
@@ -131,7 +140,6 @@ def write_views(folder: Path | str, views: Iterable[PairView]) -> None:
     names = list(kept[0].estimates) if kept else []
     if any(list(view.estimates) != names for view in kept):
         raise ValueError(f"expected views with the estimates {names}, got others; try a folder for each solver")
-    numbers = [view.numbers() for view in kept]
     arrays = {
         "format": np.array(FORMAT),
         "ids": np.frombuffer(json.dumps([view.id for view in kept]).encode(), np.uint8),
@@ -139,14 +147,11 @@ def write_views(folder: Path | str, views: Iterable[PairView]) -> None:
         "error": np.array([view.error for view in kept], np.float64),
         "count2d": np.array([len(view.points2d) for view in kept], np.int64),
         "count3d": np.array([len(view.points3d) for view in kept], np.int64),
-        "points2d": _joined([view.points2d for view in kept], np.float32, 2),
-        "points3d": _joined([view.points3d for view in kept], np.float32, 3),
-        "match3d": _joined([view.match3d for view in kept], np.int32),
-        "assigned3d": _joined([view.assigned3d for view in kept], np.int32),
-        "ids2d": _joined([own for own, _ in numbers], np.int32),
-        "ids3d": _joined([own for _, own in numbers], np.int32),
         "pose": _stacked([view.pose for view in kept]),
     }
+    for name, (kind, *width) in POINTS.items():
+        parts = [view.numbers()[name == "ids3d"] if name in IDS else getattr(view, name) for view in kept]
+        arrays[name] = np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
     arrays |= {f"estimate.{name}": _stacked([view.estimates[name] for view in kept]) for name in names}
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
@@ -171,30 +176,19 @@ def read_views(folder: Path | str) -> tuple[PairView, ...]:
 
 
 def _views(arrays: dict[str, Array]) -> Iterable[PairView]:
-    ids = json.loads(arrays["ids"].tobytes())
-    ends2d, ends3d = arrays["count2d"].cumsum(), arrays["count3d"].cumsum()
+    ends = {side: arrays[f"count{side}"].cumsum()[:-1] for side in ("2d", "3d")}
+    points: dict[str, Any] = {name: np.split(arrays[name], ends[name[-2:]]) for name in POINTS}
     prefix = "estimate."
-    for i, name in enumerate(ids):
-        own2d = slice(ends2d[i] - arrays["count2d"][i], ends2d[i])
-        own3d = slice(ends3d[i] - arrays["count3d"][i], ends3d[i])
+    for i, name in enumerate(json.loads(arrays["ids"].tobytes())):
         truth = arrays["pose"][i]
         yield PairView(
             index=int(arrays["index"][i]),
             id=name,
-            points2d=arrays["points2d"][own2d],
-            points3d=arrays["points3d"][own3d],
-            match3d=arrays["match3d"][own3d],
-            assigned3d=arrays["assigned3d"][own3d],
             pose=_split(truth) if np.isfinite(truth).all() else None,
             estimates={key.removeprefix(prefix): _split(a[i]) for key, a in arrays.items() if key.startswith(prefix)},
             error=float(arrays["error"][i]),
-            ids2d=arrays["ids2d"][own2d],
-            ids3d=arrays["ids3d"][own3d],
+            **{key: parts[i] for key, parts in points.items()},
         )
-
-
-def _joined(parts: Sequence[Array], kind: type, *width: int) -> Array:
-    return np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
 
 
 def _stacked(poses: Sequence[tuple[Array, Array] | None]) -> Array:
@@ -221,17 +215,14 @@ def _first_errors(prediction: Prediction, batch: Batch) -> list[float]:
 
 def _kept(m: int, match: Array, most: int) -> tuple[Array, Array]:
     """Indices of the 2D and 3D points that are kept, ascending."""
-    matched = match >= 0
-    keep3d = _first_then_rest(np.flatnonzero(matched), np.flatnonzero(~matched), most)
-    partners = np.unique(match[keep3d][match[keep3d] >= 0])
-    rest = np.setdiff1d(np.arange(m), partners)
-    return _first_then_rest(partners, rest, most), keep3d
+    keep3d = _first_then_rest(match >= 0, most)
+    return _first_then_rest(np.isin(np.arange(m), match[keep3d]), most), keep3d
 
 
-def _first_then_rest(first: Array, rest: Array, most: int) -> Array:
-    """All of `first` and then of `rest`, each thinned evenly where there is no room; ascending."""
-    head = _thinned(first, most)
-    return np.sort(np.r_[head, _thinned(rest, most - len(head))]).astype(np.int64)
+def _first_then_rest(first: Array, most: int) -> Array:
+    """Indices where `first` holds and then of the rest, each thinned evenly where there is no room; ascending."""
+    head = _thinned(np.flatnonzero(first), most)
+    return np.sort(np.r_[head, _thinned(np.flatnonzero(~first), most - len(head))]).astype(np.int64)
 
 
 def _thinned(values: Array, most: int) -> Array:

@@ -2,11 +2,11 @@ import json
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from report_data import write_run
 
 from bpnp.report.dashboards import log_results, mode, scalars
+from bpnp.report.page.charts import recall_chart
 
 
 @pytest.fixture(autouse=True)
@@ -39,11 +39,10 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     pairs = table("pairs_")
     column = pairs["columns"].index("rotation_error_deg")
     assert [row[column] for row in pairs["data"]] == [row.rotation_error_deg for row in results.rows]  # type: ignore[index]
-    curve = table("recall_curve/rotation_error_deg")["data"]
-    for estimate in ("ransac", "pnp"):
-        errors = np.array([row.rotation_error_deg for row in results.rows if row.estimate == estimate])
-        drawn = [(row[0], row[2]) for row in curve if row[1] == estimate]  # type: ignore[index]
-        assert [share for _, share in drawn] == pytest.approx([(errors <= limit).mean() for limit, _ in drawn])
+    (path,) = (media / "plotly" / "test" / "recall_curve").glob("rotation_deg*.json")
+    chart = recall_chart({"test": results}, "rotation_deg")
+    assert chart is not None
+    assert json.loads(path.read_text())["data"] == json.loads(chart.to_json())["data"]
     assert len(list((media / "images" / "test").glob("worst_pairs_*.png"))) == 2
     assert len(list((media / "images" / "test").glob("recall_*.png"))) == 1
     log = next(run.glob("*.wandb"))

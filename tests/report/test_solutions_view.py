@@ -1,7 +1,6 @@
 """Views of solutions: of the object, and of the file; and photos under the points, undistorted."""
 
 import json
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,65 +10,77 @@ from PIL import Image
 from planted_model import HEIGHT, WIDTH, plant_model
 from report_data import inflated, view, write_run
 
+from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.datamodules.colmap.photos import photo_finder
 from bpnp.report import plot_pair, write_page
+from bpnp.report.figures import plot_scene
 from bpnp.report.photos import Box, box_of
+from bpnp.report.pictures import plot_image, plot_residuals
 from bpnp.report.samples import write_views
-from bpnp.report.solutions import read_solution, solution_view
+from bpnp.report.solutions import solution_view, view_of
+from bpnp.solving.solution import Solution, SolutionStats
 
 
-@dataclass
-class Solved:
-    points2d: np.ndarray
-    points3d: np.ndarray
-    rotation: np.ndarray
-    translation: np.ndarray
-    matches: np.ndarray
-    verdict: str = "safe"
-    inlier_ratio: float = 0.5
-
-
-def solved() -> Solved:
+def solved(camera: Any = None) -> Solution:
+    """Exact; of 12 points two are matched."""
     planted = view(3, "x", 12)
     assert planted.pose is not None
-    return Solved(planted.points2d, planted.points3d, *planted.pose, np.array([[3, 3], [5, 5]]))
+    return Solution(
+        rotation=planted.pose[0], translation=planted.pose[1], matches=np.array([[3, 3], [5, 5]]), inlier_count=2,
+        inlier_ratio=0.5, reprojection_error=0.0, unit="px", verdict="ambiguous", reason="few", camera=camera,
+        stats=SolutionStats(), points2d=planted.points2d.astype(float), points3d=planted.points3d.astype(float),
+    )  # fmt: skip
 
 
-def test_a_solution_is_drawn_with_its_matches_on_its_points() -> None:
-    figure = plot_pair(solved())
-    assert figure.get_suptitle() == "solution: safe, 50 % inliers"
-    lines = figure.axes[1].lines
-    drawn = [line.get_xydata() for line in lines if len(line.get_xydata()) == 2]
-    assert len(drawn) == 2  # one a match, from the image point to the reprojected 3D point
-    assert all(np.allclose(a, b, atol=1e-5) for a, b in drawn)
+def test_a_solution_is_drawn_with_its_matches_in_pixels_of_its_camera() -> None:
+    camera = camera_from(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
+    for own, unit in ((None, "normalised coordinates"), (camera, "pixels")):
+        solution = solved(own)
+        figure = plot_pair(solution)
+        assert figure.get_suptitle() == "ambiguous: 2 matches (50 %), mean error 0 px\nfew"
+        axes = figure.axes[1]
+        assert axes.get_xlabel() == axes.get_ylabel() == unit
+        (segments,) = axes.collections  # one a match, from the image point to the reprojected 3D point
+        ends = np.stack(segments.get_segments())
+        seen = solution.points2d if own is None else own.project(np.c_[solution.points2d, np.ones(12)])
+        np.testing.assert_allclose(ends, np.repeat(seen[[3, 5], None], 2, 1), atol=1e-3)
 
 
-def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(tmp_path: Path) -> None:
-    content = {name: np.asarray(value).tolist() for name, value in vars(solved()).items()}
+def test_the_parts_of_a_picture_are_drawn_into_given_axes() -> None:
+    from matplotlib.figure import Figure
+
+    own = solution_view(solved())
+    image, close_up = Figure().subplots(1, 2)
+    space = Figure().add_subplot(projection="3d")
+    assert (plot_image(image, own), plot_residuals(close_up, own), plot_scene(space, own)) == (image, close_up, space)
+    assert np.abs(np.asarray(close_up.get_lines()[0].get_xydata())).max() < 1e-6
+    assert len(space.collections[0].get_offsets()) == 12
+    lost = view_of(own.points2d, own.points3d, np.full((3, 3), np.nan), np.full(3, np.nan))
+    assert not plot_residuals(Figure().subplots(), lost).axison
+
+
+def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "castle.json"
-    path.write_text(json.dumps(content))
+    path.write_text(solved().to_json())
     main(["view", str(path)])
     assert (tmp_path / "views" / "castle.png").stat().st_size > 5000
-    assert solution_view(Solved(**(vars(solved()) | {"rotation": None}))).estimates["solution"][0].shape == (3, 3)
-    for change, message in (
-        ({"points2d": [[1, 2, 3]]}, r"castle.json: expected `points2d` of shape \(k, 2\), got \(1, 3\)"),
-        ({"translation": ["x", 1, 2]}, "castle.json: expected numbers in `translation`"),
-        ({"matches": [[0, 99]]}, "castle.json: expected `matches` of 12 2D and 12 3D points"),
-        ({"points3d": []}, "castle.json: expected `points3d` of shape"),
-    ):
-        path.write_text(json.dumps(content | change))
-        with pytest.raises(ValueError, match=message):
-            read_solution(path)
+    (tmp_path / "pictures").mkdir()
+    content = json.loads(path.read_text())
     for text, message in (
-        ("", "JSON of a solution"),
-        ("[]", "no points2d"),
-        ('{"images": []}', "its pictures are in"),
-        ('{"rotation": 1}', "no points2d"),
+        ("", "expected the JSON of a solution in"),
+        ('{"images": []}', "the pictures of `bpnp localize` are in"),
+        (json.dumps(content | {"points2d": [[1, 2, 3]]}), "expected the JSON of a solution in"),
+        (json.dumps(content | {"matches": [[0, 99]]}), "expected `matches` of 12 2D and 12 3D points"),
     ):
         path.write_text(text)
-        with pytest.raises(ValueError, match=message):
-            read_solution(path)
+        with pytest.raises(SystemExit):
+            main(["view", str(path)])
+        shown = " ".join(capsys.readouterr().err.split())
+        assert message in shown
+        assert "castle.json" in shown
 
 
 def photographed(folder: Path, shrink: int = 1) -> Any:

@@ -17,9 +17,10 @@ from bpnp.report.training_log import TrainingLog
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
+Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
 POINTS = 200  # of a curve
 GROUPS = 16  # of pairs of similar size
-RECALLS = {
+RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
     "translation": ("Translation", "translation error, scene units", 10.0),
     "joint": ("Rotation and translation", "rotation error, degrees, of pairs within 0.5 scene units", 90.0),
@@ -32,16 +33,20 @@ TRAINING = {
     "Validation: correspondence loss": (("val/correspondence_loss",), False),
     "Validation: median rotation error, degrees": (("val/rotation_q2_deg",), True),
 }
-Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
 
 
-def sorted_errors(results: Results, estimate: str, key: str, joint_translation: float = JOINT_TRANSLATION) -> Array:
+def sorted_errors(results: Results, estimate: str, key: str) -> Array:
     """Errors of the pairs that have one, ascending; in the joint curve a pair that is too far away never counts."""
     errors = results.errors(estimate)
     if key == "joint":
-        return np.sort(errors.rotation_deg.where(errors.translation <= joint_translation, np.inf).numpy())
+        return np.sort(errors.rotation_deg.where(errors.translation <= JOINT_TRANSLATION, np.inf).numpy())
     values = getattr(errors, key).numpy()
     return np.sort(values[~np.isnan(values)])
+
+
+def within(errors: Array, limits: Array) -> Array:
+    """Share of ascending errors up to each limit."""
+    return np.searchsorted(errors, limits, side="right") / max(len(errors), 1)
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
@@ -56,8 +61,7 @@ def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
     figure = _figure(title, unit, "pairs up to this error", runs, log=True)
     figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
     for key, errors in known.items():
-        shares = np.searchsorted(errors, limits, side="right") / max(len(errors), 1)
-        _line(figure, runs, key, limits, shares, "%{y:.1%}")
+        _line(figure, runs, key, limits, within(errors, limits), "%{y:.1%}")
     return figure
 
 
@@ -93,9 +97,7 @@ def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
     figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
     for run, values in times.items():
         key = (run, next(iter(runs[run].estimates)))
-        _line(
-            figure, runs, key, limits, np.searchsorted(values, limits, side="right") / len(values), "%{y:.1%}", name=run
-        )
+        _line(figure, runs, key, limits, within(values, limits), "%{y:.1%}", name=run)
     return figure
 
 
@@ -149,7 +151,7 @@ def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) ->
     if not runs:
         return {"training": training_charts(logs)}
     sections: dict[str, Sequence[Figure | None]] = {
-        "recall": [recall_chart(runs, error) for error in ("rotation_deg", "translation", "joint", "reprojection_deg")],
+        "recall": [recall_chart(runs, error) for error in RECALLS],
         "errors": [error_chart(runs, size) for size in SIZES],
         "time": [time_chart(runs), total_time_chart(runs)],
         "training": training_charts(logs),
