@@ -66,37 +66,39 @@ def search_poses(
     candidates. Raises ValueError for `clutter` out of range.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
-    start, rule, few = time.monotonic(), settings.evidence, Candidates.none()
+    start, rule, few = time.monotonic(), settings.evidence, no_pose("no pose was found")
 
     @cache
     def entered() -> Scene:
         return Scene(sets, seed, settings, deadline)
 
     if is_few(sets) and not deadline.passed():
-        few, exhausted = search_few(sets, deadline, settings)
-        result = judged(few, sets, batches=0, exhaustive=True, rule=rule)
-        result = _against_repetitions(result, sets, entered, rule, exhaustive=True)
+        found, exhausted = search_few(sets, deadline, settings)
+        few = judged(found, sets, batches=0, exhaustive=True, rule=rule)
+        few = _against_repetitions(few, sets, entered, rule, exhaustive=True)
         if progress is not None:
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        if exhausted or small or result.log10_false_alarms <= rule.false_alarms:
-            return result
+        if exhausted or small or few.log10_false_alarms <= 0:
+            return few
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
     scene = entered()
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
-    candidates, turned = few, Candidates.none()  # turned: the likeliest ones of different rotations
-    if len(few):
-        rotation, translation = scene.enter(few.rotation, few.translation)
-        candidates = replace(few, rotation=rotation, translation=translation)
+    candidates = turned = Candidates.none()  # turned: the likeliest ones of different rotations
+    if len(few.candidates):
+        rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
+        candidates = replace(few.candidates, rotation=rotation, translation=translation)
     batches, best = 0, -math.inf
     searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
 
     def finished(poses: Candidates, annealed: int) -> SearchResult:
         poses = finish(scene, poses, annealed) if len(poses) else poses
         result = judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
+        if few.log10_false_alarms < result.log10_false_alarms:
+            return replace(few, batches=batches)
         return _against_repetitions(result, sets, entered, rule)
 
     def certain(leaders: Candidates) -> SearchResult | None:

@@ -46,6 +46,24 @@ def test_four_points_prove_nothing() -> None:
     assert min(evidence(*planted(rng, 4, 2e-3), 1e-3) for _ in range(20)) > -1
 
 
+@pytest.mark.parametrize("width", [0.002, 0.006])
+def test_clumps_that_meet_are_no_more_evidence_than_their_middles(width: float) -> None:
+    """Six clumps of eight points, in the image and in the scene, meet under a pose. The points within them are others,
+    or the same ones, seen with less noise than the clumps are wide."""
+    rng, clumps, alone = np.random.default_rng(0), [], []
+    for _ in range(20):
+        rotation = Rotation.random(random_state=rng).as_matrix()
+        middles = rng.uniform(-1, 1, (6, 3))
+        points = middles.repeat(8, 0) + 6 * width * rng.standard_normal((48, 3))
+        rays = rays_of(middles @ rotation.T + SHIFT)
+        others = rays_of(rays.repeat(8, 0) + width * rng.standard_normal(points.shape))
+        own = rays_of(rays_of(points @ rotation.T + SHIFT) + width / 20 * rng.standard_normal(points.shape))
+        clumps.append(evidence(others, points, rotation))
+        alone.append(evidence(rays, middles, rotation))
+        assert evidence(own, points, rotation) < -30
+    assert np.median(clumps) > np.median(alone)
+
+
 @pytest.mark.parametrize("count", [5, 20, 200])
 def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
     """A pose that was not chosen by the points has a product above b in at most one of b cases."""

@@ -62,6 +62,19 @@ def test_a_device_among_background_lights(with_normals: bool) -> None:
     assert right == 10
 
 
+def test_the_likeliest_pose_stands_where_chance_explains_every_one() -> None:
+    """Five LEDs of 17 among ten lights: no more than chance, and still the pose under which the fewest would fit."""
+    right = 0
+    for seed in range(6, 14):
+        rng = np.random.default_rng(seed)
+        points, normals = device(rng, 17)
+        image, rotation, _, led = frame(rng, points, normals, background=10)
+        hidden = np.flatnonzero(led >= 0)[5:]
+        solution = solve(np.delete(image, hidden, 0), points, CAMERA, normals3d=normals)
+        right += degrees(solution.rotation, rotation) < 3
+    assert right >= 7
+
+
 def test_a_device_that_looks_the_same_from_two_sides_is_ambiguous() -> None:
     """A half turn about z maps the points onto themselves: both poses are candidates."""
     rng = np.random.default_rng(1)

@@ -117,8 +117,9 @@ def _log_evidence(sets: PointSets, seen: Array) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), the largest x_i left out, at each of S scales, of points seen in
     directions (n, 3)."""
     logs = point_evidence(sets, seen, sets.image.scales, SHARES)
-    fixing = np.partition(logs, len(logs) - FIXING, 0)[-FIXING:]
-    evidence = (logs / sets.image.together[:, :, None]).sum(0) - np.maximum(fixing, 0).sum(0)
+    terms = sets.image.weights @ logs
+    fixing = np.partition(terms * sets.image.together[:, :, None], len(logs) - FIXING, 0)[-FIXING:]
+    evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
     return np.asarray(np.logaddexp.reduce(evidence, 1)) - math.log(evidence.size)
 
 

@@ -1,4 +1,4 @@
-"""What depends on the image points alone and not on a pose: their view, their scales, and how many lie together."""
+"""What depends on the image points alone and not on a pose: their view, their scales, and which lie together."""
 
 import math
 
@@ -13,6 +13,7 @@ SCALE_STEP = 2.0  # from one scale of the residuals to the next
 COARSEST = 0.5  # largest scale, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
 FLOOR = 2e-4  # smallest scale in spreads of the bearings: some hundredths of a pixel of an ordinary camera
 TOGETHER = 2.0  # distance in scales below which image points are one observation
+CROWDED = 2.0  # standard deviations by which the points around one exceed those of an even spread before it is a clump
 MOST_NEIGHBOURS = 64  # that are looked up around one point
 MOST_POINTS = 2000  # image points that are looked at, evenly spread over the given ones
 
@@ -24,7 +25,7 @@ class ImageStatistics:
     plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
     most 4 pi.
     scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
-    chosen: (k,) places of the image points that are looked at. together: (k, S) how many lie within `TOGETHER` scales.
+    chosen: (k,) places of the image points that are looked at. weights: (k, S, S), see `_weights`.
     """
 
     def __init__(self, bearings: Array, floor: float | None) -> None:
@@ -43,6 +44,25 @@ class ImageStatistics:
         self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
         crowd = nearest(bearings, bearings[self.chosen], TOGETHER * largest)
         self.together = (crowd[:, None] <= TOGETHER * self.scales[:, None]).sum(-1)
+        expected = 1 + (m - 1) * math.pi * (TOGETHER * self.scales) ** 2 / self.solid_angle
+        self.weights = _weights(self.together, expected)
+
+
+def _weights(together: NDArray[np.int64], expected: Array) -> Array:
+    """(k, S, S): weight of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
+
+    log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with 1 / c_i(s), and
+    with 1 / c_i(s_r) if that is less, where c_i(s) is the number of image points within 2 s of i, if it is more than an
+    even spread explains: over their expected number. So the place of a clump of points is one observation, and where
+    each of them lies within it one each.
+
+    together: (k, S) image points within TOGETHER scales of each. expected: (S,) of them, spread evenly over the view.
+    """
+    clump = together > expected + CROWDED * np.sqrt(expected)
+    crowded = np.where(clump, together / expected, 1.0)
+    steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
+    steps[:, :, 1:] -= steps[:, :, :-1]
+    return np.asarray(steps)
 
 
 def nearest(directions: Array, bearings: Array, radius: float) -> Array:
