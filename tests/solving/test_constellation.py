@@ -71,7 +71,7 @@ def test_the_likeliest_pose_stands_where_chance_explains_every_one() -> None:
         image, rotation, _, led = frame(rng, points, normals, background=10)
         hidden = np.flatnonzero(led >= 0)[5:]
         solution = solve(np.delete(image, hidden, 0), points, CAMERA, normals3d=normals)
-        right += degrees(solution.rotation, rotation) < 3
+        right += degrees_between(solution.rotation, rotation) < 3
     assert right >= 7
 
 
