@@ -1,17 +1,14 @@
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
 from planted import padded, plant
 from scipy.spatial.transform import Rotation
-from small_data import small_net
 from torch import Tensor
 
-from bpnp import Batch, BPnPNet
-from bpnp.models import Matcher, TrainedNet
+from bpnp import Batch
+from bpnp.models import Matcher
 from bpnp.models.nets.attention import Attention, Neighbourhood
-from bpnp.models.weights import described
 from bpnp.training.losses import matching_likelihood_loss
 
 
@@ -123,19 +120,3 @@ def test_says_what_is_wrong_with_its_options() -> None:
         Attention(30, 4)
     with pytest.raises(ValueError, match=r"expected `mu` > 0, got 0"):
         Matcher(mu=0.0)
-
-
-def test_comes_back_from_its_checkpoint_and_only_as_what_it_is(tmp_path: Path) -> None:
-    net, batch = small().float(), cluttered(9).to(torch.float32)
-    net.frame = "view"
-    for name, solver in (("matcher", net), ("other", small_net(8, 1))):
-        state = {f"solver.{key}": value for key, value in solver.state_dict().items()}
-        torch.save({"solver": described(solver), "state_dict": state}, tmp_path / f"{name}.ckpt")
-    expected = net.match(batch).assignment
-    for cls in (Matcher, TrainedNet):
-        again = cls.from_checkpoint(tmp_path / "matcher.ckpt")
-        torch.testing.assert_close(again.match(batch).assignment, expected)
-        assert again.frame == "view"
-    assert isinstance(TrainedNet.from_checkpoint(tmp_path / "other.ckpt"), BPnPNet)
-    with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
-        Matcher.from_checkpoint(tmp_path / "other.ckpt")

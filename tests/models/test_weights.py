@@ -59,6 +59,17 @@ def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
         assert torch.equal(again.match(pair()).assignment, net.eval().match(pair()).assignment)
 
 
+def test_a_network_comes_back_as_what_it_is(tmp_path: Path) -> None:
+    net = Matcher(channels=16, depth=1, heads=2, frame="view").eval()
+    file, other = save(net, tmp_path / "matcher.ckpt"), save(small_net(8, 1), tmp_path / "other.ckpt")
+    again = TrainedNet.from_checkpoint(file)
+    assert isinstance(again, Matcher)
+    assert again.frame == "view"
+    torch.testing.assert_close(again.match(pair()).assignment, net.match(pair()).assignment)
+    with pytest.raises(ValueError, match=r"expected a checkpoint of Matcher, got BPnPNet in .*other.ckpt"):
+        Matcher.from_checkpoint(other)
+
+
 def test_a_part_of_the_users_comes_back_only_if_the_user_names_its_class(tmp_path: Path) -> None:
     net = BPnPNet(Flat(2), Flat(3, channels=4), Sinkhorn(mu=0.3)).eval()
     file = save(net, tmp_path / "net.ckpt")
