@@ -5,8 +5,6 @@ leaves S b = y - P^T (x / P1) with S = diag(P^T 1) - P^T diag(1 / P1) P, the Lap
 `solve_multipliers` are those of the gradient (`bpnp.layers.implicit.entropic_plan`).
 """
 
-from typing import NamedTuple
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -25,12 +23,8 @@ ROUNDING = 1e-12  # of sums in float64, relative
 SHARP = 16.0  # mass per sum of the degrees, beyond which float32 loses the gradient's fifth digit
 
 
-class Solution(NamedTuple):
-    """b with S b = rhs, weighted mean zero; P b / rows; and which samples met their tolerance."""
-
-    b: Float[Tensor, "b n"]
-    mean: Float[Tensor, "b m"]
-    solved: Bool[Tensor, " b"]
+# b with S b = rhs, weighted mean zero; P b / rows; and which samples met their tolerance
+Solution = tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]
 
 
 def solve_laplacian(
@@ -52,15 +46,16 @@ def solve_laplacian(
     shift = _mean(x, cols)
     b, mean = torch.where(cols > 0, x - shift, 0), torch.where(rows > 0, mean - shift, 0)
     if rhs.dtype != torch.float64 or bool(solved.all()):
-        return Solution(b, mean, solved)
+        return b, mean, solved
     hard = (~solved).nonzero().squeeze(-1)
     exact = _factorised(plan.samples(hard).formed(), rows[hard], cols[hard], rhs[hard])
-    return Solution(*(old.index_copy(0, hard, new) for old, new in zip((b, mean, solved), exact, strict=True)))
+    b, mean, solved = (old.index_copy(0, hard, new) for old, new in zip((b, mean, solved), exact, strict=True))
+    return b, mean, solved
 
 
 def conjugate_gradients(
     plan: Plan, rows: Tensor, cols: Tensor, degree: Tensor, rhs: Tensor, tolerance: Float[Tensor, " b"], limit: int
-) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b m"], Bool[Tensor, " b"]]:
+) -> Solution:
     """x with S x = rhs, P x / rows, and which samples met the tolerance; each keeps the x at which it did."""
     inverse, unit, per_row = (divide(torch.ones_like(x), x) for x in (degree, cols, rows))
     x, mean, r = torch.zeros_like(rhs), torch.zeros_like(rows), rhs
@@ -107,7 +102,7 @@ def _factorised(plan: Float[Tensor, "b m n"], rows: Tensor, cols: Tensor, rhs: T
         left = rhs - torch.where(cols > 0, transpose_times(system, b) - ridge * b, 0)
     b = torch.where(cols > 0, b - _mean(b, cols), 0)
     solved = torch.linalg.vecdot(unit * left, left) <= FACTORISED**2 * torch.linalg.vecdot(unit * rhs, rhs)
-    return Solution(b, per_row * times(plan, b), solved)
+    return b, per_row * times(plan, b), solved
 
 
 def _mean(b: Float[Tensor, "b n"], cols: Float[Tensor, "b n"]) -> Float[Tensor, "b 1"]:

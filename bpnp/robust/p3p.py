@@ -47,7 +47,9 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
     """
     rays = bearings.double().movedim((-2, -1), (0, 1)).contiguous()
     points = points3d.double().movedim((-2, -1), (0, 1)).contiguous()
-    order = _apex_first(points)
+    # Cyclic order of the points that puts the longest side between the last two.
+    apex = _sides2(points).argmax(0) + 2
+    order = torch.stack([(apex + i) % 3 for i in range(3)]).unsqueeze(1).expand(points.shape)
     rays, points = rays.gather(0, order), points.gather(0, order)
     rays = rays * rays.square().sum(1, keepdim=True).rsqrt()
     lengths2, chords2 = _sides2(points), _sides2(rays)
@@ -89,12 +91,6 @@ def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b 
 def _sides2(points: Tensor) -> Tensor:
     """|p_0 - p_1|^2, |p_1 - p_2|^2, |p_2 - p_0|^2."""
     return (points - points.roll(-1, 0)).square().sum(1)
-
-
-def _apex_first(points: Tensor) -> Tensor:
-    """Cyclic order of the points that puts the longest side between the last two, as an index for gather."""
-    apex = _sides2(points).argmax(0) + 2
-    return torch.stack([(apex + i) % 3 for i in range(3)]).unsqueeze(1).expand(points.shape)
 
 
 def _frame(points: Tensor) -> Tensor:

@@ -27,7 +27,6 @@ from bpnp.models.evaluation import (
     refinement_enabled,
     round_widths,
 )
-from bpnp.types import Prediction
 
 MU = 0.1
 

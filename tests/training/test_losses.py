@@ -23,7 +23,6 @@ from bpnp.training.losses import (
     reprojection_loss,
 )
 from bpnp.training.task import BlindPnPTask
-from bpnp.types import Prediction
 
 
 def random_assignment(planted: Planted, *, seed: int = 0) -> Tensor:

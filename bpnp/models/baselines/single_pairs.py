@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor, nn
 
+from bpnp.checks import check_positive
 from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -46,14 +47,18 @@ class PairSolver(nn.Module):
 
     def __init__(self, time_limit: float | None) -> None:
         super().__init__()
-        if time_limit is not None and not time_limit > 0:
-            raise ValueError(f"expected `time_limit` > 0 seconds, got {time_limit}; try 30, or none for no limit")
+        check_positive(time_limit=math.inf if time_limit is None else time_limit)
         self.time_limit = time_limit
 
     def forward(self, batch: Batch) -> Prediction:
         # The trainer's inference mode would forbid a local optimiser's gradients.
         with torch.inference_mode(False), torch.no_grad():
-            answers = [self._solve(pair) for pair in _pairs(batch)]
+            answers = [
+                self.solve(pair, Deadline.after(self.time_limit))
+                if min(len(pair.points2d), len(pair.points3d)) >= MIN_POINTS
+                else Answer()
+                for pair in _pairs(batch)
+            ]
             like = batch.points3d
             missing = like.new_full((3, 3), math.nan), like.new_full((3,), math.nan)
             poses = zip(*(missing if answer.pose is None else answer.pose for answer in answers), strict=True)
@@ -64,11 +69,6 @@ class PairSolver(nn.Module):
     def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
         """The pose of one pair, found before the deadline."""
         raise NotImplementedError
-
-    def _solve(self, pair: SinglePair) -> Answer:
-        if min(len(pair.points2d), len(pair.points3d)) < MIN_POINTS:
-            return Answer()
-        return self.solve(pair, Deadline.after(self.time_limit))
 
 
 def pair_seed(seed: int, index: int) -> int:

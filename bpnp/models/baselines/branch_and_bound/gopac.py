@@ -109,7 +109,11 @@ def best_rotation(
     def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
         nonlocal count, rotation
         children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
-        reached, reachable = _counts(rays, directions, reach, children)
+        cosine = (rays @ children.rotation) @ directions.mT  # (b, m, n)
+        widened = (reach + rotation_uncertainty(children).unsqueeze(-1)).clamp_max(math.pi)
+        # Rays within reach under the rotation at each box's centre, and a bound for all rotations of the box.
+        reached = (cosine >= reach.cos() - ROUNDING).any(-1).sum(-1)
+        reachable = (cosine >= (widened.cos() - ROUNDING).unsqueeze(1)).any(-1).sum(-1).to(rays)
         i = int(reached.argmax())
         if int(reached[i]) > count:
             count, rotation = int(reached[i]), children.rotation[i]
@@ -121,15 +125,6 @@ def best_rotation(
         until=lambda _: deadline.passed() or (first and rotation is not None),
     )  # fmt: skip
     return Found(rotation, place, count, max(count, left), boxes, count >= left)
-
-
-def _counts(rays: Tensor, directions: Tensor, reach: Tensor, boxes: Boxes) -> tuple[Tensor, Tensor]:
-    """Rays within reach under the rotation at each box's centre, and a bound for all rotations of the box."""
-    cosine = (rays @ boxes.rotation) @ directions.mT  # (b, m, n)
-    exact = cosine >= (reach.cos() - ROUNDING)
-    widened = (reach + rotation_uncertainty(boxes).unsqueeze(-1)).clamp_max(math.pi).cos() - ROUNDING
-    possible = cosine >= widened.unsqueeze(1)
-    return exact.any(-1).sum(-1).to(rays), possible.any(-1).sum(-1).to(rays)
 
 
 def count_inliers(
