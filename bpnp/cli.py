@@ -3,6 +3,7 @@
 import difflib
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
@@ -105,7 +106,7 @@ def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
 def _quieten() -> None:
     """Third-party advice that does not apply here."""
     advice = logging.getLogger("lightning.pytorch.utilities.rank_zero")
-    advice.addFilter(lambda record: "Tip:" not in record.getMessage())
+    advice.addFilter(lambda record: not re.search("Tip:|weights_only", record.getMessage()))
     for part in ("does not have many workers", "Using `DistributedSampler` with the dataloaders", "LeafSpec",
                  "logs directory .* exists and is not empty", "smaller than the logging interval"):  # fmt: skip
         warnings.filterwarnings("ignore", message=f".*{part}.*")

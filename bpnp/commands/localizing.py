@@ -76,7 +76,7 @@ def _localize_photos(
         PhotoOptions,
         attempts,
         finished_solutions,
-        keep,
+        kept,
         photo_files,
         photos_table,
         write_poses,
@@ -101,11 +101,10 @@ def _localize_photos(
         try:
             for name, found in (attempts if cluster is None else _attempts_on(cluster))(scene, left, options):
                 shown.update(task, description=f"localized {name}", advance=1)
-                if isinstance(found, str):
-                    errors[name] = found
-                else:
-                    keep(output, name, files[name], found, picture=pictures)
-                    done[name] = found
+                try:
+                    done[name] = kept(output, name, files[name], found, picture=pictures)
+                except (ValueError, OSError) as error:
+                    errors[name] = str(error)
         finally:
             write_poses(output, done)
     if done:

@@ -73,21 +73,22 @@ class BpnpCLI(LightningCLI):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A CSV log always, whatever else the configuration logs to, all in the run's folder; a progress bar unless it
-        is not wanted."""
+        """A CSV log always, beside what the configuration logs to, all in the run's folder; a progress bar unless it is
+        not wanted."""
         if self._get(self.config, "trainer.enable_progress_bar") is False:
             self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         plugins = self._get(self.config_init, "trainer.plugins") or []
         own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
-        trainer = super().instantiate_trainer(**{"plugins": own} | kwargs)
-        for logger in trainer.loggers:
+        chosen = self._get(self.config_init, "trainer.logger")
+        loggers = chosen if isinstance(chosen, list) else [] if chosen in (None, True, False) else [chosen]
+        root = self._get(self.config_init, "trainer.default_root_dir")
+        for logger in loggers:
             if isinstance(logger, OfflineWandbLogger):
-                logger.keep_in(trainer.default_root_dir)
-        wanted = self._get(self.config, "trainer.logger") is not False
-        if wanted and not any(isinstance(logger, CSVLogger) for logger in trainer.loggers):
-            trainer.loggers = [*trainer.loggers, CSVLogger(trainer.default_root_dir, name="logs")]
-        return trainer
+                logger.keep_in(root)
+        if chosen is not False and not any(isinstance(logger, CSVLogger) for logger in loggers):
+            loggers = [*loggers, CSVLogger(root, name="logs")]
+        return super().instantiate_trainer(**{"plugins": own, "logger": loggers} | kwargs)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
         """Our own tables instead of a list of all metrics, and no assignments kept in memory."""

@@ -99,17 +99,23 @@ def finished_solutions(folder: Path, names: Iterable[str]) -> dict[str, Solution
     for name in names:
         try:
             done[name] = Solution.from_json(_solution_file(folder, name))
-        except (ValueError, FileNotFoundError):
+        except (ValueError, OSError):
             continue
     return done
 
 
-def keep(folder: Path, name: str, photo: Path, solution: Solution, *, picture: bool) -> None:
-    """Write solutions/<name>.json and, if wanted, pictures/<name>.png: the matches over the photo."""
+def kept(folder: Path, name: str, photo: Path, solution: Solution | str, *, picture: bool) -> Solution:
+    """Write solutions/<name>.json and, if wanted, pictures/<name>.png: the matches over the photo.
+
+    Raises ValueError with the reason if there is no solution.
+    """
+    if isinstance(solution, str):
+        raise ValueError(solution)
     if picture:
         figure = solution_picture(solution, title=f"{name}: {solution.view}", photo=read_photo(photo))
         save_figure(figure, folder / "pictures" / f"{_safe(name)}.png")
     write_text(_solution_file(folder, name), solution.to_json() + "\n")
+    return solution
 
 
 def write_poses(folder: Path, solutions: Mapping[str, Solution]) -> None:

@@ -1,5 +1,6 @@
 """What a trainer is given beside the task: schedules, compiled nets, and checkpoints read as data."""
 
+import io
 import math
 import signal
 from collections.abc import Iterator
@@ -7,12 +8,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from torch import nn
 
+from bpnp.files import written_whole
 from bpnp.models.weights import read_checkpoint
 
 
@@ -84,7 +87,13 @@ class LearningRateSchedule(Callback):
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
-    """Checkpoints read as data only, with one clear error for a file that is none."""
+    """Checkpoints written whole or not at all, and read as data only, with one clear error for a file that is none."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        with written_whole(Path(path)) as temporary:
+            temporary.write_bytes(content.getbuffer())
 
     def load_checkpoint(
         self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None

@@ -175,6 +175,7 @@ def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
               f"--trainer.default_root_dir={tmp_path}/run", "--data.val_fraction=0.3"]  # fmt: skip
     main(["fit", *common, "--trainer.max_epochs=1"])
     assert {p.name for p in (tmp_path / "run" / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
+    assert {p.name for p in (tmp_path / "run").iterdir()} == {"checkpoints", "logs"}
     logs = list((tmp_path / "run").rglob("metrics.csv"))
     assert "val/rotation_q2_deg" in logs[0].read_text().splitlines()[0]
     main(["test", *common, "--ckpt_path=last"])

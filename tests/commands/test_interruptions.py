@@ -1,9 +1,11 @@
 """Ctrl-C, and checkpoints that are not there: no work is lost in silence."""
 
+import errno
 from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from lightning.pytorch import Callback
 from small_data import SMALL_MESHES, SMALL_NET
 
@@ -12,6 +14,7 @@ from bpnp.cli import main
 from bpnp.models.weights import read_checkpoint
 from bpnp.report import read_results
 from bpnp.report.samples import read_views
+from bpnp.training.callbacks import SafeCheckpointIO
 
 MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 
@@ -64,6 +67,21 @@ def test_a_checkpoint_that_was_cut_short_is_named(tmp_path: Path, share: float) 
     cut.write_bytes(whole[: int(share * len(whole))])
     with pytest.raises(ValueError, match=r"expected a checkpoint of `bpnp fit`, got a file that cannot be read: .*cut"):
         read_checkpoint(cut)
+
+
+def test_a_full_disk_leaves_the_checkpoint_before_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path, disk = tmp_path / "last.ckpt", SafeCheckpointIO()
+    disk.save_checkpoint({"state_dict": {"step": torch.tensor(1)}}, path)
+
+    def full(self: Path, content: bytes) -> None:
+        self.open("wb").write(content[:100])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(OSError, match="No space left on device: .*last.ckpt"):
+        disk.save_checkpoint({"state_dict": {"step": torch.tensor(2)}}, path)
+    assert disk.load_checkpoint(path)["state_dict"]["step"] == 1
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_last_checkpoint_that_is_not_there_is_no_new_training(

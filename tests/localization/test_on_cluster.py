@@ -95,9 +95,15 @@ def test_the_command_goes_on_where_it_was(
     main([*command, "--output", str(output), "--no_pictures", "--cluster", cluster.scheduler_address])
     names, poses = _poses(output)
     assert len(names) == PHOTOS
-    (output / "solutions" / "new3.png.json").unlink()
+    lost = output / "solutions" / "new3.png.json"
+    lost.unlink()
     (output / "poses.txt").unlink()
     times = {file: file.stat().st_mtime_ns for file in (output / "solutions").iterdir()}
+    lost.mkdir()  # so that the solution cannot be written
+    with pytest.raises(SystemExit):
+        main([*command, "--output", str(output), "--no_pictures"])
+    assert _poses(output)[0] == [name for name in names if name != "new3.png"]
+    lost.rmdir()
     main([*command, "--output", str(output), "--no_pictures"])
     again = _poses(output)
     assert again[0] == names
