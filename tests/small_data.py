@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lightning import Trainer
-from torch import nn
+import torch
+from lightning import LightningModule, Trainer
+from torch import Tensor, nn, optim
 
 from bpnp import BPnPNet
 from bpnp.datamodules.meshes.procedural import procedural_shape
@@ -13,6 +14,7 @@ from bpnp.datamodules.meshes.surfaces import Mesh
 from bpnp.layers import RansacPnP
 from bpnp.models import Refinement
 from bpnp.models.nets import ImageFeatures, SceneFeatures
+from bpnp.types import Batch
 
 SMALL_NET = ["--model.solver=bpnp.models.BPnPNet"] + [
     f"--model.solver.features{side}.{size}" for side in ("2d", "3d") for size in ("channels=16", "depth=2")
@@ -57,6 +59,34 @@ def quiet_trainer(folder: Path, **settings: Any) -> Trainer:
     """A trainer on the CPU that prints nothing and, unless told to, writes nothing."""
     off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps")
     return Trainer(**dict.fromkeys(off, False) | {"default_root_dir": folder, "accelerator": "cpu"} | settings)
+
+
+class Recorder(LightningModule):
+    """Keeps the batches that it is trained on; its loss is that of one weight."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.ones(()))
+        self.batches: list[Batch] = []
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        self.batches.append(batch)
+        return self.weight**2
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        raise AssertionError("there is nothing to validate on")
+
+    def configure_optimizers(self) -> optim.Optimizer:
+        return optim.SGD(self.parameters(), lr=0.1)
+
+
+def recorded(data: object, *, checkpoint: Path | None = None, **options: object) -> list[Batch]:
+    """The batches that a Trainer on the CPU trains on."""
+    quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_checkpointing", "enable_model_summary"), False)
+    recorder = Recorder()
+    trainer = Trainer(accelerator="cpu", **(quiet | options))  # type: ignore[arg-type]
+    trainer.fit(recorder, data, ckpt_path=checkpoint)  # type: ignore[arg-type]
+    return recorder.batches
 
 
 def write_mesh_tree(root: Path, *, train: int = 3, test: int = 2) -> Path:

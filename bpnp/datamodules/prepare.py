@@ -19,15 +19,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import track
 
-from bpnp.datamodules.store import (
-    MANIFEST,
-    Store,
-    StoreError,
-    is_store,
-    new_store,
-    open_store,
-    read_manifest,
-)
+from bpnp.datamodules.store import MANIFEST, Store, StoreError, is_store, new_store, open_store, read_manifest
 from bpnp.files import cache_folder, claimed, fingerprint
 
 
@@ -187,11 +179,5 @@ def _interrupts_later() -> Iterator[None]:
 
 def _end_with_parent() -> None:
     """End this worker when its parent is killed; it would wait for work for ever."""
-
-    def watch() -> None:
-        parent = multiprocessing.parent_process()
-        if parent is not None:
-            wait([parent.sentinel])
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
+    if parent := multiprocessing.parent_process():
+        threading.Thread(target=lambda: wait([parent.sentinel]) and os._exit(1), daemon=True).start()

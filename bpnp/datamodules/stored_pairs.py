@@ -20,22 +20,17 @@ WIDTHS = {"points2d": 2, "points3d": 3}
 
 
 def write_pairs(
-    folder: Path,
-    pairs: Iterable[tuple[str, Pair]],
-    *,
-    parameters: Mapping[str, Any] | None = None,
-    skipped: Mapping[str, str] | None = None,
+    folder: Path, pairs: Iterable[tuple[str, Pair]], *, parameters: Mapping[str, Any] | None = None
 ) -> None:
     """Write (scene, pair) after (scene, pair) into the new store `folder`; complete or not there at all.
 
-    parameters: kept in the manifest, must be JSON. skipped: what could not be used, and why.
+    parameters: kept in the manifest, must be JSON.
     Raises StoreError if the folder exists.
     """
     with new_store(folder, PAIRS, WIDTHS) as writer:
         for scene, pair in pairs:
             add_pair(writer, scene, pair)
         writer.parameters |= parameters or {}
-        writer.skipped |= skipped or {}
 
 
 def add_pair(writer: StoreWriter, scene: str, pair: Pair) -> None:

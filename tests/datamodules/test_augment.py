@@ -1,16 +1,13 @@
 """Augmentation: counts, bounds and distributions of the protocol; true pairs stay true; no leak between pairs."""
 
-from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from jsonargparse import ArgumentParser
 from scipy import stats
 
-from bpnp.datamodules import MeshDataModule
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
 from bpnp.datamodules.pair import Counts, Pair, stacked
@@ -133,14 +130,6 @@ def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     assert not torch.allclose(*(turned.rotation.mT @ straight.rotation))
 
 
-def test_turns_are_uniform() -> None:
-    """The angle of a uniform rotation has the distribution function (a - sin a) / pi."""
-    batch = raw(*[planted(4)] * 1000)
-    turns = augmented(batch, rotate=True).rotation.mT @ batch.rotation
-    angles = np.arccos(np.clip((np.trace(turns.numpy(), axis1=1, axis2=2) - 1) / 2, -1, 1))
-    assert stats.kstest(angles, lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
-
-
 HARD: dict[str, Any] = {
     "max_points": 30, "clutter": 0.3, "rotate": True,
     "outliers": Outliers(ratio=(0.0, 1.0), side="random", occlusion=(0.0, 0.4), occluded_side="random"),
@@ -209,13 +198,3 @@ def test_a_side_that_there_is_not_is_named(valid: Any, name: str) -> None:
     object.__setattr__(valid, name, "2D")  # past the type checks of the tests, which users do not have
     with pytest.raises(ValueError, match=f'`{name}` "both", "2d".* got \'2D\''):
         valid.__post_init__()
-
-
-def test_ranges_come_from_yaml(tmp_path: Path) -> None:
-    (tmp_path / "data.yaml").write_text("train_outliers: {ratio: [0, 1], side: random, occlusion: [0.1, 0.3]}\n")
-    parser = ArgumentParser()
-    parser.add_class_arguments(MeshDataModule, "data")
-    options = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'data.yaml'}"]))
-    assert options.data.outliers["train"] == Outliers((0.0, 1.0), "random", (0.1, 0.3))
-    options = parser.instantiate_classes(parser.parse_args(["--data.train_outliers={ratio: 0.5}"]))
-    assert options.data.outliers["train"] == Outliers(0.5)

@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from lightning import LightningModule, Trainer
 from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
+from small_data import recorded
 
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.module import ColmapDataModule
@@ -202,35 +202,7 @@ def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:
         data.setup(TrainerFn.FITTING)
 
 
-class OneWeight(LightningModule):
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.ones(()))
-
-    def training_step(self, batch: Batch, index: int) -> torch.Tensor:
-        return self.weight * batch.points2d.square().mean()
-
-    def validation_step(self, batch: Batch, index: int) -> None:
-        raise AssertionError("there is nothing to validate on")
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
 def test_training_does_without_validation_scenes(tmp_path: Path) -> None:
     plant_scenes(tmp_path, 2)
     data = ColmapDataModule(str(tmp_path), val_fraction=0.0)
-    trainer = Trainer(
-        max_steps=1, accelerator="cpu", logger=False, enable_checkpointing=False, enable_progress_bar=False
-    )
-    trainer.fit(OneWeight(), data)
-    assert trainer.global_step == 1
-
-
-def test_every_image_of_real_scenes_is_served_once(shared_data: Path) -> None:
-    scenes = ["castle-P30", "sceaux_castle_txt"]
-    data = ColmapDataModule(str(shared_data / "colmap"), test_scenes=scenes, train_scenes=[], eval_max_points=50)
-    data.setup("test")
-    batches = list(data.test_dataloader())
-    assert sorted(len(batch) for batch in batches) == [7, 16, 16]
-    assert len({name for batch in batches for name in batch.ids}) == 39
+    assert len(recorded(data, max_steps=1)) == 1

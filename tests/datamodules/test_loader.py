@@ -4,11 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-import lightning
 import numpy as np
 import pytest
 import torch
+from lightning import LightningDataModule
 from lightning.pytorch.callbacks import ModelCheckpoint
+from small_data import recorded
 from torch.utils.data import DataLoader, SequentialSampler
 
 from bpnp.datamodules.loader import BucketSampler, PairDataset, PairLoader, pair_loader
@@ -37,11 +38,6 @@ class Numbered:
         n = int(self.sizes[index])
         points2d, points3d = rng.random((n, 2), dtype=np.float32), np.full((n, 3), epoch, np.float32)
         return Pair(str(index), points2d, points3d, n, np.eye(3), np.ones(3), 800.0)
-
-
-def keys_of(batch: Batch) -> tuple[str, ...]:
-    """ "epoch:index" of each pair."""
-    return tuple(f"{int(points[0, 0])}:{name}" for points, name in zip(batch.points3d, batch.ids, strict=True))
 
 
 def dataset(sizes: Sequence[int]) -> PairDataset:
@@ -171,45 +167,18 @@ def test_errors_name_what_is_wrong() -> None:
         next(iter(PairLoader(pairs, sampler=SequentialSampler(pairs), batch_size=None)))
 
 
-class Recorder(lightning.LightningModule):
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = torch.nn.Linear(2, 1)
-        self.seen: list[tuple[str, ...]] = []
-
-    def training_step(self, batch, _) -> torch.Tensor:
-        self.seen.append(keys_of(batch))
-        return self.layer(batch.points2d).mean()
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), 0.1)
-
-
-class Pairs(lightning.LightningDataModule):
-    def __init__(self, workers: int) -> None:
-        super().__init__()
-        self.workers = workers
-
-    def train_dataloader(self) -> DataLoader:
-        return pair_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=self.workers)
-
-
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.filterwarnings("ignore")
 def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers: int) -> None:
+    class Pairs(LightningDataModule):
+        def train_dataloader(self) -> DataLoader:
+            return pair_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=workers)
+
     def fit(*callbacks: ModelCheckpoint, checkpoint: Path | None = None) -> list[tuple[str, ...]]:
-        module = Recorder()
-        trainer = lightning.Trainer(
-            max_epochs=2,
-            accelerator="cpu",
-            logger=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            enable_checkpointing=bool(callbacks),
-            callbacks=list(callbacks),
-        )
-        trainer.fit(module, Pairs(workers), ckpt_path=checkpoint)
-        return module.seen
+        """ "epoch:index" of each pair of each batch."""
+        options = {"max_epochs": 2, "enable_checkpointing": bool(callbacks), "callbacks": list(callbacks)}
+        batches = recorded(Pairs(), checkpoint=checkpoint, **options)
+        return [tuple(f"{int(p[0, 0])}:{i}" for p, i in zip(b.points3d, b.ids, strict=True)) for b in batches]
 
     whole = fit(ModelCheckpoint(tmp_path, filename="{step}", save_top_k=-1, every_n_train_steps=1))
     expected = sampler(random_sizes(14), batch_size=4, shuffle=True)

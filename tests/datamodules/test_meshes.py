@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from lightning import LightningModule, Trainer
 from scipy import stats
 from scipy.spatial.transform import Rotation
+from small_data import recorded
 
 from bpnp.datamodules.augment import Augmentation, Outliers
 from bpnp.datamodules.loader import PairDataset, PairKeys
@@ -178,29 +178,11 @@ def test_a_bad_mesh_is_left_out_and_a_changed_one_read_again(folder: Path, tmp_p
     assert "box1/test/box1_0099#0" in source.names(range(len(data.datasets["test"])))
 
 
-class Recorder(LightningModule):
-    def __init__(self) -> None:
-        super().__init__()
-        self.weight = torch.nn.Parameter(torch.zeros(()))
-        self.batches: list[Batch] = []
-
-    def training_step(self, batch: Batch, batch_idx: int) -> torch.Tensor:
-        self.batches.append(batch)
-        return self.weight**2
-
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        return torch.optim.SGD(self.parameters(), lr=0.1)
-
-
 def train(folder: Path, **options: object) -> list[Batch]:
     """The batches of two epochs."""
     outliers = Outliers(ratio=(0.0, 1.0), side="random")
     data = module(folder, train_pairs=12, batch_size=4, fresh_views=True, train_outliers=outliers, **options)
-    recorder = Recorder()
-    flags = dict.fromkeys(("logger", "enable_progress_bar", "enable_checkpointing", "enable_model_summary"), False)
-    trainer = Trainer(default_root_dir=folder, max_epochs=2, accelerator="cpu", limit_val_batches=0, **flags)
-    trainer.fit(recorder, data)
-    return recorder.batches
+    return recorded(data, default_root_dir=folder, max_epochs=2, limit_val_batches=0)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -235,31 +217,3 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         hold_out(10, 1.0, seed=0)
     with pytest.raises(ValueError, match="at least 2 training rows"):
         hold_out(1, 0.1, seed=0)
-
-
-def test_procedural_batches(tmp_path: Path) -> None:
-    data = module(tmp_path, batch_size=4, eval_batch_size=2)
-    data.setup()
-    batch = next(iter(data.train_dataloader()))
-    assert batch.points2d.shape == (4, 32, 2)
-    assert batch.mask2d.all()
-    assert batch.points3d.norm(dim=-1).max() <= 1 + 1e-6
-    seen = torch.cat([some.index for some in data.test_dataloader()])
-    assert sorted(seen.tolist()) == [0, 1, 2]
-    assert [len(some) for some in data.val_dataloader()] == [2]
-
-
-def test_psb(shared_data: Path, tmp_path: Path) -> None:
-    """Real CAD meshes: all of six classes are read, and the noise of their pairs is the one asked for."""
-    root = tmp_path / "psb"
-    root.mkdir()
-    for name in ("aircraft", "blade", "city", "door", "hat", "watch"):
-        (root / name).symlink_to(shared_data / "psb" / name)
-    data = module(tmp_path, root, num_points=1000, pool_size=1000, eval_batch_size=8)
-    data.setup("test")
-    assert len(data.datasets["test"]) == len(list(root.glob("*/test/*.off")))
-    for batch in data.test_dataloader():
-        camera = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
-        matched = torch.take_along_dim(batch.points2d, batch.match3d[..., None], 1)
-        residual = (matched - camera[..., :2] / camera[..., 2:]) * batch.focal[:, None, None]
-        assert residual.std().item() == pytest.approx(2, rel=0.03)

@@ -66,9 +66,7 @@ def _read(path: Path) -> Pixels:
 
 
 def _resampled(
-    photo: Pixels,
-    project: Callable[[NDArray[np.float64]], NDArray[np.float64]],
-    box: tuple[float, float, float, float],
+    photo: Pixels, project: Callable[[NDArray[np.float64]], NDArray[np.float64]], box: tuple[float, float, float, float]
 ) -> Pixels:
     left, top, right, bottom = box
     height = int(np.clip(round(WIDTH * (bottom - top) / (right - left)), 16, 2 * WIDTH))
@@ -78,4 +76,4 @@ def _resampled(
     size = np.array(photo.shape[1::-1])
     column, row = (project(rays) * size - 0.5).T  # COLMAP's origin is the corner of the first pixel
     channels = [map_coordinates(photo[..., c], [row, column], order=1, cval=0) for c in range(3)]
-    return np.stack(channels, -1).reshape(height, WIDTH, 3).astype(np.uint8)
+    return np.stack(channels, -1).reshape(height, WIDTH, 3)

@@ -129,11 +129,7 @@ def camera_of(record: CameraRecord | None, where: str) -> Camera:
 
 
 def _image_points(
-    record: ImageRecord,
-    camera: Camera,
-    ids: NDArray[np.int64],
-    points3d: NDArray[np.float64],
-    lost: Counter[str],
+    record: ImageRecord, camera: Camera, ids: NDArray[np.int64], points3d: NDArray[np.float64], lost: Counter[str]
 ) -> ImagePoints:
     rotation = Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix()
     undistorted = camera.normalise(record.keypoints)

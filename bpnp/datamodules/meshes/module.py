@@ -7,12 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.meshes.prepare import open_surfaces, split_rows
+from bpnp.datamodules.meshes.prepare import open_surfaces
 from bpnp.datamodules.meshes.procedural import ProceduralShapes
-from bpnp.datamodules.meshes.source import MeshSource, Views, hold_out
+from bpnp.datamodules.meshes.source import POINTS, MeshSource, Views, hold_out
 from bpnp.datamodules.meshes.surfaces import Normalisation
 from bpnp.datamodules.module import STAGES, PairDataModule
-from bpnp.datamodules.store import Store
+from bpnp.datamodules.store import Store, StoreError
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 
@@ -123,8 +123,18 @@ class MeshDataModule(PairDataModule):
         )
 
     def _rows(self, store: Store, split: str, root: Path) -> NDArray[np.int64]:
-        """The meshes of a split."""
-        rows = split_rows(store, "test" if split == "test" else "train", root=root, pool_size=self.pool_size)
+        """The meshes of a split. StoreError if there are none, or fewer samples of each than `pool_size`."""
+        folder = "test" if split == "test" else "train"
+        rows = np.array([row for row in range(len(store)) if store.name(row).split("/")[-2] == folder])
+        if not len(rows):
+            raise StoreError(
+                f"expected meshes <class>/{{train,test}}/* in {root}, got none for {folder!r}; try another `root`"
+            )
+        if self.pool_size > (kept := int(store.counts(POINTS)[0])):
+            raise StoreError(
+                f"expected `pool_size` of at most {kept}, the samples in {store.folder}, got {self.pool_size}; try "
+                f"that, or preparing again with --points {self.pool_size}"
+            )
         if split == "test":
             return rows
         training, held_out = hold_out(len(rows), self.val_fraction, seed=self.seed)

@@ -4,7 +4,6 @@ from collections import Counter
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bpnp.datamodules.meshes.archives import MeshFiles, open_archive
 from bpnp.datamodules.meshes.procedural import ProceduralShapes
@@ -78,18 +77,3 @@ def open_surfaces(
         return store
     recipe = surfaces_recipe(archive, points=points, normalisation=normalisation, label=label)
     return cached(recipe, label, cache_dir)
-
-
-def split_rows(store: Store, split: str, *, root: Path | None, pool_size: int) -> NDArray[np.int64]:
-    """The meshes of a split. StoreError if there are none, or fewer samples of each than `pool_size`."""
-    rows = [row for row in range(len(store)) if store.name(row).split("/")[-2] == split]
-    if not rows:
-        raise StoreError(
-            f"expected meshes <class>/{{train,test}}/* in {root}, got none for {split!r}; try another `root`"
-        )
-    if pool_size > (kept := int(store.counts(POINTS)[0])):
-        raise StoreError(
-            f"expected `pool_size` of at most {kept}, the samples in {store.folder}, got {pool_size}; try that, or "
-            f"preparing again with --points {pool_size}"
-        )
-    return np.array(rows)

@@ -13,14 +13,7 @@ from bpnp.datamodules.augment import Drawn, bounds
 from bpnp.datamodules.pair import Pair
 from bpnp.datamodules.synthetic_maps.buildings import facades, from_the_air, several_buildings
 from bpnp.datamodules.synthetic_maps.objects import statue, table_top
-from bpnp.datamodules.synthetic_maps.photos import (
-    Camera,
-    camera_at,
-    details,
-    image_shape,
-    look,
-    nearby_camera,
-)
+from bpnp.datamodules.synthetic_maps.photos import Camera, camera_at, details, image_shape, look, nearby_camera
 from bpnp.datamodules.synthetic_maps.scene import Array, Kind, Scene, Viewpoint
 from bpnp.datamodules.synthetic_maps.surrounded import courtyard, interior, street
 

@@ -6,16 +6,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.synthetic_maps.buildings import TELE
-from bpnp.datamodules.synthetic_maps.scene import (
-    Array,
-    Blobs,
-    Scene,
-    Surface,
-    Viewpoint,
-    assembled,
-    directions,
-    joined,
-)
+from bpnp.datamodules.synthetic_maps.scene import Array, Blobs, Scene, Surface, Viewpoint, assembled, directions, joined
 from bpnp.datamodules.synthetic_maps.surroundings import ground_points, horizon_points, tree_points
 from bpnp.datamodules.synthetic_maps.walls import box_walls, wall_points
 
