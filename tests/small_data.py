@@ -11,6 +11,7 @@ from torch import Tensor, nn, optim
 from bpnp import BPnPNet
 from bpnp.datamodules.meshes.procedural import procedural_shape
 from bpnp.datamodules.meshes.surfaces import Mesh
+from bpnp.geometry import project, transform
 from bpnp.layers import RansacPnP
 from bpnp.models import Refinement
 from bpnp.models.nets import ImageFeatures, SceneFeatures
@@ -59,6 +60,20 @@ def quiet_trainer(folder: Path, **settings: Any) -> Trainer:
     """A trainer on the CPU that prints nothing and, unless told to, writes nothing."""
     off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps")
     return Trainer(**dict.fromkeys(off, False) | {"default_root_dir": folder, "accelerator": "cpu"} | settings)
+
+
+def check_pairs(batch: Batch, tolerance: float = 2e-6) -> None:
+    """True pairs project onto their 2D points, no 2D point twice, and nothing is beyond the masks."""
+    assert batch.match3d is not None
+    true = batch.match3d >= 0
+    seen = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
+    shown = project(transform(batch.rotation.double(), batch.translation.double(), batch.points3d.double())).float()
+    torch.testing.assert_close(shown[true], seen[true], rtol=0, atol=tolerance)
+    for match, own in zip(batch.match3d, true, strict=True):
+        assert len(match[own].unique()) == own.sum()
+    assert (batch.mask3d | ~true).all()
+    assert (batch.points3d[~batch.mask3d] == 0).all()
+    assert (batch.points2d[~batch.mask2d] == 0).all()
 
 
 class Recorder(LightningModule):

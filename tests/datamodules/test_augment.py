@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 from scipy import stats
+from small_data import check_pairs
 
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
 from bpnp.datamodules.pair import Counts, Pair, stacked
-from bpnp.geometry import project, transform
+from bpnp.geometry import transform
 from bpnp.types import Batch
 
 FIELDS = ("points2d", "points3d", "mask2d", "mask3d", "match3d", "rotation", "translation", "origin")
@@ -40,19 +41,6 @@ def true_pairs(batch: Batch) -> torch.Tensor:
     return (batch.match3d >= 0).sum(-1)
 
 
-def check(batch: Batch) -> None:
-    """True pairs project onto their 2D points, no 2D point twice, nothing beyond the masks."""
-    true = batch.match3d >= 0
-    seen = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
-    shown = project(transform(batch.rotation, batch.translation, batch.points3d.double())).float()
-    torch.testing.assert_close(shown[true], seen[true], rtol=0, atol=2e-6)
-    for match, own in zip(batch.match3d, true, strict=True):
-        assert len(match[own].unique()) == own.sum()
-    assert (batch.mask3d | ~true).all()
-    assert (batch.points3d[~batch.mask3d] == 0).all()
-    assert (batch.points2d[~batch.mask2d] == 0).all()
-
-
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.5])
 @pytest.mark.parametrize("side", ["both", "2d", "3d"])
 def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
@@ -62,7 +50,7 @@ def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
     assert int(result.count2d) == 60 + added * (side != "3d")
     assert int(result.count3d) == 60 + added * (side != "2d")
     assert int(true_pairs(result)) == 60
-    check(result)
+    check_pairs(result)
     assert result.points2d[0].amin(0).tolist() == pair.points2d.min(0).tolist()
     assert result.points3d[0].amax(0).tolist() == pair.points3d.max(0).tolist()
 
@@ -85,7 +73,7 @@ def test_occlusion_leaves_points_without_a_partner(side: str, left2d: int, left3
     result = augmented(batch, outliers=Outliers(occlusion=0.25, occluded_side=side))
     assert (int(result.count2d[0]), int(result.count3d[0])) == (left2d, left3d)
     assert true_pairs(result).tolist() == [45, 4]
-    check(result)
+    check_pairs(result)
     assert true_pairs(augmented(batch, outliers=Outliers(occlusion=0.9))).tolist() == [6, 4]
 
 
@@ -97,7 +85,7 @@ def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str,
     batch = raw(planted(40, free2d=12, free3d=30))
     result = augmented(batch, max_points=20, clutter=clutter, clutter_side=side)
     assert (int(true_pairs(result)), int(result.count2d), int(result.count3d)) == (20, 20 + extra2d, 20 + extra3d)
-    check(result)
+    check_pairs(result)
     assert int((result.points2d > 50).all(-1).sum()) == extra2d
     assert int((result.points3d > 50).all(-1).sum()) == extra3d
     assert len(result.points3d[0].unique(dim=0)) == 20 + extra3d
@@ -120,7 +108,7 @@ def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     batch = raw(planted(), planted(seed=1))
     batch.origin = torch.tensor([[5e5, -3e6, 40.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     straight, turned = augmented(batch), augmented(batch, rotate=True)
-    check(turned)
+    check_pairs(turned)
     for before, after in ((straight, turned),):
         camera = (transform(b.rotation, b.translation, b.points3d.double()) for b in (before, after))
         torch.testing.assert_close(*camera, rtol=0, atol=1e-5)
@@ -139,7 +127,7 @@ HARD: dict[str, Any] = {
 def test_a_pair_depends_on_its_key_alone_not_on_neighbours_or_padding() -> None:
     pairs = [planted(n, free2d=n // 2, free3d=9, seed=n) for n in (8, 60, 25)]
     together = augmented(raw(*pairs), 1, 2, **HARD)
-    check(together)
+    check_pairs(together)
     for row, pair in enumerate(pairs):
         alone = augment(stacked([pair], torch.tensor([row])), Augmentation(**HARD), row_keys(torch.tensor([row]), 1, 2))
         for name in FIELDS:

@@ -1,5 +1,3 @@
-import subprocess
-import sys
 import warnings
 from pathlib import Path
 from typing import Any
@@ -9,12 +7,11 @@ import pytest
 import torch
 from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
-from small_data import recorded
+from small_data import check_pairs, recorded
 
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.module import ColmapDataModule
 from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
-from bpnp.types import Batch
 
 
 def test_models_are_found_in_every_layout(tmp_path: Path) -> None:
@@ -97,18 +94,6 @@ def plant_scenes(root: Path, count: int = 5) -> None:
         plant_model(root / f"s{i}" / "sparse" / "0", images=4, seen=20 + 5 * i, seed=i)
 
 
-def check_batch(batch: Batch) -> None:
-    """True pairs project onto their keypoints; the masks cover the points and no padding."""
-    assert batch.rotation is not None
-    assert batch.match3d is not None
-    points = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
-    true = batch.match3d >= 0
-    expected = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
-    assert ((points[..., :2] / points[..., 2:] - expected)[true]).abs().max() < 1e-5
-    assert (batch.mask3d | ~true).all()
-    assert (batch.points3d[~batch.mask3d] == 0).all()
-
-
 def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
     plant_scenes(tmp_path)
     data = ColmapDataModule(str(tmp_path), max_points=22, clutter=0.2, rotate=True, batch_size=3)
@@ -117,7 +102,7 @@ def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
     for part in ("train", "val", "test", "predict"):
         ids = []
         for batch in getattr(data, f"{part}_dataloader")():
-            check_batch(batch)
+            check_pairs(batch, 1e-5)
             ids += batch.ids
         served[part] = {name.split("/")[0] for name in ids}
         assert len(ids) == len(set(ids)) == 4 * len(served[part])
@@ -149,14 +134,6 @@ def test_wrong_options_are_named_for_models_and_stores_alike(options: dict[str, 
     for root in ("models", "store"):
         with pytest.raises(ValueError, match=message):
             ColmapDataModule(root, **options)
-
-
-def test_a_side_of_clutter_that_there_is_not_is_named() -> None:
-    """In a process of its own, where no test checks types."""
-    script = "from bpnp.datamodules import ColmapDataModule; ColmapDataModule('scenes', clutter_side='2D')"
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
-    assert result.returncode == 1
-    assert """expected `clutter_side` "both", "2d" or "3d", got '2D'""" in result.stderr
 
 
 def test_only_training_draws_anew(tmp_path: Path) -> None:

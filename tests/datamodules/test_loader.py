@@ -132,17 +132,6 @@ def test_max_cells_bounds_padding_and_buckets_waste_little() -> None:
     assert training < 0.25 * (16 * shuffled.max(1).astype(float) ** 2).sum()
 
 
-def test_workers_change_nothing() -> None:
-    source = dataset(random_sizes(20))
-    loaders = [pair_loader(source, batch_size=4, shuffle=True, seed=1, num_workers=w) for w in (0, 1)]
-    state = torch.get_rng_state()
-    for one, other in zip(*loaders, strict=True):
-        assert one.ids == other.ids
-        assert torch.equal(one.points2d, other.points2d)
-        assert torch.equal(one.match3d, other.match3d)
-    assert torch.equal(state, torch.get_rng_state())
-
-
 def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
     source = dataset(random_sizes(20))
     whole = [batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)]

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from scipy import stats
 from scipy.spatial.transform import Rotation
-from small_data import recorded
+from small_data import check_pairs, recorded
 
 from bpnp.datamodules.augment import Augmentation, Outliers
 from bpnp.datamodules.loader import PairDataset, PairKeys
@@ -121,9 +121,7 @@ def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     assert torch.equal(true.sum(-1), (depth > 0.1).sum(-1))
     assert torch.equal(batch.count2d, true.sum(-1) + (0.2 * true.sum(-1)).long())
     assert torch.equal(batch.count3d, 300 + (0.2 * true.sum(-1)).long())
-    seen = batch.points2d.gather(1, batch.match3d.clamp(min=0)[..., None].expand(-1, -1, 2))
-    camera = batch.points3d @ batch.rotation.mT + batch.translation[:, None]
-    torch.testing.assert_close((camera[..., :2] / camera[..., 2:])[true], seen[true], rtol=1e-4, atol=1e-4)
+    check_pairs(batch, 1e-4)
     blind = Views(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
     with pytest.warns(UserWarning, match="reach 1"):
         pairs = source(tmp_path, blind, num_points=4, pool_size=4, num_pairs=1)

@@ -18,6 +18,7 @@ import pytest
 import torch
 import trimesh
 from planted_model import plant_model
+from small_data import check_pairs
 
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
@@ -62,6 +63,11 @@ def run(source: Path, output: Path, **changes: object) -> Prepared:
 
 def opened(folder: Path) -> Store:
     return open_store(folder, SURFACES)
+
+
+def check_same_bytes(store: Path, expected: Path) -> None:
+    for path in expected.iterdir():
+        assert (store / path.name).read_bytes() == path.read_bytes()
 
 
 def names(store: Store) -> list[str]:
@@ -119,8 +125,7 @@ def test_several_processes_give_the_same_bytes(meshes: Path, tmp_path: Path, mon
     run(meshes, tmp_path / "one")
     monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 3)
     run(meshes, tmp_path / "two", processes=2)
-    for path in (tmp_path / "one").iterdir():
-        assert (tmp_path / "two" / path.name).read_bytes() == path.read_bytes()
+    check_same_bytes(tmp_path / "two", tmp_path / "one")
 
 
 def hdf5(folder: Path) -> dict[str, np.ndarray]:
@@ -245,8 +250,7 @@ def test_no_kill_leaves_a_wrong_store(
         ended += killed(work, rng.uniform(0, 1.2 * duration))
         if not (tmp_path / "store").exists():
             continue
-        for path in (tmp_path / "whole").iterdir():
-            assert (tmp_path / "store" / path.name).read_bytes() == path.read_bytes()
+        check_same_bytes(tmp_path / "store", tmp_path / "whole")
         shutil.rmtree(tmp_path / "store")
     assert ended < 24
     work()
@@ -294,8 +298,7 @@ def test_parts_of_another_preparation_are_not_used(
             run(meshes, tmp_path / "store", normalisation="none")
     assert len([path for path in (tmp_path / ".store.unfinished").iterdir() if path.is_dir()]) == 4
     run(meshes, tmp_path / "store")
-    for path in (tmp_path / "whole").iterdir():
-        assert (tmp_path / "store" / path.name).read_bytes() == path.read_bytes()
+    check_same_bytes(tmp_path / "store", tmp_path / "whole")
 
 
 def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -357,14 +360,12 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
         torch.testing.assert_close(stored, anew)
     stored = batches[1]
     assert sorted((stored.match3d >= 0).sum(-1).tolist()) == [31, 31, 31, 32, 32, 32]
-    for i in range(6):
-        true = stored.match3d[i] >= 0
-        camera = stored.points3d[i, true] @ stored.rotation[i].mT + stored.translation[i]
-        seen = stored.points2d[i, stored.match3d[i, true]]
-        torch.testing.assert_close(camera[:, :2] / camera[:, 2:], seen, rtol=0, atol=2e-5)
+    check_pairs(stored, 2e-5)
     assert set(open_store(tmp_path / "store", "pairs").skipped) == {"0003", "0000"}
     with pytest.raises(StoreError, match="clutter.*0.5.*--clutter 0.6"):
         ColmapDataModule(str(tmp_path / "store"), **(options | {"clutter": 0.6})).setup("test")
+    with pytest.raises(ValueError, match="nothing.txt"):
+        ColmapDataModule(str(tmp_path / "store"), val_scenes=str(tmp_path / "nothing.txt"))
 
 
 def test_what_was_not_used_of_a_model_is_listed_and_not_logged(
@@ -381,24 +382,6 @@ def test_what_was_not_used_of_a_model_is_listed_and_not_logged(
     assert caplog.text == ""
 
 
-def test_outliers_reach_the_batches_of_a_store(tmp_path: Path) -> None:
-    scenes(tmp_path / "scenes", 4)
-    prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=4, clutter=0.0, processes=1)
-    module = ColmapDataModule(
-        str(tmp_path / "store"),
-        max_points=20,
-        batch_size=2,
-        train_outliers=Outliers(ratio=1.0, side="3d"),
-        test_outliers=Outliers(occlusion=0.5),
-    )
-    module.setup()
-    train, test = next(iter(module.train_dataloader())), next(iter(module.test_dataloader()))
-    assert (train.points2d.shape[1], train.points3d.shape[1]) == (20, 40)
-    assert (test.count2d < test.count3d).all()
-    with pytest.raises(ValueError, match="nothing.txt"):
-        ColmapDataModule(str(tmp_path / "store"), val_scenes=str(tmp_path / "nothing.txt"))
-
-
 def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     scenes(tmp_path / "scenes", 1)
     with pytest.raises(StoreError, match="at least one usable image.*min_points"):
@@ -412,20 +395,19 @@ def test_what_is_left_of_removed_parts_is_not_used(
     """A kill while the parts are removed, after the store has got its name."""
     run(meshes, tmp_path / "whole")
     monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
+
+    def remove_one_file_and_stop(folder: Path, *, ignore_errors: bool = False) -> None:
+        if folder.name == ".store.unfinished":
+            next(folder.glob("*/points.npy")).unlink()
+            raise KeyboardInterrupt
+
     with monkeypatch.context() as patch:
-        patch.setattr(shutil, "rmtree", _remove_one_file_and_stop)
+        patch.setattr(shutil, "rmtree", remove_one_file_and_stop)
         with pytest.raises(KeyboardInterrupt):
             run(meshes, tmp_path / "store")
     shutil.rmtree(tmp_path / "store")
     run(meshes, tmp_path / "store")
-    for path in (tmp_path / "whole").iterdir():
-        assert (tmp_path / "store" / path.name).read_bytes() == path.read_bytes()
-
-
-def _remove_one_file_and_stop(folder: Path, *, ignore_errors: bool = False) -> None:
-    if folder.name == ".store.unfinished":
-        next(folder.glob("*/points.npy")).unlink()
-        raise KeyboardInterrupt
+    check_same_bytes(tmp_path / "store", tmp_path / "whole")
 
 
 def module(meshes: Path, cache: Path) -> MeshDataModule:

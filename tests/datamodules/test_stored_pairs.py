@@ -101,10 +101,11 @@ def test_small_pairs_are_left_out(store: Store) -> None:
 def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) -> None:
     dataset = PairDataset(StoredPairs(store, np.arange(12), min_points=4), Augmentation(max_points=20, clutter=0.5))
     loader = pair_loader(dataset, batch_size=5, shuffle=False, seed=0, num_workers=num_workers)
-    served = {}
+    served, state = {}, torch.get_rng_state()
     for batch in loader:
         for row, name in enumerate(batch.ids):
             served[name] = batch.points3d[row, batch.mask3d[row]]
+    assert torch.equal(state, torch.get_rng_state())
     assert sorted(served) == sorted(pair.name for _, pair in pairs())
     for i, (_, pair) in enumerate(pairs()):
         assert torch.equal(served[pair.name], pickle.loads(pickle.dumps(dataset)).pair(i).points3d[0])
