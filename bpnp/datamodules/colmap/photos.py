@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 from scipy.ndimage import map_coordinates
 
 from bpnp.datamodules.colmap.reconstruction import read_projections
@@ -39,7 +40,8 @@ def photo_finder(root: Path) -> Callable[[str, tuple[float, float, float, float]
         if path is None or project is None:
             return None
         try:
-            photo = _read(path)
+            with Image.open(path) as file:
+                photo = np.asarray(file.convert("RGB"))
         except (OSError, ValueError) as error:
             logger.warning("photo %s cannot be read: %s", path, error)
             return None
@@ -50,19 +52,8 @@ def photo_finder(root: Path) -> Callable[[str, tuple[float, float, float, float]
 
 def image_file(model: Path, image: str) -> Path | None:
     """The photo of a model's image, if it is where COLMAP's or MegaDepth's layout has it."""
-    for folder in [model, *model.parents][: UP + 1]:
-        for name in FOLDERS:
-            path = folder / name / image
-            if path.is_file():
-                return path
-    return None
-
-
-def _read(path: Path) -> Pixels:
-    from PIL import Image
-
-    with Image.open(path) as photo:
-        return np.asarray(photo.convert("RGB"))
+    paths = (folder / name / image for folder in [model, *model.parents][: UP + 1] for name in FOLDERS)
+    return next((path for path in paths if path.is_file()), None)
 
 
 def _resampled(

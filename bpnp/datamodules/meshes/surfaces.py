@@ -61,7 +61,12 @@ def read_mesh(path: Path) -> Mesh:
 
 def parse_mesh(content: bytes, suffix: str) -> Mesh:
     """The mesh in the bytes of a file with this suffix, as `read_mesh`; the MeshError names no file."""
-    return _parse_off(content) if suffix.lower() == ".off" else _parse_other(content, suffix.lower())
+    if suffix.lower() == ".off":
+        return _parse_off(content)
+    mesh = _load(content, suffix.lower())
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
 
 
 def read_vertices(path: Path) -> NDArray[np.float64]:
@@ -115,13 +120,6 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
         middle, last = polygons[:, 1:-1], polygons[:, 2:]
         fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
     return np.concatenate(fans)
-
-
-def _parse_other(content: bytes, suffix: str) -> Mesh:
-    mesh = _load(content, suffix)
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
-    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
 
 
 def _vertices(content: bytes, suffix: str) -> NDArray[np.float64]:
