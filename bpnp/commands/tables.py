@@ -47,8 +47,10 @@ def table(
         output: folder of the results.
         paper: published rows beneath.
     """
-    from bpnp.table.blocks import blocks_of, lines_of, write_tables
-    from bpnp.table.layout import terminal
+    from bpnp.report.tables.result_tables import CAPTION, fitted
+    from bpnp.report.tables.rows import paper_rows
+    from bpnp.report.tables.written_tables import COLUMNS, note
+    from bpnp.table.blocks import blocks_of, rows_of, write_tables
     from bpnp.table.methods import parse_methods
     from bpnp.table.pairs import read_data
     from bpnp.table.run import run
@@ -73,12 +75,9 @@ def table(
             task = shown.add_task("pairs", total=missing)
             for tested in run(blocks, processes=processes):
                 shown.advance(task, tested)
-        lines = [line for ratio, own in lists for line in lines_of(own, ratio, len(every))]
-    published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else _paper(paper)
-    out.print(terminal(lines, published))
-    for path in write_tables(output, lines, published):
+        rows = [row for ratio, own in lists for row in rows_of(own, ratio, len(every))]
+    published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else paper
+    rows += paper_rows(None if published == "none" else published)
+    out.print(fitted("Pose errors", COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
+    for path in write_tables(output, rows):
         say(f"wrote {path}", to=out)
-
-
-def _paper(wanted: str) -> Paper | None:
-    return next((paper for paper in PAPERS.values() if paper == wanted), None)

@@ -27,7 +27,7 @@ from bpnp.report.palette import VERDICTS
 from bpnp.report.photos import PhotoFinder, picture_box
 from bpnp.report.pictures import solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
-from bpnp.report.tables.result_tables import number
+from bpnp.report.tables.rows import number
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
 from bpnp.types import Batch

@@ -19,7 +19,7 @@ from bpnp.report.figures import save_figure
 from bpnp.report.palette import VERDICTS
 from bpnp.report.pictures import read_photo, solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
-from bpnp.report.tables.result_tables import number
+from bpnp.report.tables.rows import number
 from bpnp.solving.solution import Solution
 
 SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}

@@ -41,6 +41,12 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
     )
 
 
+def labels(runs: Mapping[str, Results]) -> dict[tuple[str, str], str]:
+    """The name of each estimate of each run, with the run's only where there are several."""
+    keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
+    return {key: key[1] if len(runs) == 1 else f"{key[0]}: {key[1]}" for key in keys}
+
+
 def trained_only(paths: Sequence[Path | str]) -> bool:
     """Whether these are folders of trainings of which none has results yet."""
     places = [place for path in paths for place in (Path(path), Path(path) / "test")]

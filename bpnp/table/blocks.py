@@ -7,8 +7,8 @@ from typing import Any
 from bpnp.files import write_text
 from bpnp.report.figures import save_figure
 from bpnp.report.runs import mean_and_spread
-from bpnp.report.tables.published import Paper
-from bpnp.table.layout import Line, as_csv, as_latex, as_markdown
+from bpnp.report.tables.rows import Row
+from bpnp.report.tables.written_tables import as_csv, as_latex, as_markdown
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs, with_outlier_ratio, with_setting
 from bpnp.table.run import Block
@@ -33,32 +33,33 @@ def blocks_of(
     return [Block(method, data, folder / _folder_name(method.label), indices) for method in methods]
 
 
-def lines_of(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Line]:
+def rows_of(blocks: Sequence[Block], rho: float | None, seeds: int) -> list[Row]:
     """The rows of a share: each estimate of each method, its mean and standard deviation where there are several seeds.
 
     blocks: those of all methods for the first seed, then for the next.
     """
     results = [(block, block.summarise()) for block in blocks]
-    lines = []
+    rows = []
     for k in range(len(blocks) // seeds):
         own = results[k :: len(blocks) // seeds]
         block, first = own[0]
+        pairs = {"pairs": sum(len(block.indices) for block, _ in own)}
         for estimate in first.estimates:
             label = f"{block.method.label} {estimate}" if len(first.estimates) > 1 else block.method.label
-            pairs = sum(len(block.indices) for block, _ in own)
             mean, spread = mean_and_spread([each.estimates[estimate] for _, each in own])
-            lines.append(Line(label, pairs, mean, rho))
+            rows.append(Row(label, {**mean, **pairs}, rho=rho))
             if seeds > 1:
-                lines.append(Line(label, pairs, spread, rho, spread_of=seeds))
-    return lines
+                label = f"{label}, standard deviation of {seeds} seeds"
+                rows.append(Row(label, {**spread, **pairs}, seeds=True, rho=rho))
+    return rows
 
 
-def write_tables(folder: Path, lines: Sequence[Line], paper: Paper | None) -> list[Path]:
+def write_tables(folder: Path, rows: Sequence[Row]) -> list[Path]:
     written = []
     for name, write in (("table.csv", as_csv), ("table.md", as_markdown), ("table.tex", as_latex)):
-        written.append(write_text(folder / name, write(lines, paper)))
-    if any(line.rho is not None for line in lines):
-        written.append(save_figure(sweep_figure(lines), folder / "outliers.png"))
+        written.append(write_text(folder / name, write(rows)))
+    if any(row.rho is not None for row in rows):
+        written.append(save_figure(sweep_figure(rows), folder / "outliers.png"))
     return written
 
 

@@ -3,8 +3,9 @@
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from bpnp.report.palette import DASHES, LIGHT
-from bpnp.table.layout import Line
+from bpnp.report.figures import line_style
+from bpnp.report.palette import LIGHT
+from bpnp.report.tables.rows import Row
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -13,28 +14,19 @@ RECALL = "recall_joint_15deg_0.5"
 WORST_DEG = 180.0
 
 
-def sweep_figure(lines: Sequence[Line]) -> "Figure":
-    """A figure of the lines that have an outlier share. Raises ValueError if none has."""
+def sweep_figure(rows: Sequence[Row]) -> "Figure":
+    """A figure of the rows that have an outlier share, without those of spreads."""
     from matplotlib.figure import Figure
 
-    labels = list(dict.fromkeys(line.label for line in lines if line.rho is not None))
-    if not labels:
-        raise ValueError("expected results at several outlier shares, got none; try --rho 0 0.25 0.5 1")
+    known = sorted((row for row in rows if row.rho is not None and not row.seeds), key=lambda row: row.rho or 0.0)
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     errors, recall = figure.subplots(1, 2)
-    for i, label in enumerate(labels):
-        known = [line for line in lines if line.label == label and line.rho is not None and not line.spread_of]
-        chosen = sorted(known, key=lambda line: line.rho or 0.0)
-        shares = [line.rho for line in chosen]
-        style = {"color": LIGHT[i % len(LIGHT)], "marker": "o", "ms": 3.5, "label": label.replace("$", r"\$")}
-        dashes = DASHES[i // len(LIGHT) % len(DASHES)]
-        for axes, values in (
-            (errors, [line.values["rotation_q2_deg"] for line in chosen]),
-            (recall, [100 * line.values[RECALL] for line in chosen]),
-        ):
-            (curve,) = axes.plot(shares, values, **style)
-            if dashes:
-                curve.set_dashes(dashes)
+    for i, label in enumerate(dict.fromkeys(row.label for row in rows if row in known)):
+        chosen = [row for row in known if row.label == label]
+        style = line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": label.replace("$", r"\$")}
+        shares = [row.rho for row in chosen]
+        errors.plot(shares, [row.values["rotation_q2_deg"] for row in chosen], **style)
+        recall.plot(shares, [100 * float(row.values[RECALL]) for row in chosen], **style)
     errors.set(yscale="log", ylabel="median rotation error, degrees", ylim=(None, 1.2 * WORST_DEG))
     recall.set(ylabel="% of pairs within 15 degrees and 0.5", ylim=(0, 101))
     for axes in (errors, recall):

@@ -15,7 +15,8 @@ from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_results, read_views
 from bpnp.report.folder import append_rows, finished_rows
 from bpnp.report.tables.published import PUBLISHED
-from bpnp.table.layout import Line, as_latex, as_markdown
+from bpnp.report.tables.rows import Row, paper_rows
+from bpnp.report.tables.written_tables import as_latex, as_markdown
 from bpnp.table.methods import parse_methods
 from bpnp.table.pairs import TestPairs, read_data
 from bpnp.training.task import BlindPnPTask
@@ -230,10 +231,11 @@ def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
 
 
 def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:
-    line = Line("L_c & 50% | R", 3, {})
-    assert r"L\_c \& 50\% | R" in as_latex([line], None)
-    assert r"L_c & 50% \| R" in as_markdown([line], "megadepth")
-    assert "MegaDepth: another data set" in as_markdown([line], "megadepth")
+    rows = [Row("L_c & 50% | R", {"pairs": 3})]
+    assert r"L\_c \& 50\% | R" in as_latex(rows)
+    rows += paper_rows("megadepth")
+    assert r"L_c & 50% \| R | 3 |" in as_markdown(rows)
+    assert "MegaDepth: another data set" in as_markdown(rows)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from bpnp.report.palette import DARK, LIGHT
 from bpnp.report.photos import box_of
 from bpnp.report.results import CAUSES
 from bpnp.report.samples import thin, write_views
-from bpnp.report.tables.result_tables import number
+from bpnp.report.tables.rows import number
 
 pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
 FLAGS = (

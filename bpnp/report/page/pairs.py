@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.report.palette import styles
 from bpnp.report.results import CAUSES, PairRow, Results
+from bpnp.report.runs import labels
 from bpnp.report.samples import FEW, Array, PairView, spread_key, thin
 
 VIEW_POINTS = 300  # most points a side of a pair
@@ -29,12 +30,6 @@ def compressed(text: str) -> str:
 def shown_id(id: str) -> str:
     """A pair's name with replacements for bytes that are no UTF-8."""
     return id.encode("utf-8", "replace").decode() or "(no name)"
-
-
-def labels(runs: Mapping[str, Results]) -> dict[tuple[str, str], str]:
-    """The name of each estimate of each run, with the run's only where there are several."""
-    keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
-    return {key: key[1] if len(runs) == 1 else f"{key[0]}: {key[1]}" for key in keys}
 
 
 def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:

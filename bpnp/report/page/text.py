@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.report.page.pairs import labels
 from bpnp.report.palette import DASHES, styles
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
-from bpnp.report.runs import seed_groups, with_spread
-from bpnp.report.tables.published import Paper, published_rows
-from bpnp.report.tables.result_tables import RESULT_COLUMNS, best_texts, cell
+from bpnp.report.runs import labels
+from bpnp.report.tables.published import Paper
+from bpnp.report.tables.result_tables import CAPTION
+from bpnp.report.tables.rows import RESULT_COLUMNS, best_texts, cell, run_rows
 
 # Options of the data that change no result.
 LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
@@ -100,31 +100,27 @@ def series_boxes(runs: Mapping[str, Results]) -> str:
 
 def quartiles_html(runs: Mapping[str, Results], paper: Paper | None) -> str:
     """The table of quartiles with the terminal's numbers; the best of each column is bold."""
-    rows = {key: runs[key[0]].estimates[key[1]] for key in labels(runs)}
-    best = best_texts(RESULT_COLUMNS, list(rows.values()))
+    rows = run_rows(runs, paper)
+    best = best_texts(RESULT_COLUMNS, rows)
     head = "".join(
-        f'<th scope="col"><button type="button" class="sort" data-key="{i}">{visible(column.header)}</button></th>'
-        for i, column in enumerate(RESULT_COLUMNS)
+        f'<th scope="col"><button type="button">{visible(column.header)}</button></th>' for column in RESULT_COLUMNS
     )
+    swatches = _swatches(runs)
     body = ""
-    for i, (key, swatch) in enumerate(zip(rows, _swatches(runs), strict=True)):
-        cells = ""
+    for i, row in enumerate(rows):
+        own = i < len(swatches)
+        body += f'<tr data-series="{i}">' if own else f'<tr class="{"seeds" if row.seeds else "paper"}">'
+        body += f'<th scope="row">{swatches[i] if own else ""}{visible(row.name)}</th>'
         for column in RESULT_COLUMNS:
-            text, value = cell(column, rows[key]), rows[key].get(column.key)
-            exact = "" if value is None else f' data-value="{str(value).replace("inf", "Infinity")}" title="{value}"'
-            cells += f"<td{' class=best' if text == best[column.key] else ''}{exact}>{text}</td>"
-        body += f'<tr data-series="{i}"><th scope="row">{swatch}{visible(labels(runs)[key])}</th>{cells}</tr>'
-    for label, values in with_spread(rows, seed_groups(runs)):
-        cells = "".join(f"<td>{cell(column, values)}</td>" for column in RESULT_COLUMNS)
-        body += f'<tr class="seeds"><th scope="row">{visible(label)}</th>{cells}</tr>'
-    for name, printed in published_rows(paper).items():
-        cells = "".join(f"<td>{printed.get(column.key, '-')}</td>" for column in RESULT_COLUMNS)
-        body += f'<tr class="paper"><th scope="row">{visible(name)}</th>{cells}</tr>'
+            text, value = cell(column, row.values), row.values.get(column.key)
+            mark = " class=best" if own and text == best[column.key] else ""
+            if own and value is not None:
+                mark += f' data-value="{str(value).replace("inf", "Infinity")}" title="{value}"'
+            body += f"<td{mark}>{text}</td>"
+        body += "</tr>"
     return (
         f'<div class="wide"><table id="quartile-table"><thead><tr><th scope="col">estimate</th>{head}</tr></thead>'
-        f'<tbody>{body}</tbody></table></div><p class="note">rot, repr: errors in degrees. trans: in scene units. '
-        "15deg 0.5 and 10deg 1.0: % of pairs with both rotation and translation error within. sec: seconds per pair. "
-        "Best values are bold. A pair without a pose counts as 180 deg and inf.</p>"
+        f'<tbody>{body}</tbody></table></div><p class="note">{CAPTION} Best values are bold.</p>'
     )
 
 

@@ -16,12 +16,12 @@ from bpnp.files import written_whole
 from bpnp.report.folder import read_results
 from bpnp.report.page import templates
 from bpnp.report.page.charts import chart_text, page_charts
-from bpnp.report.page.pairs import compressed, labels, page_numbers, page_points, shown_id
+from bpnp.report.page.pairs import compressed, page_numbers, page_points, shown_id
 from bpnp.report.page.text import causes_html, headline_html, options, quartiles_html, series_boxes, visible
 from bpnp.report.palette import INKS
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import CAUSES
-from bpnp.report.runs import named_runs, trained_only
+from bpnp.report.runs import labels, named_runs, trained_only
 from bpnp.report.samples import read_views
 from bpnp.report.tables.published import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log

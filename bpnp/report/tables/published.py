@@ -44,8 +44,3 @@ PUBLISHED: Mapping[Paper, Mapping[str, Mapping[str, str]]] = {
         """,
     ),
 }
-
-
-def published_rows(paper: Paper | None) -> dict[str, Mapping[str, str]]:
-    """The printed rows of a data set by the name that a table gives them; none without a data set."""
-    return {} if paper is None else {f"paper, {NAMES[paper]}: {name}": row for name, row in PUBLISHED[paper].items()}

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 from rich import box
@@ -10,54 +9,27 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.metrics import RecallThresholds, pose_recalls
 from bpnp.report.folder import read_results
 from bpnp.report.results import Results
-from bpnp.report.runs import named_runs, read_runs, seed_groups, trained_only, with_spread
+from bpnp.report.runs import named_runs, read_runs, trained_only
 from bpnp.report.tables.fitted_table import WIDTH, FittedTable
-from bpnp.report.tables.published import Paper, published_rows
+from bpnp.report.tables.published import Paper
+from bpnp.report.tables.rows import (
+    HERE,
+    RECALL_COLUMNS,
+    RESULT_COLUMNS,
+    Column,
+    Row,
+    best_texts,
+    cell,
+    number,
+    run_rows,
+)
 from bpnp.report.training_log import TrainingLog, read_training_log
 
-Values = Mapping[str, float]
-
-
-@dataclass(frozen=True)
-class Column:
-    """Where a column's number is found, what is written above it, and whether it is a share (shown in %, more is
-    better) or an error or a time (less is better)."""
-
-    key: str
-    header: str
-    share: bool = False
-
-
-QUARTILES = tuple(
-    Column(f"{error}_q{number}{unit}", f"{short}\nQ{number}")
-    for error, unit, short in (
-        ("rotation", "_deg", "rot"),
-        ("translation", "", "trans"),
-        ("reprojection", "_deg", "repr"),
-    )
-    for number in (1, 2, 3)
-)
-RESULT_COLUMNS = (
-    *QUARTILES,
-    Column("recall_joint_15deg_0.5", "15deg\n0.5", share=True),
-    Column("recall_joint_10deg_1", "10deg\n1.0", share=True),
-    Column("found", "found\n%", share=True),
-    Column("seconds_mean", "sec"),
-)
-STANDARD_POINTS = RecallThresholds((1, 2, 5, 10, 20), (0.05, 0.1, 0.2, 0.5, 1), (), (0.25, 0.5, 1, 2))
-RECALL_COLUMNS = (
-    *(Column(f"recall_rotation_{limit:g}deg", f"rot\n{limit:g}", share=True) for limit in STANDARD_POINTS.rotation_deg),
-    *(
-        Column(f"recall_translation_{limit:g}", f"trans\n{limit:g}", share=True)
-        for limit in STANDARD_POINTS.translation
-    ),
-    *(
-        Column(f"recall_reprojection_{limit:g}deg", f"repr\n{limit:g}", share=True)
-        for limit in STANDARD_POINTS.reprojection_deg
-    ),
+CAPTION = (
+    "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of pairs with "
+    "both rotation and translation error within. sec: mean seconds a pair. No pose counts as 180 deg and inf."
 )
 
 
@@ -68,17 +40,26 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
     column is bold. `paper` adds the published rows of that data set, for orientation only: they
     are of other data and take no part in the comparison.
     """
-    caption = (
-        "rot, repr: errors in degrees; trans: in scene units; 15deg 0.5, 10deg 1.0: % of pairs with both rotation and "
-        "translation error within; sec: seconds per pair. A pair without a pose counts as 180 deg and inf."
-    )
-    return _table(_title("Pose errors", runs), RESULT_COLUMNS, runs, published_rows(paper), caption)
+    return fitted(_title("Pose errors", runs), RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
 def recall_table(runs: Mapping[str, Results]) -> FittedTable:
     """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
     caption = "% of pairs with an error up to the number in the head: rot, repr in degrees; trans in scene units."
-    return _table(_title("Recall", runs), RECALL_COLUMNS, runs, {}, caption)
+    return fitted(_title("Recall", runs), RECALL_COLUMNS, run_rows(runs), caption)
+
+
+def fitted(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> FittedTable:
+    """The table of rows: those of runs, the best numbers bold, those of several seeds, those of the paper."""
+    best = best_texts(columns, rows)
+    groups: tuple[list[tuple[Text, list[Text]]], ...] = ([], [], [])
+    for row in rows:
+        place = 2 if row.source != HERE else int(row.seeds)
+        dim = "dim" if place == 2 else ""
+        texts = [(column.key, cell(column, row.values)) for column in columns]
+        shown = [Text(text, "bold" if place == 0 and text == best[key] else dim) for key, text in texts]
+        groups[place].append((Text(row.name, dim), shown))
+    return FittedTable(title, [column.header for column in columns], groups, caption)
 
 
 def learning_table(before: Results, after: Results) -> Table:
@@ -112,11 +93,7 @@ def training_table(logs: Mapping[str, TrainingLog]) -> FittedTable:
 
 
 def report(
-    paths: Sequence[Path],
-    console: Console | None = None,
-    *,
-    paper: Paper | None = None,
-    untrained: Path | None = None,
+    paths: Sequence[Path], console: Console | None = None, *, paper: Paper | None = None, untrained: Path | None = None
 ) -> None:
     """Print the tables of one or several results folders, named by what their paths do not share.
 
@@ -138,76 +115,6 @@ def report(
         console.print(learning_table(read_results(untrained), list(runs.values())[-1]))
 
 
-def number(value: float | None) -> str:
-    """Three significant digits in at most six characters: two digits below 0.01; "-" for none."""
-    if value is None:
-        return "-"
-    size = abs(value)
-    if size == 0 or not math.isfinite(value):
-        return f"{value:g}"
-    if 0.01 <= size < 999.5:
-        return f"{value:#.3g}".rstrip(".")
-    if 0.001 <= size < 0.01:
-        return f"{value:.4f}"
-    if 999.5 <= size < 99_999.5:
-        return f"{value:.0f}"
-    mantissa, exponent = f"{value:.{0 if size < 1e-9 else 1}e}".split("e")
-    return f"{mantissa}e{int(exponent)}"
-
-
-def _values(results: Results, estimate: str) -> Values:
-    standard = pose_recalls(results.errors(estimate), STANDARD_POINTS)
-    return results.estimates[estimate] | {key: float(value) for key, value in standard.items()}
-
-
 def _title(what: str, runs: Mapping[str, Results]) -> str:
     sizes = sorted({results.pairs for results in runs.values()})
     return f"{what}, {' or '.join(map(str, sizes))} pairs"
-
-
-def _table(
-    title: str,
-    columns: Sequence[Column],
-    runs: Mapping[str, Results],
-    published: Mapping[str, Mapping[str, str]],
-    caption: str,
-) -> FittedTable:
-    """A row per run and estimate, then mean and spread of the runs that differ by their seeds, then what is printed."""
-    rows = {(run, name): _values(results, name) for run, results in runs.items() for name in results.estimates}
-    best = best_texts(columns, list(rows.values()))
-    shown = {key: {column.key: cell(column, values) for column in columns} for key, values in rows.items()}
-    here = [
-        (
-            Text(estimate if len(runs) == 1 else f"{run}: {estimate}"),
-            [Text(text, "bold" if text == best[key] else "") for key, text in cells.items()],
-        )
-        for (run, estimate), cells in shown.items()
-    ]
-    seeds = [
-        (Text(label), [Text(cell(column, values)) for column in columns])
-        for label, values in with_spread(rows, seed_groups(runs))
-    ]
-    paper = [
-        (Text(label, "dim"), [Text(printed.get(column.key, "-"), "dim") for column in columns])
-        for label, printed in published.items()
-    ]
-    return FittedTable(title, [column.header for column in columns], [here, seeds, paper], caption)
-
-
-def cell(column: Column, values: Values) -> str:
-    """What a table shows of a column: a share in percent, else `number`."""
-    value = values.get(column.key)
-    return f"{100 * value:.1f}" if column.share and value is not None else number(value)
-
-
-def best_texts(columns: Sequence[Column], rows: Sequence[Values]) -> dict[str, str | None]:
-    """The best number of each column as it is shown; None where there is nothing to compare."""
-    return {column.key: _best(column, rows) for column in columns}
-
-
-def _best(column: Column, rows: Sequence[Values]) -> str | None:
-    """The best number as it is shown, so that what reads the same is marked the same; nothing to mark in one row."""
-    known = [row for row in rows if math.isfinite(row.get(column.key, math.nan))]
-    if len(rows) < 2 or not known:
-        return None
-    return cell(column, (max if column.share else min)(known, key=lambda row: row[column.key]))

@@ -12,7 +12,7 @@ from bpnp.report import PairRow, Results, learning_table, recall_table, report, 
 from bpnp.report.page.text import quartiles_html
 from bpnp.report.runs import seed_groups
 from bpnp.report.tables.fitted_table import FittedTable
-from bpnp.report.tables.result_tables import number
+from bpnp.report.tables.rows import number
 
 
 def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
