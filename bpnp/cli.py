@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import first_line, run_command
+from bpnp.commands.parser import first_line, parsed_arguments
 from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
 from bpnp.configs import config_names, packaged_config
 
@@ -60,7 +60,7 @@ def _run(arguments: list[str]) -> None:
                 return
             word, *rest = rest
             name, command = f"{name} {word}", command[_known(word, list(command), f"one of bpnp {name}")]
-        run_command(name, command, rest)
+        command(**parsed_arguments(name, command, rest))
 
 
 def _known(name: str, names: Sequence[str], what: str) -> str:

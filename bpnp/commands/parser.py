@@ -45,8 +45,8 @@ def plain(message: str) -> str:
     return f"{name}: {reason}" if name and f"expected {name} as" not in reason else reason
 
 
-def run_command(name: str, command: Callable[..., None], arguments: Sequence[str]) -> None:
-    """Parse the arguments of a command and call it. Raises ValueError for arguments that it does not take.
+def parsed_arguments(name: str, command: Callable[..., None], arguments: Sequence[str]) -> dict[str, Any]:
+    """The arguments of a command by name. Raises ValueError for arguments that it does not take.
 
     A hyphen in the name of an option is read as an underscore.
     """
@@ -65,7 +65,7 @@ def run_command(name: str, command: Callable[..., None], arguments: Sequence[str
         for key, value in vars(command_parser(name, command).parse_args(given)).items()
         if key in hints
     }
-    command(**chosen, **extra)
+    return chosen | extra
 
 
 def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:

@@ -3,6 +3,7 @@ import inspect
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -14,16 +15,6 @@ from bpnp.cli import COMMANDS, main
 from bpnp.files import claimed
 
 MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
-
-
-def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert len(error.strip().splitlines()) <= 2
-    return error
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
@@ -86,11 +77,11 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
     ],
 )
 def test_a_users_mistake_is_one_clear_error(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    arguments: list[str], message: str, fails: Callable[..., str], tmp_path: Path
 ) -> None:
     if arguments[:1] in (["fit"], ["test"]) and len(arguments) > 1:
         arguments = [*arguments, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
-    assert message in fails(arguments, capsys)
+    assert message in fails(*arguments)
 
 
 def test_a_reader_that_leaves_is_no_error() -> None:
@@ -141,10 +132,10 @@ def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
     assert (tmp_path / "again" / "checkpoints" / "last.ckpt").is_file()
 
 
-def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, fails: Callable[..., str]) -> None:
     arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     with claimed(tmp_path):
-        assert "expected a folder that no other process writes to" in fails(arguments, capsys)
+        assert "expected a folder that no other process writes to" in fails(*arguments)
 
 
 @pytest.mark.parametrize(
@@ -155,18 +146,16 @@ def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, capsys: pytest
         ("model: [1", "expected YAML in .*wrong.yaml, got while parsing a flow sequence"),
     ],
 )
-def test_a_broken_configuration_is_named(
-    content: str, message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_broken_configuration_is_named(content: str, message: str, fails: Callable[..., str], tmp_path: Path) -> None:
     (tmp_path / "wrong.yaml").write_text(content)
-    assert re.search(message, fails(["fit", f"--config={tmp_path}/wrong.yaml"], capsys))
+    assert re.search(message, fails("fit", f"--config={tmp_path}/wrong.yaml"))
 
 
-def test_a_checkpoint_that_is_none_is_named(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_checkpoint_that_is_none_is_named(fails: Callable[..., str], tmp_path: Path) -> None:
     broken = tmp_path / "broken.ckpt"
     broken.write_bytes(b"no checkpoint")
     root = [f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
-    assert "broken.ckpt" in fails(["test", *MESHES, *root, *SMALL_NET, f"--ckpt_path={broken}"], capsys)
+    assert "broken.ckpt" in fails("test", *MESHES, *root, *SMALL_NET, f"--ckpt_path={broken}")
 
 
 def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

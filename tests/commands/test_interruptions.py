@@ -1,6 +1,7 @@
 """Ctrl-C, and checkpoints that are not there: no work is lost in silence."""
 
 import errno
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -84,10 +85,5 @@ def test_a_full_disk_leaves_the_checkpoint_before_and_is_named(tmp_path: Path, m
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_a_last_checkpoint_that_is_not_there_is_no_new_training(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as stop:
-        main([*arguments("fit", tmp_path), "--ckpt_path=last"])
-    assert stop.value.code == 2
-    assert "expected a checkpoint for --ckpt_path last" in capsys.readouterr().err
+def test_a_last_checkpoint_that_is_not_there_is_no_new_training(tmp_path: Path, fails: Callable[..., str]) -> None:
+    assert "expected a checkpoint for --ckpt_path last" in fails(*arguments("fit", tmp_path), "--ckpt_path=last")

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution
-from bpnp.cli import main
 
 CAMERA = "PINHOLE,1379.7,1382.1,760.3,503.4"
 
@@ -21,7 +21,7 @@ def place(shared_data: Path) -> tuple[Path, Path]:
 
 
 def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
-    place: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]
 ) -> None:
     model, photos = place
     folder, output = tmp_path / "photos", tmp_path / "out"
@@ -32,10 +32,7 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg 0003.jpg\n0004.jpg 0005.jpg\n0006.jpg 0005.jpg\n0006.jpg 0007.jpg\n")
     command = ["localize", str(model), str(folder), "--camera", CAMERA, "--views", str(pairs), "--output", str(output)]
-    with pytest.raises(SystemExit) as status:
-        main([*command, "--leave-one-out"])
-    assert status.value.code == 2
-    assert "1 of 3 photos could not be tried, such as 0009.jpg" in capsys.readouterr().err
+    assert "1 of 3 photos could not be tried, such as 0009.jpg" in fails(*command, "--leave-one-out")
 
     scene = SceneMap.from_colmap(model)
     lines = [line.split() for line in (output / "poses.txt").read_text().splitlines() if not line.startswith("#")]
@@ -57,39 +54,29 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
 
     # Another run goes on where this one was: nothing is solved again, and other settings are refused.
     before = (output / "solutions/0004.jpg.json").stat().st_mtime_ns
-    with pytest.raises(SystemExit):
-        main([*command, "--leave-one-out"])
+    fails(*command, "--leave-one-out")
     assert (output / "solutions/0004.jpg.json").stat().st_mtime_ns == before
-    capsys.readouterr()
-    with pytest.raises(SystemExit):
-        main([*command, "--leave-one-out", "--seed", "1"])
-    assert "without results of other settings, got other seed; try another --output" in capsys.readouterr().err
+    error = fails(*command, "--leave-one-out", "--seed", "1")
+    assert "without results of other settings, got other seed; try another --output" in error
 
 
-def failing(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
-    with pytest.raises(SystemExit) as status:
-        main(["localize", *arguments])
-    assert status.value.code == 2
-    return capsys.readouterr().err
-
-
-def test_bad_input_is_one_clear_error(
-    place: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]) -> None:
     model, photos = place
     out = ("--output", str(tmp_path / "out"))
-    assert "expected MAP PHOTO... or --model MODEL, got neither" in failing(capsys)
-    assert "got both" in failing(capsys, str(model), "--model", str(model))
-    assert "expected one or more photos" in failing(capsys, str(model), *out)
-    assert "a.jpg, which does not exist" in failing(capsys, str(model), "a.jpg", *out)
+    assert "expected MAP PHOTO... or --model MODEL, got neither" in fails("localize")
+    assert "got both" in fails("localize", str(model), "--model", str(model))
+    assert "expected one or more photos" in fails("localize", str(model), *out)
+    assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
-    assert "focal length in the EXIF data" in failing(capsys, str(model), str(tmp_path / "plain.jpg"), *out)
-    error = failing(capsys, str(model), str(tmp_path / "plain.jpg"), "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out)
+    assert "focal length in the EXIF data" in fails("localize", str(model), str(tmp_path / "plain.jpg"), *out)
+    error = fails(
+        "localize", str(model), str(tmp_path / "plain.jpg"), "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out
+    )
     assert "expected photos of 128 x 96 pixels as --camera says, got plain.jpg of 64 x 48" in error
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")
-    error = failing(
-        capsys, str(model), str(photos / "0004.jpg"), "--camera", CAMERA, "--views", str(pairs),
+    error = fails(
+        "localize", str(model), str(photos / "0004.jpg"), "--camera", CAMERA, "--views", str(pairs),
         "--output", str(tmp_path / "views"),
     )  # fmt: skip
     assert "expected names of views of the map, got nowhere.jpg" in error

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -12,14 +13,9 @@ from bpnp.cli import main
 from bpnp.report.samples import thin, write_views
 
 
-def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(arguments)
-    assert stop.value.code == 2
-    return capsys.readouterr().err
-
-
-def test_commands_write_what_they_say(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_write_what_they_say(
+    tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
     write_run(tmp_path / "run", 12, 0)
     page, recall = tmp_path / "report.html", tmp_path / "recall.png"
     main(["report", str(tmp_path / "run"), "--html", str(page), "--recall", str(recall)])
@@ -31,12 +27,14 @@ def test_commands_write_what_they_say(tmp_path: Path, capsys: pytest.CaptureFixt
     written = Path(capsys.readouterr().out.removeprefix("wrote ").rstrip("\n"))
     assert written.parent == tmp_path / "run" / "test" / "views"
     assert imread(written).std() > 0.05
-    assert "got 'nothing'; try one of" in fails(["view", str(tmp_path / "run"), "nothing"], capsys)
+    assert "got 'nothing'; try one of" in fails("view", str(tmp_path / "run"), "nothing")
     (tmp_path / "run" / "test" / "points.npz").unlink()
-    assert "expected points.npz in" in fails(["view", str(tmp_path / "run")], capsys)
+    assert "expected points.npz in" in fails("view", str(tmp_path / "run"))
 
 
-def test_a_run_that_was_only_trained_shows_its_curves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_that_was_only_trained_shows_its_curves(
+    tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
+) -> None:
     write_run(tmp_path / "run", 12, 0)
     shutil.rmtree(tmp_path / "run" / "test")
     page = tmp_path / "report.html"
@@ -47,18 +45,18 @@ def test_a_run_that_was_only_trained_shows_its_curves(tmp_path: Path, capsys: py
     text = page.read_text()
     assert 'id="training"' in text
     assert 'id="quartiles"' not in text
-    assert "expected a results folder" in fails(["report", str(tmp_path)], capsys)
+    assert "expected a results folder" in fails("report", str(tmp_path))
 
 
-def test_every_pair_of_a_test_can_be_viewed_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_pair_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:
     write_run(tmp_path, 9, 0)
     names = {row.index: row.id for row in rows(9, 0)}
     write_views(tmp_path / "test", [thin(view(i, names[i])) for i in range(9)])
     main(["view", str(tmp_path), "scene/0004", "0007"])
     assert {path.name for path in (tmp_path / "test" / "views").iterdir()} == {"scene_0004.png", "scene_0007.png"}
-    assert "got 'scene'; try one of scene/000" in fails(["view", str(tmp_path), "scene"], capsys)
+    assert "got 'scene'; try one of scene/000" in fails("view", str(tmp_path), "scene")
     several = ["view", str(tmp_path), "scene/0004", "0007", "--output", "x.png"]
-    assert "expected one pair with --output, got 2" in fails(several, capsys)
+    assert "expected one pair with --output, got 2" in fails(*several)
 
 
 def test_the_workspace_of_the_project_is_saved(

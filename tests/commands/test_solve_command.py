@@ -2,7 +2,9 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -26,16 +28,6 @@ def write(folder: Path, points2d: np.ndarray = X, points3d: np.ndarray = P) -> l
     np.savetxt(folder / "x.csv", points2d, delimiter=",", header="x,y", comments="")
     np.save(folder / "p.npy", points3d)
     return [str(folder / "x.csv"), str(folder / "p.npy")]
-
-
-def fails(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    with pytest.raises(SystemExit) as stop:
-        main(["solve", *arguments])
-    assert stop.value.code == 2
-    error = capsys.readouterr().err
-    assert "Traceback" not in error
-    assert len(error.strip().splitlines()) == 1
-    return error
 
 
 def test_files_become_a_pose(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -120,25 +112,25 @@ def test_gravity_is_three_numbers_of_either_side(tmp_path: Path, capsys: pytest.
         (lambda files: [*files, "--device", "tpu9"], "`device` of this machine"),
     ],
 )
-def test_a_mistake_is_one_line(change, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert message in fails(change(write(tmp_path)), capsys)
+def test_a_mistake_is_one_line(change: Any, message: str, tmp_path: Path, fails: Callable[..., str]) -> None:
+    assert message in fails("solve", *change(write(tmp_path)))
 
 
-def test_bad_points_are_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_points_are_one_line(tmp_path: Path, fails: Callable[..., str]) -> None:
     for points2d, points3d, message in (
         (X[:3], P, "4 or more points in `points2d`, got 3"),
         (X, np.where(np.arange(40)[:, None] == 7, np.nan, P), "finite `points3d`"),
         (500 * X, P, "look like pixels"),
     ):
-        assert message in fails(write(tmp_path, points2d, points3d), capsys)
+        assert message in fails("solve", *write(tmp_path, points2d, points3d))
 
 
 def test_an_unwritable_output_is_known_before_the_search(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("bpnp.solving.solve.solve", None)
     (tmp_path / "file").write_text("")
-    assert "file" in fails([*write(tmp_path), "--output", str(tmp_path / "file" / "r.json")], capsys)
+    assert "file" in fails("solve", *write(tmp_path), "--output", str(tmp_path / "file" / "r.json"))
 
 
 def test_an_interruption_is_one_line(

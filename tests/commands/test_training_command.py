@@ -1,6 +1,7 @@
 """Short help with groups on request, and a user's own task, loss and weights by name."""
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -90,10 +91,8 @@ def test_groups_list_every_option_once(capsys: pytest.CaptureFixture[str]) -> No
     assert told <= everything
 
 
-def test_another_group_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["fit", "--help", "modle"])
-    assert "one of model, data, trainer, files, all, got 'modle'" in capsys.readouterr().err
+def test_another_group_is_refused(fails: Callable[..., str]) -> None:
+    assert "one of model, data, trainer, files, all, got 'modle'" in fails("fit", "--help", "modle")
 
 
 def test_a_loss_by_class_path_trains(tmp_path: Path) -> None:
@@ -103,10 +102,10 @@ def test_a_loss_by_class_path_trains(tmp_path: Path) -> None:
     assert seen == [(2.0, set()), (2.0, set())]
 
 
-def test_a_loss_of_the_wrong_shape_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit):
-        main(["fit", *MESHES, *SMALL_NET, "--model.loss=test_training_command.OneNumber", *SHORT, *folders(tmp_path)])
-    assert "expected a tensor of shape (4,) from OneNumber, got ()" in capsys.readouterr().err
+def test_a_loss_of_the_wrong_shape_is_refused(tmp_path: Path, fails: Callable[..., str]) -> None:
+    loss = "--model.loss=test_training_command.OneNumber"
+    error = fails("fit", *MESHES, *SMALL_NET, loss, *SHORT, *folders(tmp_path))
+    assert "expected a tensor of shape (4,) from OneNumber, got ()" in error
 
 
 @pytest.mark.parametrize("given", ["options", "file"])
