@@ -14,14 +14,18 @@ from typing import Any
 import numba
 import torch
 from numba.core import event
+from numba.core.dispatcher import Dispatcher
+
+_FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """A decorator: compile at the first call, keep the result on disk, and hold no lock while it runs.
 
     It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
-    names another one); where neither can, each process compiles again. A function is compiled without the wrappers that
-    a type checker puts around it when it is imported.
+    names another one); where neither can, each process compiles again. So it is after a change of the function's file,
+    or of another one with functions that this file calls, which numba does not look at. A function is compiled without
+    the wrappers that a type checker puts around it when it is imported.
     options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. The wrapper
     for Python is another tenth, which `no_cpython_wrapper` leaves out of a function that only compiled ones call (a
     call from Python ends the process). Counting references is a fifth, which `_nrt=False` leaves out of one that
@@ -31,10 +35,17 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
+        files = {inspect.getfile(function)}.union(
+            *(_FILES[known] for known in function.__globals__.values() if isinstance(known, Dispatcher))
+        )
         try:
-            return numba.njit(function, cache=True, **options)
+            dispatcher: Any = numba.njit(function, cache=True, **options)
+            stats = [os.stat(file) for file in sorted(files)]
+            dispatcher._cache._cache_file._source_stamp = [(stat.st_mtime, stat.st_size) for stat in stats]
         except RuntimeError:  # numba finds no folder for its cache
-            return numba.njit(function, **options)
+            dispatcher = numba.njit(function, **options)
+        _FILES[dispatcher] = files
+        return dispatcher
 
     return compiled
 

@@ -16,13 +16,22 @@ import torch
 import bpnp.compilation
 from bpnp.compilation import in_threads
 
-LOOP = """
+FACTOR = """
 from bpnp.compilation import compiler
 
 
 @compiler()
+def factor():
+    return 2
+"""
+LOOP = """
+from bpnp.compilation import compiler
+from bpnp.factor import factor
+
+
+@compiler()
 def double(x):
-    return 2 * x
+    return factor() * x
 """
 
 
@@ -94,6 +103,7 @@ def package(tmp_path: Path) -> Path:
     folder.mkdir(parents=True)
     shutil.copy(bpnp.compilation.__file__, folder / "compilation.py")
     (folder / "__init__.py").touch()
+    (folder / "factor.py").write_text(FACTOR)
     (folder / "loop.py").write_text(LOOP)
     (folder / "__pycache__").touch()  # a file where the folder would be
     return folder.parent
@@ -120,6 +130,13 @@ def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(
     assert first[1].count("compiling") == 1
     assert second[1] == ""
     assert list(cache.rglob("*.nbi"))
+
+
+def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path, tmp_path: Path) -> None:
+    cache = str(tmp_path / "cache")
+    assert doubled(package, cache)[0] == "8 10\n"
+    (package / "bpnp" / "factor.py").write_text(FACTOR.replace("2", "30"))
+    assert doubled(package, cache)[0] == "120 150\n"
 
 
 def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> None:

@@ -12,16 +12,13 @@ from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.grid import build_grid, descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene
-from bpnp.search.settings import ClusterStage, Recipe, Stages
-from bpnp.search.starts import Prior, draw_poses
+from bpnp.search.settings import ClusterStage, Stages
+from bpnp.search.starts import Array
 
 
-def run_batch(
-    scene: Scene, starts: int, coarse: Stages, recipe: Recipe, prior: Prior | None, best: Candidates
-) -> Candidates:
+def run_batch(scene: Scene, poses: Candidates, coarse: Stages, best: Candidates) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    rotation, translation = draw_poses(scene.spread, scene.bulk3d, starts, recipe, prior, scene.rng)
-    poses = Candidates.unscored(rotation, translation, hits=1)
+    starts = len(poses)
     for stage in coarse:
         poses = anneal_on_clusters(scene, poses, stage, scene.settings.kept_by(stage, starts))
     return anneal_further(scene, Candidates.concatenated([poses, shaken(scene, best)]), starts)
@@ -84,13 +81,25 @@ def anneal_on_points(
 def shaken(scene: Scene, poses: Candidates) -> Candidates:
     """Starts around the best poses; those of a batch that end there are no evidence for it, hence no hits."""
     shaking = scene.settings.shaking
-    rotation = np.repeat(poses.rotation[: shaking.poses], shaking.copies, 0)
-    vector = math.radians(shaking.rotation_deg) * scene.rng.standard_normal((len(rotation), 3))
-    translation = np.repeat(poses.translation[: shaking.poses], shaking.copies, 0)
-    depth = np.linalg.norm(translation, axis=-1, keepdims=True)
-    moved = translation + shaking.translation * depth * scene.spread * scene.rng.standard_normal(translation.shape)
-    turned = Rotation.from_rotvec(vector).as_matrix() @ rotation
-    return Candidates.unscored(turned.astype(np.float32), moved.astype(np.float32))
+    rotation, translation = (
+        np.repeat(x[: shaking.poses], shaking.copies, 0) for x in (poses.rotation, poses.translation)
+    )
+    vectors, shifts = scene.rng.standard_normal((2, len(rotation), 3), np.float32)
+    shifts *= np.float32(shaking.translation * scene.spread) * np.linalg.norm(translation, axis=-1, keepdims=True)
+    return turned_about_middle(scene, rotation, translation, math.radians(shaking.rotation_deg) * vectors, shifts)
+
+
+def turned_about_middle(
+    scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, hits: int = 0
+) -> Candidates:
+    """Poses turned by rotation vectors (s, 3) about the middle of the points, and shifted by (s, 3).
+
+    There an error of the rotation moves the camera, not what it looks at.
+    """
+    middle = scene.bulk3d.mean(0)
+    turned = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
+    shifted = rotation @ middle + translation + shifts - turned @ middle
+    return Candidates.unscored(turned, shifted.astype(np.float32), hits=hits)
 
 
 def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Candidates:

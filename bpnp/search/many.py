@@ -5,7 +5,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +14,11 @@ from bpnp.search.annealing import finish, run_batch
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
-from bpnp.search.nearby import beside, cooled, likeliest, nearby_batch
+from bpnp.search.nearby import beside, cooled, drawn_around, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
-from bpnp.search.starts import PosePrior, Prior
+from bpnp.search.starts import PosePrior, Prior, draw_poses
 from bpnp.search.verdict import (
     SearchResult,
     is_certain,
@@ -136,10 +135,13 @@ def search_poses(
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
     if result.log10_false_alarms > 0 and len(candidates) and candidates.hits[0] <= batches / 2:
-        for look, k in product(settings.beside, range(len(turned))):
-            if deadline.passed():
+        since = 0  # looks since the best log-likelihood was bettered
+        for k in range(len(turned)):
+            if deadline.passed() or since == settings.beside_patience:
                 break
-            candidates = merged([candidates, beside(scene, turned[k : k + 1], look)], scene)
+            best = float(candidates.score[0])
+            candidates = merged([candidates, beside(scene, turned[k : k + 1], settings.beside)], scene)
+            since = 0 if candidates.score[0] > best else since + 1
             candidates, leaders = _weighed_leaders(candidates, scene, sets)
             if (safe := certain(leaders)) is not None:
                 return safe
@@ -182,14 +184,16 @@ def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> 
 
     Of a rough pose all batches are full, and every other one is looked up in a raster, which finds other poses.
     """
-    settings = scene.settings
-    starts, coarse, turn = settings.batch(number), settings.coarse, number
+    settings, coarse = scene.settings, scene.settings.coarse
     if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
         if number % 2 == 0:
             return nearby_batch(scene, prior), 1.0
-        starts, coarse, turn = settings.starts, cooled(coarse, prior, scene), number // 2
-    recipe = settings.recipes[turn % len(settings.recipes)]
-    return run_batch(scene, starts, coarse, recipe, prior, best), starts / settings.starts
+        poses, coarse = drawn_around(scene, prior, settings.starts), cooled(coarse, prior, scene)
+    else:
+        recipe = settings.recipes[number % len(settings.recipes)]
+        drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
+        poses = Candidates.unscored(*drawn, hits=1)
+    return run_batch(scene, poses, coarse, best), len(poses) / settings.starts
 
 
 def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:

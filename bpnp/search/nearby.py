@@ -21,16 +21,15 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import in_time
-from bpnp.search.annealing import anneal_on_points
+from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby, Stages
-from bpnp.search.starts import Array, PosePrior
+from bpnp.search.starts import PosePrior
 
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
@@ -82,7 +81,7 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
     vectors[0], shifts[0] = 0, 0
-    return _turned(scene, mean, np.asarray(prior.translation, np.float32), vectors, shifts)
+    return turned_about_middle(scene, mean, np.asarray(prior.translation, np.float32), vectors, shifts, hits=1)
 
 
 def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
@@ -92,18 +91,7 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
     depth = np.linalg.norm(rotation @ scene.bulk3d.mean(0) + translation, axis=-1, keepdims=True)
     shifts *= depth * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
-    return _turned(scene, rotation, translation, vectors, shifts)
-
-
-def _turned(scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array) -> Candidates:
-    """Poses turned by rotation vectors (s, 3) about the middle of the points, and shifted by (s, 3).
-
-    There an error of the rotation moves the camera, not what it looks at.
-    """
-    middle = scene.bulk3d.mean(0)
-    turned = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
-    shifted = rotation @ middle + translation + shifts - turned @ middle
-    return Candidates.unscored(turned, shifted.astype(np.float32), hits=1)
+    return turned_about_middle(scene, rotation, translation, vectors, shifts, hits=1)
 
 
 def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int) -> Candidates:

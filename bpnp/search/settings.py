@@ -169,11 +169,11 @@ class SearchSettings:
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
     around: batches from a guess of the pose before those from anywhere.
-    refined_directly: starts of `refine_poses` that need no clusters; more compete on clusters first.
-    beside: how poses around the likeliest `beside_poses`, no two turned by less than `beside_deg`, are looked up, one
-        rule after the other, if the batches end without a pose that exceeds chance: among many outliers the right pose
-        is no optimum on clusters, but is often some degrees beside one. Six cost about as much as a batch from a prior.
-    kept: candidates from batch to batch, and in the end.
+    refined_directly: starts of `refine_poses` that need no clusters.
+    beside: how poses around the likeliest `beside_poses`, no two turned by less than `beside_deg`, are looked up, if
+        the batches end without a pose that exceeds chance: among many outliers the right pose is no optimum on
+        clusters, but is often some degrees beside one. After `beside_patience` without a likelier pose it ends.
+    kept: candidates, from batch to batch.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
@@ -193,11 +193,12 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
-    beside: tuple[Nearby, ...] = (
-        Nearby(2**17, 10.0, 0.1, 2**15, (50, 300), (2**14, 2**9), 0.03, 0.015, 2, 16, points_again=600, annealed=12),
+    beside: Nearby = Nearby(
+        2**17, 10.0, 0.1, 2**15, (50, 300), (2**14, 2**9), 0.03, 0.015, 2, 16, points_again=600, annealed=12
     )
     beside_poses: int = 6
     beside_deg: float = 10.0
+    beside_patience: int = 3
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
     least_annealed: int = 12

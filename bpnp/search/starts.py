@@ -88,12 +88,6 @@ def draw_poses(
         points3d[rng.integers(len(points3d), size=count)] - middle
     )
     translation = depth[:, None] * np.array([0.0, 0.0, 1.0]) - np.einsum("sij,sj->si", rotation, seen)
-    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
-        # About the middle of the points: there the rotation's error moves the camera, not what it looks at.
-        known = np.asarray(prior.rotation) @ middle + np.asarray(prior.translation)
-        noise = prior.translation_sigma * rng.standard_normal((count, 3))
-        noise[0] = 0
-        translation = known + noise - rotation @ middle
     return rotation.astype(np.float32), translation.astype(np.float32)
 
 

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.misfit import Misfit, systematic_misfit
-from bpnp.search.evidence.uncertainty import rotation_bound
+from bpnp.search.evidence.uncertainty import Misfit, rotation_bound, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence

@@ -63,7 +63,7 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
     before = annealed["points"]
     assert len(finish(scene, fine)) == len(fine)
     assert annealed["points"] == before
-    assert len(run_batch(scene, 1200, DEFAULT.coarse, DEFAULT.recipes[0], None, Candidates.none())) > 0
+    assert len(run_batch(scene, starts(scene, 1200), DEFAULT.coarse, Candidates.none())) > 0
 
 
 def test_a_limit_that_is_not_reached_changes_nothing(scene: Scene) -> None:

@@ -6,8 +6,8 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.few.arrays import ImageArrays, scene_arrays
-from bpnp.search.few.knowledge import knowledge_of
 from bpnp.search.few.poses import SETTINGS
+from bpnp.search.few.priors import knowledge_of
 from bpnp.search.few.state import Enumeration
 from bpnp.search.point_sets import PointSets
 from bpnp.solving.matches import fit_pose

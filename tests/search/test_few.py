@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.robust.p3p import p3p
 from bpnp.search.few.p3p import p3p_depths
-from bpnp.search.few.pairs import p2p_turned, p2p_upright
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
+from bpnp.search.few.priors import p2p_turned, p2p_upright
 from bpnp.search.few.triangles import orders_of_triples, pose_of_triangle, triangle_table
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior

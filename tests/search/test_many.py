@@ -143,7 +143,7 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     rotation, translation = planted.rotation[0].double().numpy(), planted.translation[0].double().numpy()
     others = super_fibonacci(200)
     others[77] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix() @ rotation
-    few = SearchSettings(max_batches=1, starts=1, first_starts=1, beside=())
+    few = SearchSettings(max_batches=1, starts=1, first_starts=1, beside_poses=0)
 
     def off(result):
         return np.degrees(Rotation.from_matrix(result.best[0] @ rotation.T).magnitude())

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.few.triangles import triangle_table, triples_between
+from bpnp.search.few.triangles import triangle_table, triples_within
 from bpnp.search.starts import turned_to
 
 Array = NDArray[np.float64]
@@ -34,24 +34,16 @@ class SceneArrays:
         labels = np.full(len(points), -1) if labels3d is None else np.array(labels3d, np.int64)
         self.arrays = points, normals, labels
         self.order, self.rank = neighbours_of(points, normals)
-        self._tables: tuple[NDArray[Any], ...] | None = None
-        self._within: dict[int, int] = {0: 0, 1: 0}
+        self._tables: dict[int, tuple[NDArray[Any], ...]] = {}
         self._pairs: dict[int, NDArray[np.int64]] = {}
 
-    def triples(self, near: int) -> tuple[tuple[NDArray[Any], ...], int]:
-        """Tables of the triples (triples, sides, frames, middles, orientations), and how many of them, the first ones,
-        are of a point and two of its `near` nearest."""
+    def triples(self, near: int) -> tuple[NDArray[Any], ...]:
+        """`triangle_table` of a point and two of its `near` nearest; those of fewer are the first rows."""
         near = min(near, self.order.shape[1])
-        if near not in self._within:
-            known = max(self._within)
-            points, normals, _ = self.arrays
-            tables = triangle_table(points, normals, triples_between(self.order, self.rank, known + 1, near))
-            if self._tables is not None:
-                tables = tuple(np.concatenate(pair) for pair in zip(self._tables, tables, strict=True))
-            self._tables = tables
-            self._within[near] = len(tables[0])
-        assert self._tables is not None
-        return self._tables, self._within[near]
+        if near not in self._tables:
+            found = triples_within(self.order, self.rank, near)
+            self._tables[near] = triangle_table(*self.arrays[:2], found)
+        return self._tables[near]
 
     def pairs(self, near: int) -> NDArray[np.int64]:
         """Pairs (t, 2) of a point and one of its `near` nearest, nearest first."""
@@ -78,8 +70,6 @@ class ImageArrays:
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
         self.arrays = (flat, gain, labels, *grid_of(flat, gain, reach))
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
-        self._triples = np.empty((0, 3), np.int64)
-        self._near = 1
 
     @functools.cached_property
     def _neighbours(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -87,12 +77,7 @@ class ImageArrays:
 
     def triples(self, near: int) -> NDArray[np.int64]:
         """Triples (t, 3) of an image point and two of its `near` nearest, nearest first."""
-        order, rank = self._neighbours
-        near = min(near, order.shape[1])
-        if near > self._near:
-            more = triples_between(order, rank, self._near + 1, near)
-            self._triples, self._near = np.concatenate([self._triples, more]), near
-        return self._triples
+        return triples_within(*self._neighbours, near)
 
     def pairs(self, near: int) -> NDArray[np.int64]:
         """Pairs (s, 2) of an image point and one of its `near` nearest, nearest first."""

@@ -9,8 +9,7 @@ allows, and a pose (12,) with its matches (m,) that others are compared with.
 import math
 from typing import Any
 
-from bpnp.search.few.adjustment import refine
-from bpnp.search.few.matching import WIDEST_MATCHED, compiled, evidence, match, part, sight, turned
+from bpnp.search.few.matching import WIDEST_MATCHED, compiled, evidence, match, part, refine, sight, turned
 
 SAME = 1 + 2 * math.cos(math.radians(2.0))  # trace of the turn between two poses that are the same
 SAME_SHIFT, SAME_DEPTH = 0.1, 0.05  # of the scene's extent and of its distance

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.few.arrays import ImageArrays, SceneArrays, scene_arrays
-from bpnp.search.few.knowledge import knowledge_of, predicted_pose
+from bpnp.search.few.priors import knowledge_of, predicted_pose
 from bpnp.search.few.state import Enumeration, Stage
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import PosePrior, Prior

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.knowledge import predicted_pose
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
+from bpnp.search.few.priors import predicted_pose
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.verdict import is_certain, weighed

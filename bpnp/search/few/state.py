@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 from bpnp.search.few.arrays import ImageArrays, SceneArrays
 from bpnp.search.few.enumeration import sweep
 from bpnp.search.few.kept import vary
-from bpnp.search.few.knowledge import Knowledge
 from bpnp.search.few.matching import RADII
-from bpnp.search.few.pairs import sweep_pairs
+from bpnp.search.few.priors import Knowledge, sweep_pairs
 from bpnp.search.few.triangles import orders_of_triples
 
 Array = NDArray[np.float64]
@@ -66,11 +65,11 @@ class Enumeration:
         m, n = len(self.image.rays), len(self.scene.arrays[0])
         self.stage = stage
         if stage.pairs == 3:
-            self._image, (self._scene, self._count) = self.image.triples(stage.near2d), self.scene.triples(stage.near3d)
+            self._image, self._scene = self.image.triples(stage.near2d), self.scene.triples(stage.near3d)
             self._orders = orders_of_triples(self.image.rays[:, :3], self._image)
         else:
             self._image, self._pairs = self.image.pairs(stage.near2d), self.scene.pairs(stage.near3d)
-            self._count = len(self._pairs)
+        self._count = len(self._scene[0] if stage.pairs == 3 else self._pairs)
         self._before = self._done.get((stage.pairs, stage.reach), (0, 0))
         self._done[stage.pairs, stage.reach] = len(self._image), self._count
         # How many witnesses make a hypothesis worth a look depends on what chance gives it.

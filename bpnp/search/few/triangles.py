@@ -65,14 +65,14 @@ def pose_of_triangle(
     return True
 
 
-def triples_between(order: Places, rank: Places, first: int, last: int) -> Places:
-    """Triples (t, 3) of a point, one of its `first` to `last` nearest (counted from 1), and a nearer one.
+def triples_within(order: Places, rank: Places, near: int) -> Places:
+    """Triples (t, 3) of a point and two of its `near` nearest.
 
     Every set of three comes once, from the point to which the farther one of the other two is nearest in rank, and
     nearer triples come first. order: (n, k) each point's nearest. rank: (n, n) the place of one among another's.
     """
     own, parts = np.arange(len(order)), [np.empty((0, 3), np.int64)]
-    for farther in range(max(first - 1, 1), min(last, order.shape[1])):
+    for farther in range(1, min(near, order.shape[1])):
         i, a, b = np.broadcast_arrays(own, order[:, :farther].T, order[:, farther])
         once = np.ones(a.shape, np.bool_)
         for one, other in ((a, b), (b, a)):
