@@ -61,15 +61,9 @@ def test_a_tenth_more_time_is_worse(new: float, worse: bool) -> None:
 def test_the_table_of_the_search_takes_the_place_of_the_old_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    same = {"translation": 0.1, "seconds": 2.0, "cpu_seconds": 1.0, "batches": 4}
     rows = [
-        {
-            "rotation_deg": error,
-            "translation": 0.1,
-            "verdict": verdict,
-            "seconds": 2.0,
-            "cpu_seconds": 1.0,
-            "batches": 4,
-        }
+        {"rotation_deg": error, "verdict": verdict, **same}
         for error, verdict in ((0.01, "confident"), (0.03, "confident"), (30.0, "failed"))
     ]
     monkeypatch.setattr(bench_search, "run", lambda *_: rows)

@@ -5,10 +5,9 @@ from collections.abc import Callable, Mapping
 from typing import Literal
 
 from bpnp.commands.completion import completion_script
-from bpnp.commands.dashboard import wandb_results
 from bpnp.commands.localizing import localize
 from bpnp.commands.preparing import prepare_megadepth, prepare_modelnet40, prepare_released
-from bpnp.commands.reporting import report, view
+from bpnp.commands.reporting import report, view, wandb_results
 from bpnp.commands.solving import solve
 from bpnp.commands.tables import table
 from bpnp.commands.weights import convert_weights

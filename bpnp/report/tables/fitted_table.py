@@ -23,7 +23,7 @@ class FittedTable:
     groups: Sequence[Sequence[tuple[Text, Sequence[Text]]]]
     caption: str = ""
 
-    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table]:
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> Iterator[Table | Text]:
         rows = [row for group in self.groups for row in group]
         name = min(max([9, *(len(label) for label, _ in rows)]), options.max_width // 3)
         parts: list[list[int]] = [[]]
@@ -36,11 +36,8 @@ class FittedTable:
             parts[-1].append(i)
             left -= width
         for number, part in enumerate(parts):
-            title, caption = (text or None for text in (self.title, self.caption))
-            table = Table(
-                title=title if number == 0 else None, caption=caption if part is parts[-1] else None,
-                box=box.SIMPLE_HEAD, padding=0, caption_justify="left", pad_edge=False,
-            )  # fmt: skip
+            title = self.title if number == 0 and self.title else None
+            table = Table(title=title, box=box.SIMPLE_HEAD, padding=0, pad_edge=False)
             table.add_column("", overflow="fold", width=name)
             for i in part:
                 table.add_column(self.headers[i], justify="right", no_wrap=True)
@@ -49,3 +46,5 @@ class FittedTable:
                     table.add_row(label, *(cells[i] for i in part))
                 table.add_section()
             yield table
+        if self.caption:
+            yield Text(self.caption, "dim italic")
