@@ -2,9 +2,10 @@
 
 import csv
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+
+import numpy as np
 
 FOLDERS = ("logs", "lightning_logs")
 LOSS = "train/loss"
@@ -19,6 +20,7 @@ CURVES = (
 # These are logged from the first step with a pose loss on.
 SWITCH_MARKS = ("train/pose_loss", "train/without_pose")
 MOST_POINTS = 500
+Columns = dict[str, dict[int, float]]  # by name, the values by step
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def read_training_log(results: Path | str) -> TrainingLog | None:
     return None
 
 
-def _joined(logs: list[tuple[Path, dict[str, dict[int, float]]]]) -> TrainingLog:
+def _joined(logs: list[tuple[Path, Columns]]) -> TrainingLog:
     """The newest log, and of older ones that started before it the steps up to its start."""
     files: list[Path] = []
     curves: dict[str, dict[int, float]] = {}
@@ -58,39 +60,32 @@ def _joined(logs: list[tuple[Path, dict[str, dict[int, float]]]]) -> TrainingLog
     for file, log in reversed(logs):
         first = _steps(log)[0]
         if first < start:
-            files.append(file)
+            files.insert(0, file)
             for name, values in log.items():
                 before = {step: value for step, value in values.items() if step < start}
                 curves[name] = before | curves.get(name, {})
             start = first
     marks = [step for name in SWITCH_MARKS for step in curves.get(name, {})]
-    return TrainingLog(
-        curves={name: _thinned(curves[name]) for name in CURVES if name in curves},
-        switch_step=min(marks, default=None),
-        files=tuple(reversed(files)),
-    )
+    thinned = {name: _thinned(curves[name]) for name in CURVES if name in curves}
+    return TrainingLog(thinned, min(marks, default=None), tuple(files))
 
 
-def _steps(log: Mapping[str, Mapping[int, float]]) -> list[int]:
+def _steps(log: Columns) -> list[int]:
     """The steps that were trained, as far as they were logged; untrained weights are at step 0."""
-    if LOSS in log:
-        return sorted(log[LOSS])
-    return sorted({step for values in log.values() for step in values if step > 0})
+    return sorted(log.get(LOSS) or {step for values in log.values() for step in values if step > 0})
 
 
-def _read(path: Path) -> dict[str, dict[int, float]]:
+def _read(path: Path) -> Columns:
     """By column, the values by step."""
-    columns: dict[str, dict[int, float]] = {}
-    wanted = {*CURVES, *SWITCH_MARKS}
+    columns: Columns = {}
     with path.open(encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file)
         if reader.fieldnames is not None and "step" not in reader.fieldnames:
             raise ValueError(f"expected column 'step' in {path}, got {reader.fieldnames}")
         for row in reader:
             try:
-                for name in wanted:
-                    if row.get(name):
-                        columns.setdefault(name, {})[int(row["step"])] = float(row[name])
+                for name in {*CURVES, *SWITCH_MARKS} & {name for name, text in row.items() if text}:
+                    columns.setdefault(name, {})[int(row["step"])] = float(row[name])
             except ValueError as error:
                 raise ValueError(f"expected numbers in {path}, line {reader.line_num}, got {error}") from error
     return columns
@@ -98,11 +93,10 @@ def _read(path: Path) -> dict[str, dict[int, float]]:
 
 def _thinned(values: dict[int, float]) -> tuple[list[float], list[float]]:
     """Steps and values in order; of long curves the means of equal parts."""
-    steps = sorted(values)
-    size = math.ceil(len(steps) / MOST_POINTS)
-    parts = [steps[i : i + size] for i in range(0, len(steps), size)]
-    means = [math.fsum(values[step] for step in part) / len(part) for part in parts]
-    return [sum(part) / len(part) for part in parts], means
+    curve = np.array(sorted(values.items()), float)
+    size = math.ceil(len(curve) / MOST_POINTS)
+    steps, means = np.transpose([part.mean(0) for part in np.split(curve, range(size, len(curve), size))]).tolist()
+    return steps, means
 
 
 def _version(path: Path) -> tuple[float, str]:

@@ -4,14 +4,10 @@ Finished pairs are in the results folders at once, so that a run that is stopped
 """
 
 import logging
-import multiprocessing
-import os
 import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,13 +20,13 @@ from bpnp.files import keep_settings
 from bpnp.report.folder import append_rows, finished_rows, write_results
 from bpnp.report.results import Results, rows_from, summarise
 from bpnp.report.samples import PairView, read_views, select_views, thin, views_from, write_views
+from bpnp.solving.processes import in_processes
 from bpnp.table.methods import Method
 from bpnp.table.pairs import TestPairs
 from bpnp.training.callbacks import interruptible
 from bpnp.training.task import BlindPnPTask
 
 IDENTITY = "method.json"
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 ROUNDS = 50  # turns in which a method is given its pairs, so that a table cut short has about as many of each
 LEAST = 4  # pairs of a turn, unless fewer are left
 
@@ -87,10 +83,25 @@ def run(blocks: Sequence[Block], *, processes: int) -> Iterator[int]:
         for k in range(0, len(missing), size):
             turns[k // size].append((block, missing[k : k + size]))
     jobs = [job for turn in turns for job in turn]
-    with one_thread():
-        for (block, indices), views in _tested(jobs, processes):
+    tester, threads = Tester(), torch.get_num_threads()
+
+    def test(place: int, _: Any) -> list[PairView]:
+        return tester.test(*jobs[place])
+
+    torch.set_num_threads(1)
+    places = range(len(jobs))
+    alone = ((place, test(place, None)) for place in places)
+    try:
+        for place, views in in_processes(test, places, processes, tell=_ignored) if processes > 1 else alone:
+            block, indices = jobs[place]
             block.keep(views)
             yield len(indices)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _ignored(*_: Any) -> None:
+    """Workers say nothing while they test."""
 
 
 class PairKeeper(Callback):
@@ -144,57 +155,13 @@ class Tester:
 @contextmanager
 def quiet() -> Iterator[None]:
     """No messages of the trainer's, which would repeat for every turn, nor its advice."""
-    loggers = [logging.getLogger(f"lightning.pytorch.utilities.{name}") for name in ("rank_zero", "warnings")]
-    before = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
+    logger = logging.getLogger("lightning.pytorch")
+    before = logger.level
+    logger.setLevel(logging.ERROR)
     try:
         with warnings.catch_warnings():
             for advice in (".*does not have many workers.*", ".*LeafSpec.*"):
                 warnings.filterwarnings("ignore", message=advice)
             yield
     finally:
-        for logger, level in zip(loggers, before, strict=True):
-            logger.setLevel(level)
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread for this process and for those that it starts, whose libraries read the variables when they load."""
-    kept, threads = {name: os.environ.get(name) for name in THREAD_VARIABLES}, torch.get_num_threads()
-    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-        for name in THREAD_VARIABLES:
-            del os.environ[name]
-        os.environ.update({name: value for name, value in kept.items() if value is not None})
-
-
-def _tested(jobs: Sequence[Job], processes: int) -> Iterator[tuple[Job, list[PairView]]]:
-    """Each job with what `Tester.test` returns, as they are finished."""
-    if processes == 1 or len(jobs) < 2:
-        tester = Tester()
-        for job in jobs:
-            yield job, tester.test(*job)
-        return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(processes, len(jobs)), mp_context=context, initializer=_process_tester)
-    try:
-        futures = {pool.submit(_test, *job): job for job in jobs}
-        for future in as_completed(futures):
-            yield futures[future], future.result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-@cache
-def _process_tester() -> Tester:
-    torch.set_num_threads(1)
-    return Tester()
-
-
-def _test(block: Block, indices: Sequence[int]) -> list[PairView]:
-    return _process_tester().test(block, indices)
+        logger.setLevel(before)
