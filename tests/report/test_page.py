@@ -13,6 +13,8 @@ from bpnp.report import read_results, write_page, write_results
 from bpnp.report.page.charts import chart_text, error_chart, page_charts, recall_chart
 from bpnp.report.page.text import headline_html
 from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
+from bpnp.report.results import CAUSES
+from bpnp.report.tables.rows import number
 
 
 class Elements(HTMLParser):
@@ -50,8 +52,14 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
         for key in ("rotation_error_deg", "translation_error", "reprojection_error_deg", "seconds", "inliers", "n"):
             shown = np.array(columns[own["numbers"][key]], float)
             np.testing.assert_allclose(shown, [getattr(r, key) for r in results.of(own["estimate"])], rtol=6e-5)
-        assert f'title="{results.estimates[own["estimate"]]["rotation_q2_deg"]}"' in text
+        median = results.estimates[own["estimate"]]["rotation_q2_deg"]
+        assert re.search(f'title="{re.escape(str(median))}">{re.escape(number(median))}</td>', text)
+        causes = [r.cause for r in results.of(own["estimate"])]
+        assert "".join(f"<td>{5 * causes.count(cause):.1f}%</td>" for cause in CAUSES) in text
     assert text.count("paper, MegaDepth: Lc Lp") == 2
+    (training,) = (chart for chart in map(json.loads, data["charts"]) if "Training" in chart["layout"]["title"]["text"])
+    assert [shape["x0"] for shape in training["layout"]["shapes"]] == [50, 50]  # where the pose loss joins
+    assert [note["text"] for note in training["layout"]["annotations"]] == ["a: pose loss", "b: pose loss"]
 
 
 def test_the_headline_says_what_was_tested(tmp_path: Path) -> None:

@@ -15,7 +15,6 @@ from report_data import HOSTILE, rows, view, write_run
 from bpnp.report import Results, write_page, write_results
 from bpnp.report.palette import DARK, LIGHT
 from bpnp.report.photos import box_of
-from bpnp.report.results import CAUSES
 from bpnp.report.samples import thin, write_views
 from bpnp.report.tables.rows import number
 
@@ -108,21 +107,6 @@ def floats(cells: list[str]) -> list[float]:
     return [float(cell) for cell in cells]
 
 
-def test_the_quartiles_are_those_of_the_files(page: Callable[..., Any], written: Any) -> None:
-    rows = page(
-        "return [...document.querySelectorAll('#quartile-table tbody tr')].map((row) =>"
-        "[...row.children].map((cell) => [cell.textContent, cell.title]))"
-    )
-    estimates = {f"{name}: {key}": v for name, r in written[1].items() for key, v in r.estimates.items()}
-    assert [row[0][0] for row in rows[:4]] == list(estimates)
-    for row in rows[:4]:
-        values = estimates[row[0][0]]
-        for (text, exact), key in zip(row[1:4], ("rotation_q1_deg", "rotation_q2_deg", "rotation_q3_deg"), strict=True):
-            assert text == number(values[key])
-            assert float(exact) == values[key]
-    assert ["paper, ModelNet40: Lc Lp R", "3.33", "8.09"] in [[cell[0] for cell in row[:3]] for row in rows[4:]]
-
-
 def test_tables_sort_and_the_best_is_bold(page: Callable[..., Any], written: Any) -> None:
     medians = [v["rotation_q2_deg"] for r in written[1].values() for v in r.estimates.values()]
     for order in (sorted(medians), sorted(medians, reverse=True)):
@@ -130,15 +114,6 @@ def test_tables_sort_and_the_best_is_bold(page: Callable[..., Any], written: Any
         column = "#quartile-table tbody tr:not(.paper) td:nth-child(3)"
         assert texts(page, column) == [number(value) for value in order]
     assert texts(page, "#quartile-table td.best:nth-child(3)") == [number(min(medians))]
-
-
-def test_recall_curves_are_read_out(page: Callable[..., Any], written: Any) -> None:
-    label = page("return document.querySelector('#recall .chart').getAttribute('aria-label')")
-    for name, results in written[1].items():
-        for estimate in ("ransac", "pnp"):
-            (share,) = re.findall(re.escape(f"{name}: {estimate} ends at ") + r"([\d.]+)%", label)
-            right = column(results, estimate, "rotation_error_deg") <= 90
-            assert float(share) == pytest.approx(100 * right.mean(), abs=0.051)
 
 
 def test_runs_are_switched_off_and_on_and_the_address_keeps_it(browser: Any, page: Callable[..., Any]) -> None:
@@ -185,14 +160,6 @@ def test_the_worst_pairs_come_first_and_filters_narrow_them(
     opened(browser, page("return location.href"))
     assert f"{len(chosen)} of {COUNT} pairs" in texts(page, "#place")[0]
     assert page("return document.getElementById('least').value") == "12.5"
-
-
-def test_shares_of_causes_are_those_of_the_rows(page: Callable[..., Any], written: Any) -> None:
-    row = texts(page, "#cause-table tbody tr:nth-child(2) td")[1:]
-    causes = [r.cause for r in written[1]["first"].of("pnp")]
-    expected = [f"{100 * causes.count(cause) / COUNT:.1f}%" for cause in CAUSES]
-    converged = column(written[1]["first"], "pnp", "converged").mean()
-    assert row == [*expected, f"{100 * converged:.1f}%"]
 
 
 def test_run_against_run_counts_the_better_pairs_and_opens_one(
@@ -296,12 +263,6 @@ def test_a_pair_opens_from_the_keyboard_and_arrows_go_through_the_list(browser: 
     assert not page("return document.getElementById('pair').open || location.hash.includes('open=')")
     opened(browser, page("return location.href.split('#')[0]") + "#open=scene%2F0042")
     assert texts(page, "#pair-title") == ["scene/0042"]
-
-
-def test_the_pose_loss_is_marked_where_it_joins(page: Callable[..., Any]) -> None:
-    layout = page("return JSON.parse(DATA.charts[document.querySelector('#training .chart').dataset.chart]).layout")
-    assert [shape["x0"] for shape in layout["shapes"]] == [50, 50]
-    assert [note["text"] for note in layout["annotations"]] == ["first: pose loss", "second: pose loss"]
 
 
 def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from report_data import row
 from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import PoseErrors, RecallThresholds
@@ -58,12 +59,6 @@ def pose_of(batch: Batch) -> Pose:
     assert batch.translation is not None
     stats = SolveStats(torch.tensor([5, 9]), torch.tensor([1e-9, 0.5]), torch.tensor([True, False]))
     return Pose(batch.rotation.clone(), batch.translation.clone(), stats)
-
-
-def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
-    values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
-    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
-    return dataclasses.replace(first, **changes)  # type: ignore[arg-type]
 
 
 def test_rows_of_a_planted_batch() -> None:
@@ -201,13 +196,6 @@ def test_a_full_disk_names_the_file_of_the_finished_pairs(tmp_path: Path) -> Non
         append_rows(tmp_path, [row(0)])
 
 
-def test_results_as_a_data_frame(tmp_path: Path) -> None:
-    rows = [row(i, rotation_error_deg=float(i)) for i in range(12)]
-    frame = write_results(tmp_path, rows).frame()
-    assert frame.rotation_error_deg.tolist() == [r.rotation_error_deg for r in rows]
-    assert frame[frame.cause == "solved"]["index"].tolist() == list(range(6))
-
-
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
@@ -258,8 +246,11 @@ def test_damaged_results_raise_one_clear_error(tmp_path: Path, damage: Callable[
         read_results(tmp_path)
 
 
-def test_results_give_their_errors_back(tmp_path: Path) -> None:
-    results = write_results(tmp_path, [row(2), row(1), row(1, "ransac"), row(2, "ransac")])
-    errors = results.errors("ransac")
+def test_results_give_their_errors_and_a_data_frame(tmp_path: Path) -> None:
+    results = write_results(tmp_path, [row(i, e, rotation_error_deg=float(i)) for i in (2, 1, 9) for e in ("pnp", "a")])
+    errors = results.errors("a")
     assert isinstance(errors, PoseErrors)
-    assert errors.rotation_deg.tolist() == [row(1).rotation_error_deg, row(2).rotation_error_deg]
+    assert errors.rotation_deg.tolist() == [1, 2, 9]
+    frame = results.frame()
+    assert frame.rotation_error_deg.tolist() == [r.rotation_error_deg for r in results.rows]
+    assert frame[frame.cause == "solved"]["index"].tolist() == [1, 1, 2, 2]

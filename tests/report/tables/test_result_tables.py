@@ -3,22 +3,16 @@ import io
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
+from report_data import row
 from rich.console import Console
 from rich.table import Table
 
-from bpnp.report import PairRow, Results, learning_table, recall_table, report, results_table, write_results
+from bpnp.report import Results, learning_table, recall_table, report, results_table, write_results
 from bpnp.report.page.text import quartiles_html
 from bpnp.report.runs import seed_groups
 from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.rows import number
-
-
-def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
-    values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
-    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
-    return dataclasses.replace(first, **changes)  # type: ignore[arg-type]
 
 
 def rendered(table: Table | FittedTable, width: int = 80) -> list[str]:
