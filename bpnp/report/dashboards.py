@@ -6,7 +6,6 @@ here only, when it is used.
 
 import os
 from collections.abc import Sequence
-from dataclasses import astuple, fields
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import numpy as np
 from bpnp.report.figures import plot_pair, recall_curve
 from bpnp.report.folder import read_results
 from bpnp.report.page.charts import RECALLS, recall_chart
-from bpnp.report.results import CAUSES, PairRow, Results, cause_shares
+from bpnp.report.results import Results, cause_shares
 from bpnp.report.samples import FEW, PairView, read_views
 
 MOST_PICTURES = 12
@@ -109,22 +108,15 @@ def workspace(entity: str, project: str) -> Any:
 
 def _tables(results: Results) -> dict[str, Any]:
     import wandb
+    from pandas import DataFrame
 
-    shares = {name: cause_shares(row for row in results.rows if row.estimate == name) for name in results.estimates}
-    keys = list(next(iter(results.estimates.values())))
-    return {
-        "test/quartiles": wandb.Table(
-            columns=["estimate", *keys],
-            data=[[name, *(values.get(key) for key in keys)] for name, values in results.estimates.items()],
-        ),
-        "test/causes": wandb.Table(
-            columns=["estimate", *CAUSES], data=[[name, *values.values()] for name, values in shares.items()]
-        ),
-        "test/pairs": wandb.Table(
-            columns=[field.name for field in fields(PairRow)],
-            data=[[_text(value) for value in astuple(row)] for row in results.rows],
-        ),
+    causes = {name: cause_shares(results.of(name)) for name in results.estimates}
+    frames = {
+        "quartiles": DataFrame({"estimate": name, **values} for name, values in results.estimates.items()),
+        "causes": DataFrame({"estimate": name, **shares} for name, shares in causes.items()),
+        "pairs": results.frame().map(_text),
     }
+    return {f"test/{name}": wandb.Table(dataframe=frame) for name, frame in frames.items()}
 
 
 def _curves(results: Results) -> dict[str, Any]:

@@ -13,11 +13,11 @@ import numpy as np
 
 from bpnp.files import written_whole
 from bpnp.report.page.charts import RECALLS, Error, sorted_errors, within
-from bpnp.report.palette import DASHES, LIGHT, QUIET, styles
+from bpnp.report.palette import DASHES, LIGHT, QUIET
 from bpnp.report.photos import box_of
 from bpnp.report.pictures import Lines, estimate_of, plot_image
 from bpnp.report.results import Results
-from bpnp.report.runs import read_runs
+from bpnp.report.runs import read_runs, series_of
 from bpnp.report.samples import Array, PairView
 from bpnp.report.solutions import solution_view
 
@@ -43,13 +43,11 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure"
 
     runs = runs if isinstance(runs, Mapping) else read_runs(runs)
     figure = Figure(figsize=(11, 3.2), layout="constrained")
-    shapes = styles({name: list(results.estimates) for name, results in runs.items()})
     for axes, (key, limit) in zip(figure.subplots(1, 4, sharey=True), LIMITS.items(), strict=True):
-        for (run, estimate), shape in shapes.items():
-            errors = sorted_errors(runs[run], estimate, key)
-            name = estimate if len(runs) == 1 else f"{run}: {estimate}"
+        for own in series_of(runs):
             limits = np.linspace(0, limit, POINTS)
-            axes.plot(limits, within(errors, limits), **line_style(*shape), label=_text(name))
+            shares = within(sorted_errors(runs[own.run], own.estimate, key), limits)
+            axes.plot(limits, shares, **line_style(own.colour, own.dashes), label=_text(own.label))
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")

@@ -6,9 +6,10 @@ import re
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from bpnp.report.folder import read_results
+from bpnp.report.palette import styles
 from bpnp.report.results import Results
 
 if TYPE_CHECKING:
@@ -41,10 +42,20 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
     )
 
 
-def labels(runs: Mapping[str, Results]) -> dict[tuple[str, str], str]:
-    """The name of each estimate of each run, with the run's only where there are several."""
-    keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
-    return {key: key[1] if len(runs) == 1 else f"{key[0]}: {key[1]}" for key in keys}
+class Series(NamedTuple):
+    """An estimate of a run as tables and figures show it. colour, dashes: indices of the palette."""
+
+    run: str
+    estimate: str
+    label: str
+    colour: int
+    dashes: int
+
+
+def series_of(runs: Mapping[str, Results]) -> list[Series]:
+    """Every estimate of every run, with the run's name only where there are several."""
+    shapes = styles({run: list(results.estimates) for run, results in runs.items()})
+    return [Series(*key, key[1] if len(runs) == 1 else ": ".join(key), *shape) for key, shape in shapes.items()]
 
 
 def trained_only(paths: Sequence[Path | str]) -> bool:

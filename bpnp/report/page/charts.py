@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.report.palette import DASHES, LIGHT, QUIET, styles
+from bpnp.report.palette import DASHES, LIGHT, QUIET
 from bpnp.report.results import Results
+from bpnp.report.runs import series_of
 from bpnp.report.samples import Array
 from bpnp.report.training_log import TrainingLog
 
@@ -52,72 +53,62 @@ def within(errors: Array, limits: Array) -> Array:
 def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
     """Share of pairs with an error up to a threshold, on a logarithmic axis (paper Fig. 3)."""
     title, unit, most = RECALLS[error]
-    known = {key: sorted_errors(runs[key[0]], key[1], error) for key in styles(_estimates(runs))}
-    finite = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in known.values()])
+    known = [sorted_errors(runs[own.run], own.estimate, error) for own in series_of(runs)]
+    finite = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in known])
     if not len(finite):
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = _figure(title, unit, "pairs up to this error", runs, log=True)
+    figure = _figure(title, unit, "pairs up to this error", log=True)
     figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
-    for key, errors in known.items():
-        _line(figure, runs, key, limits, within(errors, limits), "%{y:.1%}")
+    for place, errors in enumerate(known):
+        _line(figure, runs, place, limits, within(errors, limits), "%{y:.1%}")
     return figure
 
 
 def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
     """Median rotation error of groups of pairs of similar `size` ("m", "n" or "true_pairs")."""
-    figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees", runs, log=True)
+    figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees", log=True)
     figure.update_yaxes(type="log")
-    for run, estimate in styles(_estimates(runs)):
-        rows = runs[run].of(estimate)
+    for place, own in enumerate(series_of(runs)):
+        rows = sorted(runs[own.run].of(own.estimate), key=lambda row: getattr(row, size))
         x = np.array([getattr(row, size) for row in rows])
         if len(np.unique(x)) < 3:
             continue
-        order = np.argsort(x, kind="stable")
-        edges = np.searchsorted(x[order], np.unique(np.quantile(x, np.linspace(0, 1, GROUPS + 1)[1:-1])), side="right")
-        error = np.array([row.rotation_error_deg for row in rows])[order]
+        edges = np.searchsorted(x, np.unique(np.quantile(x, np.linspace(0, 1, GROUPS + 1)[1:-1])), side="right")
+        error = np.array([row.rotation_error_deg for row in rows])
         groups = [part for part in np.split(np.arange(len(x)), edges) if len(part)]
         medians = [max(float(np.median(error[part])), 1e-6) for part in groups]
-        _line(figure, runs, (run, estimate), [np.median(x[order][part]) for part in groups], medians, "%{y:.3g} deg")
+        _line(figure, runs, place, [np.median(x[part]) for part in groups], medians, "%{y:.3g} deg")
     return figure if figure.data else None
 
 
-def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
-    """Share of pairs done within a time; the estimates of a run are made together and share theirs."""
-    times = {
-        run: np.sort([row.seconds for row in results.of(next(iter(results.estimates)))])
-        for run, results in runs.items()
-    }
+def time_charts(runs: Mapping[str, Results]) -> "list[Figure]":
+    """Share of pairs done within a time, and cumulative seconds in the order of the data set.
+
+    The estimates of a run are made together and share their time.
+    """
+    first = {own.run: place for place, own in reversed(list(enumerate(series_of(runs))))}
+    times = {run: np.array([row.seconds for row in runs[run].of(next(iter(runs[run].estimates)))]) for run in first}
     positive = np.concatenate([values[values > 0] for values in times.values()])
     if not len(positive):
-        return None
+        return []
     limits = np.geomspace(positive.min() * 0.9, positive.max() * 1.1, POINTS)
-    figure = _figure("Pairs done within a time", "seconds per pair", "pairs within", runs, log=True)
-    figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
-    for run, values in times.items():
-        key = (run, next(iter(runs[run].estimates)))
-        _line(figure, runs, key, limits, within(values, limits), "%{y:.1%}", name=run)
-    return figure
-
-
-def total_time_chart(runs: Mapping[str, Results]) -> "Figure | None":
-    """Cumulative seconds in the order of the data set."""
-    figure = _figure("Cumulative run time", "pairs, in the order of the data set", "seconds", runs)
-    for run, results in runs.items():
-        first = next(iter(results.estimates))
-        seconds = np.cumsum([row.seconds for row in results.of(first)])
-        if seconds[-1] > 0:
-            shown = np.unique(np.linspace(0, len(seconds) - 1, POINTS).astype(int))
-            _line(figure, runs, (run, first), shown + 1, seconds[shown], "%{y:.3g} s", name=run)
-    return figure if figure.data else None
+    shares = _figure("Pairs done within a time", "seconds per pair", "pairs within", log=True)
+    shares.update_yaxes(range=[0, 1.01], tickformat=".0%")
+    total = _figure("Cumulative run time", "pairs, in the order of the data set", "seconds")
+    for run, values in reversed(times.items()):
+        _line(shares, runs, first[run], limits, within(np.sort(values), limits), "%{y:.1%}", name=run)
+        shown = np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))
+        _line(total, runs, first[run], shown + 1, np.cumsum(values)[shown], "%{y:.3g} s", name=run)
+    return [shares, total]
 
 
 def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
     """Losses and the validation error over the steps; a dashed line marks the first step with the pose loss."""
     charts = []
     for title, (keys, log) in TRAINING.items():
-        figure = _figure(title, "step", "", {})
+        figure = _figure(title, "step", "")
         figure.update_yaxes(type="log" if log else "linear")
         for place, (run, own) in enumerate(logs.items()):
             known = [key for key in keys if key in own.curves and (key == keys[0] or own.switch_step is not None)]
@@ -153,18 +144,14 @@ def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) ->
     sections: dict[str, Sequence[Figure | None]] = {
         "recall": [recall_chart(runs, error) for error in RECALLS],
         "errors": [error_chart(runs, size) for size in SIZES],
-        "time": [time_chart(runs), total_time_chart(runs)],
+        "time": time_charts(runs),
         "training": training_charts(logs),
     }
     known = {name: [chart for chart in charts if chart is not None] for name, charts in sections.items()}
     return {name: charts for name, charts in known.items() if charts}
 
 
-def _estimates(runs: Mapping[str, Results]) -> dict[str, list[str]]:
-    return {name: list(results.estimates) for name, results in runs.items()}
-
-
-def _figure(title: str, x: str, y: str, runs: Mapping[str, Results], *, log: bool = False) -> "Figure":
+def _figure(title: str, x: str, y: str, *, log: bool = False) -> "Figure":
     from plotly.graph_objects import Figure
 
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
@@ -176,15 +163,13 @@ def _figure(title: str, x: str, y: str, runs: Mapping[str, Results], *, log: boo
 
 
 def _line(
-    figure: "Figure", runs: Mapping[str, Results], key: tuple[str, str], x: Any, y: Any, hover: str, *, name: str = ""
+    figure: "Figure", runs: Mapping[str, Results], place: int, x: Any, y: Any, hover: str, name: str = ""
 ) -> None:
-    run, estimate = key
-    colour, dash = styles(_estimates(runs))[key]
-    label = name or (estimate if len(runs) == 1 else f"{run}: {estimate}")
+    """Add a line in the style of the series at `place`, by which the page finds it."""
+    own = series_of(runs)[place]
     figure.add_scatter(
-        x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=label, mode="lines",
-        meta=list(styles(_estimates(runs))).index(key),
-        line={"color": LIGHT[colour], "dash": _dash(dash), "width": 2}, hovertemplate=hover,
+        x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=name or own.label, mode="lines", meta=place,
+        line={"color": LIGHT[own.colour], "dash": _dash(own.dashes), "width": 2}, hovertemplate=hover,
     )  # fmt: skip
 
 

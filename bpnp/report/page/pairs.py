@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.palette import styles
 from bpnp.report.results import CAUSES, PairRow, Results
-from bpnp.report.runs import labels
+from bpnp.report.runs import series_of
 from bpnp.report.samples import FEW, Array, PairView, spread_key, thin
 
 VIEW_POINTS = 300  # most points a side of a pair
@@ -39,14 +38,13 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     def place(values: Iterable[Any]) -> int:
         return columns.setdefault(tuple(values), len(columns))
 
-    shapes = styles({name: list(results.estimates) for name, results in runs.items()})
     series = [
         {
-            "run": run, "estimate": estimate, "name": name, "colour": f"c{shapes[run, estimate][0]}",
-            "ids": place(shown_id(row.id) for row in runs[run].of(estimate)),
-            "numbers": {key: place(values) for key, values in _columns(runs[run].of(estimate)).items()},
+            "run": own.run, "estimate": own.estimate, "name": own.label, "colour": f"c{own.colour}",
+            "ids": place(shown_id(row.id) for row in runs[own.run].of(own.estimate)),
+            "numbers": {key: place(values) for key, values in _columns(runs[own.run].of(own.estimate)).items()},
         }
-        for (run, estimate), name in labels(runs).items()
+        for own in series_of(runs)
     ]  # fmt: skip
     return {"series": series, "columns": list(columns)}
 

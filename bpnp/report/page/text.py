@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.report.palette import DASHES, styles
+from bpnp.report.palette import DASHES
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
-from bpnp.report.runs import labels
+from bpnp.report.runs import Series, series_of
 from bpnp.report.tables.published import Paper
 from bpnp.report.tables.result_tables import CAPTION
 from bpnp.report.tables.rows import RESULT_COLUMNS, best_texts, cell, run_rows
@@ -93,8 +93,8 @@ def _plain(value: Any) -> bool:
 def series_boxes(runs: Mapping[str, Results]) -> str:
     """A checkbox for each estimate of each run that shows and hides it."""
     return "".join(
-        f'<label><input type="checkbox" id="series{i}" data-state checked>{swatch}{visible(label)}</label>'
-        for i, (label, swatch) in enumerate(zip(labels(runs).values(), _swatches(runs), strict=True))
+        f'<label><input type="checkbox" id="series{i}" data-state checked>{_named(own)}</label>'
+        for i, own in enumerate(series_of(runs))
     )
 
 
@@ -105,12 +105,12 @@ def quartiles_html(runs: Mapping[str, Results], paper: Paper | None) -> str:
     head = "".join(
         f'<th scope="col"><button type="button">{visible(column.header)}</button></th>' for column in RESULT_COLUMNS
     )
-    swatches = _swatches(runs)
+    shown = series_of(runs)
     body = ""
     for i, row in enumerate(rows):
-        own = i < len(swatches)
+        own = i < len(shown)
         body += f'<tr data-series="{i}">' if own else f'<tr class="{"seeds" if row.seeds else "paper"}">'
-        body += f'<th scope="row">{swatches[i] if own else ""}{visible(row.name)}</th>'
+        body += f'<th scope="row">{_named(shown[i]) if own else visible(row.name)}</th>'
         for column in RESULT_COLUMNS:
             text, value = cell(column, row.values), row.values.get(column.key)
             mark = " class=best" if own and text == best[column.key] else ""
@@ -130,18 +130,18 @@ def causes_html(runs: Mapping[str, Results]) -> str:
         f'<th scope="col"><span class="fill cause{i}"></span> {cause}</th>' for i, cause in enumerate(CAUSES)
     )
     body = ""
-    for i, (key, swatch) in enumerate(zip(labels(runs), _swatches(runs), strict=True)):
-        results = runs[key[0]]
-        shares = cause_shares(results.of(key[1]))
+    for i, own in enumerate(series_of(runs)):
+        results = runs[own.run]
+        shares = cause_shares(results.of(own.estimate))
         bar = "".join(
             f'<span class="cause{place}" style="width: {100 * share:.2f}%"></span>'
             for place, share in enumerate(shares.values()) if share
         )  # fmt: skip
         cells = "".join(f"<td>{100 * share:.1f}%</td>" for share in shares.values())
         body += (
-            f'<tr data-series="{i}"><th scope="row">{swatch}{visible(labels(runs)[key])}</th>'
+            f'<tr data-series="{i}"><th scope="row">{_named(own)}</th>'
             f'<td><div class="bar" aria-hidden="true">{bar}</div></td>{cells}'
-            f"<td>{100 * results.estimates[key[1]].get('converged', float('nan')):.1f}%</td></tr>"
+            f"<td>{100 * results.estimates[own.estimate].get('converged', float('nan')):.1f}%</td></tr>"
         )
     return (
         f'<div class="wide"><table id="cause-table"><thead><tr><th scope="col">estimate</th><th></th>{head}'
@@ -151,11 +151,9 @@ def causes_html(runs: Mapping[str, Results]) -> str:
     )
 
 
-def _swatches(runs: Mapping[str, Results]) -> list[str]:
-    """A line in the colour and the dashes of each estimate."""
-    shapes = styles({name: list(results.estimates) for name, results in runs.items()})
-    return [
-        f'<svg class="swatch" aria-hidden="true" viewBox="0 0 28 10"><path d="M0,5H28" '
-        f'style="stroke: var(--c{colour})" stroke-dasharray="{" ".join(map(str, DASHES[dash]))}"/></svg>'
-        for colour, dash in shapes.values()
-    ]
+def _named(own: Series) -> str:
+    """A line in the colour and the dashes of a series, and its label."""
+    return (
+        f'<svg class="swatch" aria-hidden="true" viewBox="0 0 28 10"><path d="M0,5H28" style="stroke: '
+        f'var(--c{own.colour})" stroke-dasharray="{" ".join(map(str, DASHES[own.dashes]))}"/></svg>{visible(own.label)}'
+    )

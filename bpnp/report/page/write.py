@@ -21,7 +21,7 @@ from bpnp.report.page.text import causes_html, headline_html, options, quartiles
 from bpnp.report.palette import INKS
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.results import CAUSES
-from bpnp.report.runs import labels, named_runs, trained_only
+from bpnp.report.runs import named_runs, series_of, trained_only
 from bpnp.report.samples import read_views
 from bpnp.report.tables.published import Paper
 from bpnp.report.training_log import TrainingLog, read_training_log
@@ -76,7 +76,7 @@ def page_html(
     views = {name: read_views(path) for name, path in folders.items()}
     charts = page_charts(runs, logs)
     figures = [chart for section in charts.values() for chart in section]
-    names = list(labels(runs).values())
+    names = [own.label for own in series_of(runs)]
     sections = {
         **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
         **(

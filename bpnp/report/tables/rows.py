@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from bpnp.metrics import RecallThresholds, pose_recalls
 from bpnp.report.results import Results
-from bpnp.report.runs import labels, seed_groups, with_spread
+from bpnp.report.runs import seed_groups, series_of, with_spread
 from bpnp.report.tables.published import NAMES, PUBLISHED, Paper
 
 Values = Mapping[str, float | int | str]
@@ -75,10 +75,10 @@ RECALL_COLUMNS = tuple(
 def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Row]:
     """A row per run and estimate, then mean and spread of the runs that differ by their seeds, then what is printed."""
     known = {}
-    for run, estimate in labels(runs):
+    for run, estimate, *_ in series_of(runs):
         standard = pose_recalls(runs[run].errors(estimate), STANDARD_POINTS)
         known[run, estimate] = runs[run].estimates[estimate] | {key: float(value) for key, value in standard.items()}
-    rows = [Row(label, known[key]) for key, label in labels(runs).items()]
+    rows = [Row(own.label, known[own.run, own.estimate]) for own in series_of(runs)]
     rows += [Row(label, values, seeds=True) for label, values in with_spread(known, seed_groups(runs))]
     return rows + paper_rows(paper)
 
