@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.report import PairRow, Results, write_results
 from bpnp.report.samples import PairView, write_views
+from bpnp.types import Batch
 
 HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcff"
 
@@ -40,6 +41,28 @@ def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) 
                 PairRow(i, name, estimate, *errors, inliers, m, n, min(m, n), 12, 1e-8, converged, found, seconds)
             )
     return planted
+
+
+def planted(sizes: tuple[int, ...], clutter: int) -> Batch:
+    """Exact pairs; the last `clutter` points of each side have no match, and matches are shuffled."""
+    rng = np.random.default_rng(0)
+    sets2d, sets3d, matches = [], [], []
+    rotation = Rotation.random(len(sizes), rng=rng).as_matrix()
+    for i, size in enumerate(sizes):
+        points = rng.uniform(-1, 1, (size, 3))
+        camera = points @ rotation[i].T + [0, 0, 4]
+        order = rng.permutation(size - clutter)
+        match = np.full(size, -1)
+        match[: size - clutter] = order
+        image = rng.uniform(-1, 1, (size, 2))
+        image[order] = (camera[:, :2] / camera[:, 2:])[: size - clutter]
+        sets2d.append(image)
+        sets3d.append(points)
+        matches.append(match)
+    translation = np.tile([0.0, 0.0, 4.0], (len(sizes), 1))
+    return Batch.from_arrays(
+        sets2d, sets3d, list(rotation), list(translation), matches, ids=[f"pair {i}" for i in range(len(sizes))]
+    )
 
 
 def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:

@@ -4,30 +4,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from report_data import planted
 from scipy.spatial.transform import Rotation
 
 from bpnp.report.samples import FEW, PairView, read_views, select_views, thin, views_from, write_views
 from bpnp.types import Batch, Pose, Prediction, SolveStats
-
-
-def planted(sizes: tuple[int, ...], clutter: int) -> Batch:
-    """Exact pairs; the last `clutter` points of each side have no match, and matches are shuffled."""
-    rng = np.random.default_rng(0)
-    sets2d, sets3d, matches = [], [], []
-    rotation = Rotation.random(len(sizes), rng=rng).as_matrix()
-    for i, size in enumerate(sizes):
-        points = rng.uniform(-1, 1, (size, 3))
-        camera = points @ rotation[i].T + [0, 0, 4]
-        order = rng.permutation(size - clutter)
-        match = np.full(size, -1)
-        match[: size - clutter] = order
-        image = rng.uniform(-1, 1, (size, 2))
-        image[order] = (camera[:, :2] / camera[:, 2:])[: size - clutter]
-        sets2d.append(image)
-        sets3d.append(points)
-        matches.append(match)
-    translation = np.tile([0.0, 0.0, 4.0], (len(sizes), 1))
-    return Batch.from_arrays(sets2d, sets3d, list(rotation), list(translation), matches)
 
 
 def answered(batch: Batch, degrees: float = 10.0) -> Prediction:
