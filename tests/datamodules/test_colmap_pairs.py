@@ -102,13 +102,3 @@ def test_images_with_too_few_points_are_skipped_and_counted(tmp_path: Path) -> N
         ColmapSource(scenes, min_points=7)
     with pytest.raises(ValueError, match="`clutter` of 0 or more, got -0.1"):
         ColmapSource(scenes, clutter=-0.1)
-
-
-def test_real_images_are_pairs_within_the_reconstruction_error(shared_data: Path) -> None:
-    for scene in ("castle-P30", "sceaux_castle_txt", "walkthrough"):
-        reconstruction = read_reconstruction(shared_data / "colmap" / scene / "sparse" / "0", name=scene)
-        pairs = ColmapSource([reconstruction], clutter=0.5)
-        for index in range(0, len(pairs.images), 9):
-            pair = pairs.pair(index)
-            assert len(pair.points2d) <= np.ceil(1.5 * pair.matched)
-            assert np.median(residuals(pair)) * pair.focal < 2.5

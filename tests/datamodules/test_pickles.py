@@ -127,13 +127,6 @@ TAMPERED = {
 }
 
 
-def test_tampered_arrays_are_refused(tmp_path: Path) -> None:
-    for tampered in TAMPERED.values():
-        (tmp_path / "x.pkl").write_bytes(pickle.dumps([tampered], 2))
-        with pytest.raises(PickleError, match=r"x\.pkl"):
-            load_pickle(tmp_path / "x.pkl")
-
-
 OPCODES = {
     "objects behind a number's type": b"cnumpy\ndtype\n(U\x02V8K\x00K\x01tR(K\x03U\x01|N(U\x01atp}NK\x08K\x01K\x00tb.",
     "another type's fields": b"cnumpy\ndtype\n(U\x02f8K\x00K\x01tR(K\x03U\x01<N(U\x01at}J\x08\0\0\0K\x01K\x00tb.",
@@ -156,9 +149,9 @@ OPCODES = {
 }
 
 
-def test_strange_and_broken_pickles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_strange_tampered_and_broken_pickles_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    for content in OPCODES.values():
+    for content in [*OPCODES.values(), *(pickle.dumps([tampered], 2) for tampered in TAMPERED.values())]:
         Path("x.pkl").write_bytes(content)
         with pytest.raises(PickleError, match=r"x\.pkl: ."):
             load_pickle(Path("x.pkl"))

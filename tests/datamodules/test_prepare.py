@@ -74,7 +74,7 @@ def names(store: Store) -> list[str]:
     return [store.name(row) for row in range(len(store))]
 
 
-def zipped(root: Path, *, folders: Callable[[str], str] = str) -> Path:
+def zipped(root: Path, folders: Callable[[str], str] = str) -> Path:
     path = root.with_suffix(".zip")
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for file in sorted(root.rglob("*.off")):
@@ -98,27 +98,23 @@ def check(store: Store, root: Path) -> None:
         assert store.columns["radius"][row] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("form", ["folder", "parent", "zip"])
+@pytest.mark.parametrize("form", ["folder", "parent", "zip", "zip in capitals", "folder in capitals"])
 def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: Path, form: str) -> None:
-    source = {"folder": lambda: meshes, "parent": lambda: meshes.parent, "zip": lambda: zipped(meshes)}[form]()
+    """The same splits, whether a folder is `train` or `Train`, and the data module opens them."""
+    source = meshes if form == "folder" else meshes.parent
+    if "zip" in form or "capitals" in form:
+        splits = {"train": "Train", "test": "TEST"} if "capitals" in form else {}
+        source = zipped(meshes, lambda name: "/".join(splits.get(part, part) for part in name.split("/")))
+    if form == "folder in capitals":
+        zipfile.ZipFile(source).extractall(tmp_path / "unpacked")
+        source = tmp_path / "unpacked"
     prepared = run(source, tmp_path / "out" / "store")
     assert prepared.counts == {"train": 8, "test": 4}
     check(opened(tmp_path / "out" / "store"), meshes)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["store"]
-
-
-@pytest.mark.parametrize("form", ["folder", "zip"])
-def test_split_folders_in_capitals_are_the_same_splits(meshes: Path, tmp_path: Path, form: str) -> None:
-    """What has been prepared can be opened, whether the folder is `train` or `Train`."""
-    source = zipped(meshes, folders=lambda name: name.replace("train", "Train").replace("test", "TEST"))
-    if form == "folder":
-        source = tmp_path / "unpacked"
-        zipfile.ZipFile(meshes.with_suffix(".zip")).extractall(source)
-    assert run(source, tmp_path / "store").counts == {"train": 8, "test": 4}
-    data = MeshDataModule(str(tmp_path / "store"), num_points=16, pool_size=32, train_pairs=8, val_fraction=0.2)
+    data = MeshDataModule(str(prepared.folder), num_points=16, pool_size=32, train_pairs=8, val_fraction=0.2)
     data.setup()
-    assert len(data.datasets["train"].source.rows) == 6
-    assert len(data.datasets["test"]) == 4
+    assert (len(data.datasets["train"].source.rows), len(data.datasets["test"])) == (6, 4)
 
 
 def test_several_processes_give_the_same_bytes(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

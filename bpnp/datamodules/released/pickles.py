@@ -20,10 +20,8 @@ def load_pickle(path: Path) -> Any:
             if not isinstance(content, (dict, list, tuple, np.ndarray)):
                 raise pickle.UnpicklingError(f"a bare {type(content).__name__} is refused")
         except Exception as error:
-            raise PickleError(
-                f"expected a pickle of numpy arrays, plain containers and numbers, got {path}: "
-                f"{error!r}; try the authors' file as it was downloaded"
-            ) from error
+            got = f"{path}: {error!r}; try the authors' file as it was downloaded"
+            raise PickleError(f"expected a pickle of numpy arrays, plain containers and numbers, got {got}") from error
     return content
 
 
