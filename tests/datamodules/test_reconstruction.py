@@ -1,9 +1,8 @@
 import logging
 import shutil
-import struct
 import subprocess
 import sys
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from planted_model import HEIGHT, WIDTH, plant_model
 
 from bpnp.cameras import camera_models, colmap_camera
+from bpnp.datamodules.colmap.model_files import ModelRecords, read_records
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
@@ -53,13 +53,21 @@ def test_planted_points_come_back_through_every_camera_model(model: str, tmp_pat
         assert image.focal == pytest.approx(expected, rel=1e-6)
 
 
-def test_keypoints_outside_the_field_of_view_are_dropped_and_counted(tmp_path: Path, caplog) -> None:
+def editable(folder: Path, monkeypatch: pytest.MonkeyPatch) -> ModelRecords:
+    """What the files of a model hold, to be changed before the model is read."""
+    records = read_records(folder)
+    copies = [replace(im, keypoints=im.keypoints.copy(), point_ids=im.point_ids.copy()) for im in records.images]
+    records = replace(records, images=copies)
+    monkeypatch.setattr("bpnp.datamodules.colmap.reconstruction.read_records", lambda _: records)
+    return records
+
+
+def test_keypoints_outside_the_field_of_view_are_dropped_and_counted(tmp_path: Path, monkeypatch, caplog) -> None:
     """At 300 pixels a radian a fisheye pixel 600 from the centre looks backwards: x/z means nothing."""
     plant_model(tmp_path, camera=FISHEYE, images=1)
-    keypoints = image_keypoints(tmp_path / "images.bin")
-    keypoints["position"][3] = (400.0 + 600.0, 300.0)  # of a 3D point
-    keypoints["position"][-2] = (400.0, 300.0 - 600.0)  # clutter
-    rewrite_keypoints(tmp_path / "images.bin", keypoints)
+    keypoints = editable(tmp_path, monkeypatch).images[0].keypoints
+    keypoints[3] = 400.0 + 600.0, 300.0  # of a 3D point
+    keypoints[-2] = 400.0, 300.0 - 600.0  # clutter
     with caplog.at_level(logging.WARNING):
         found = read_reconstruction(tmp_path)
     assert found.lost == {"keypoints that could not be undistorted": 2}
@@ -67,12 +75,11 @@ def test_keypoints_outside_the_field_of_view_are_dropped_and_counted(tmp_path: P
     assert (len(found.images[0].points2d), len(found.images[0].clutter2d)) == (39, 11)
 
 
-def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path) -> None:
+def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path, monkeypatch) -> None:
     truth = plant_model(tmp_path, images=1)
-    keypoints = image_keypoints(tmp_path / "images.bin")
-    keypoints[-1] = keypoints[5]
-    keypoints["position"][5] += 3.0
-    rewrite_keypoints(tmp_path / "images.bin", keypoints)
+    image = editable(tmp_path, monkeypatch).images[0]
+    image.keypoints[-1], image.point_ids[-1] = image.keypoints[5], image.point_ids[5]
+    image.keypoints[5] += 3.0
     found = read_reconstruction(tmp_path)
     assert found.lost == {"repeated keypoints": 1}
     np.testing.assert_array_equal(found.images[0].seen, truth.seen[0])
@@ -80,20 +87,14 @@ def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path) -> None:
     assert len(found.images[0].clutter2d) == 11
 
 
-def test_bad_points_are_dropped_and_counted(tmp_path: Path) -> None:
+def test_bad_points_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
     """A NaN point leaves the scene, a point behind a camera leaves its pairs, an unknown one is no clutter."""
     truth = plant_model(tmp_path, images=1)
-    a, b, c = truth.seen[0][:3]
-    behind = truth.rotations[0].T @ (np.array([0, 0, -1.0]) - truth.translations[0])
-    content = bytearray((tmp_path / "points3D.bin").read_bytes())
-    for place, point_id in point_places(content):
-        if point_id == a + 1:
-            struct.pack_into("<3d", content, place + 8, *[np.nan] * 3)
-        if point_id == b + 1:
-            struct.pack_into("<3d", content, place + 8, *behind)
-        if point_id == c + 1:
-            struct.pack_into("<q", content, place, 999_999)
-    (tmp_path / "points3D.bin").write_bytes(content)
+    records = editable(tmp_path, monkeypatch)
+    nan, behind, unknown = (np.flatnonzero(records.point_ids == seen + 1) for seen in truth.seen[0][:3])
+    records.points3d[nan] = np.nan
+    records.points3d[behind] = truth.rotations[0].T @ (np.array([0, 0, -1.0]) - truth.translations[0])
+    records.point_ids[unknown] = 999_999
     found = read_reconstruction(tmp_path)
     assert found.lost == {
         "points that are not finite": 1,
@@ -105,20 +106,10 @@ def test_bad_points_are_dropped_and_counted(tmp_path: Path) -> None:
     np.testing.assert_allclose(image.points2d, truth.points2d[0][3:], atol=1e-6)
 
 
-def point_places(content: bytes) -> Iterator[tuple[int, int]]:
-    """Where each record of a points3D.bin begins, and its id."""
-    place = 8
-    for _ in range(struct.unpack_from("<Q", content)[0]):
-        yield place, struct.unpack_from("<q", content, place)[0]
-        place += 51 + 8 * struct.unpack_from("<Q", content, place + 43)[0]
-
-
-def test_an_image_with_a_broken_pose_is_skipped_and_counted(tmp_path: Path) -> None:
+def test_an_image_with_a_broken_pose_is_skipped_and_counted(tmp_path: Path, monkeypatch) -> None:
     plant_model(tmp_path)
-    content = bytearray((tmp_path / "images.bin").read_bytes())
-    for name, quaternion in ((b"photo 0.jpg", (0, 0, 0, 0)), (b"photo 2.jpg", (np.nan, 0, 0, 1))):
-        struct.pack_into("<4d", content, content.index(name) - 60, *quaternion)
-    (tmp_path / "images.bin").write_bytes(content)
+    images = editable(tmp_path, monkeypatch).images
+    images[0].quaternion[:], images[2].quaternion[0] = 0, np.nan
     found = read_reconstruction(tmp_path)
     assert (len(found.images), found.lost) == (1, {"images with a broken pose": 2})
 
@@ -197,17 +188,3 @@ def test_binary_and_text_give_the_same(scene: str | None, request, tmp_path: Pat
     (tmp_path / "text").mkdir()
     pycolmap.Reconstruction(tmp_path / "binary").write_text(tmp_path / "text")
     assert equal(read_reconstruction(tmp_path / "binary"), read_reconstruction(tmp_path / "text"))
-
-
-KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])
-
-
-def image_keypoints(path: Path) -> np.ndarray:
-    """The keypoints of a file of one image: the last thing in it."""
-    content = path.read_bytes()
-    start = content.index(b".jpg\0") + 5 + 8
-    return np.frombuffer(content[start:], KEYPOINT).copy()
-
-
-def rewrite_keypoints(path: Path, keypoints: np.ndarray) -> None:
-    path.write_bytes(path.read_bytes()[: -keypoints.nbytes] + keypoints.tobytes())
