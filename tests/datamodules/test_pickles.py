@@ -92,6 +92,7 @@ CALLS = {
     "bytearray": (Call(bytearray, 10**12), "bytearray"),
     "a namespace": (types.SimpleNamespace(a=1), "SimpleNamespace"),
     "a record type": (np.zeros(2, [("a", "f8"), ("b", "O")]), "type"),
+    "a type in a type": (Call(np.dtype, ("i8", [("a", "O")])), "type"),
     "a text array": (np.array(["a"]), "type"),
     "dates": (np.array(["2020"], "M8[Y]"), "type"),
     "a masked array": (np.ma.masked_array([1, 2], [0, 1]), "refused"),
