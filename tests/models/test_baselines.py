@@ -111,6 +111,30 @@ def test_softposit_starts_at_the_mean_of_the_papers_cameras() -> None:
     np.testing.assert_allclose(pose.translation[0].numpy(), [0, 0, 4.5], atol=1e-6)
 
 
+def test_softposit_starts_at_random_on_the_ray_of_the_images_centre() -> None:
+    problem = plant(1, 9, seed=3)
+    poses = [SoftPOSIT(start="random", max_steps=0, seed=s)(problem.batch()).poses["softposit"] for s in (0, 0, 1)]
+    for pose in poses:
+        centre = pose.rotation @ problem.points3d.mean(1).unsqueeze(-1) + pose.translation.unsqueeze(-1)
+        seen = centre[:, :2, 0] / centre[:, 2:, 0]
+        torch.testing.assert_close(seen, problem.points2d.mean(1))
+    assert torch.equal(poses[0].rotation, poses[1].rotation)
+    assert not torch.equal(poses[0].rotation, poses[2].rotation)
+
+
+@pytest.mark.parametrize(
+    ("solver", "options", "message"),
+    [
+        (RandomRansac, {"time_limit": None}, "expected `time_limit` or `max_hypotheses`, got neither"),
+        (RandomRansac, {"confidence": 0.0}, r"expected `threshold` > 0, `confidence` in \(0, 1\], got 0.01 and 0.0"),
+        (Hungarian, {"checkpoint": "x.ckpt", "net": BPnPNet()}, "expected `checkpoint` or `net`, got both"),
+    ],
+)
+def test_options_that_mean_nothing_are_named(solver: type, options: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        solver(**options)
+
+
 def test_slack_scalings_balance_every_real_row_and_column() -> None:
     kernel = torch.rand(2, 7, 9) + 0.01
     u, v = slack_scalings(kernel, slack=1e-3, tolerance=1e-7, max_iterations=2000)

@@ -8,7 +8,7 @@ import torch
 from planted import Planted, padded, plant, posed
 from scipy.spatial.transform import Rotation
 from small_data import small_net
-from torch import Tensor
+from torch import Tensor, nn
 
 from bpnp import Batch, Pose, Prediction
 from bpnp.geometry import bearings, transform
@@ -18,6 +18,7 @@ from bpnp.training.losses import (
     correspondence_losses,
     matching_likelihood_loss,
     matching_losses,
+    own_losses,
     pairs_within,
     pose_loss,
     reprojection_loss,
@@ -263,3 +264,14 @@ def test_says_what_is_missing() -> None:
         )
     with pytest.raises(ValueError, match="with matching_loss correspondence, got likelihood"):
         BlindPnPTask(matching_loss="likelihood", correspondence_angle=0.1)
+
+
+def test_a_loss_of_the_users_is_one_number_a_pair() -> None:
+    loss, batch = nn.Identity(), plant(2, 6).batch()
+    loss.forward = lambda prediction, batch: torch.tensor([2.0, math.nan])
+    losses = own_losses(loss, Prediction(), batch)
+    assert losses.matched.tolist() == [True, False]
+    assert float(losses.total.mean()) == 2
+    loss.forward = lambda prediction, batch: torch.zeros(())
+    with pytest.raises(ValueError, match=r"expected a tensor of shape \(2,\) from Identity, got \(\)"):
+        own_losses(loss, Prediction(), batch)
