@@ -84,19 +84,16 @@ class Augmentation:
             raise ValueError(f'expected `clutter_side` "both", "2d" or "3d", got {self.clutter_side!r}')
 
     @property
-    def clutter2d(self) -> float:
-        return 0.0 if self.clutter_side == "3d" else self.clutter
-
-    @property
-    def clutter3d(self) -> float:
-        return 0.0 if self.clutter_side == "2d" else self.clutter
+    def clutters(self) -> tuple[float, float]:
+        """`clutter` of the 2D side and of the 3D side."""
+        return 0.0 if self.clutter_side == "3d" else self.clutter, 0.0 if self.clutter_side == "2d" else self.clutter
 
     def sizes(self, counts: Counts) -> NDArray[np.int64]:
         """Most points of the larger side of each augmented pair (k,)."""
         kept = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
         extra2d, extra3d = (
             np.minimum(count - counts.matched, np.rint(ratio * np.maximum(kept, 1)))
-            for count, ratio in ((counts.points2d, self.clutter2d), (counts.points3d, self.clutter3d))
+            for count, ratio in zip((counts.points2d, counts.points3d), self.clutters, strict=True)
         )
         added = np.floor(bounds(self.outliers.ratio)[1] * kept)
         return (kept + np.maximum(extra2d, extra3d) + added).astype(np.int64)
@@ -181,7 +178,7 @@ def _amounts(how: Augmentation, total: Tensor, batch: Batch, keys: Tensor) -> tu
     added2d, added3d = _on_sides(how.outliers.side, side)
     extra2d, extra3d = (
         torch.minimum((clutter * kept.clamp(min=1)).round().clamp(max=2**31).long(), count[:, None] - total)
-        for clutter, count in ((how.clutter2d, batch.count2d), (how.clutter3d, batch.count3d))
+        for clutter, count in zip(how.clutters, (batch.count2d, batch.count3d), strict=True)
     )
     return (
         true,
