@@ -1,5 +1,6 @@
 """`bpnp fit`, `validate`, `test` and `predict`: Lightning's own command line, with this project's run folder."""
 
+import re
 import sys
 from argparse import SUPPRESS
 from collections.abc import Sequence
@@ -121,8 +122,9 @@ class BpnpCLI(LightningCLI):
         folder = Path(_checkpoint_folder(self.trainer.default_root_dir))
         if path == "last" and not list(folder.glob("last*.ckpt")):
             raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
-        trained = [name for name in ("checkpoint", "pretrained") if name in str(self._get(self.config, "model.solver"))]
-        if subcommand != "fit" and path is None and not trained and any(True for _ in self.model.parameters()):
+        trained = re.search("checkpoint|pretrained", str(self._get(self.config, "model.solver")))
+        given = path or self._get(self.config, "model.weights") or trained
+        if subcommand != "fit" and not given and any(True for _ in self.model.parameters()):
             sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
 
 

@@ -127,9 +127,10 @@ def test_packaged_weights_are_found_by_name_wherever_a_checkpoint_is_taken(name:
         assert type(net) is kind
 
 
-def test_a_test_takes_packaged_weights_by_name(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize("option", ["--ckpt_path", "--model.weights"])
+def test_a_test_takes_packaged_weights_by_name(option: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sizes = ["--data.num_points=24", "--data.test_shapes=1", "--data.pool_size=64", *folders(tmp_path)]
-    main(["test", "--config=quickstart", "--ckpt_path=procedural-euler", *sizes])
+    main(["test", "--config=quickstart", f"{option}=procedural-euler", *sizes])
     assert (tmp_path / "run" / "test" / "summary.json").is_file()
     assert "untrained" not in capsys.readouterr().err
 
