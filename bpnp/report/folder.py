@@ -14,18 +14,18 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import astuple, fields
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from bpnp import __version__
 from bpnp.files import named, written_whole
 from bpnp.metrics import RecallThresholds
 from bpnp.report.results import PairRow, Results, pipeline_order, summarise
 
 FORMAT = 1
-COLUMNS = tuple(field.name for field in fields(PairRow))
 UNFINISHED = "unfinished.csv"
 PARSE: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
+COLUMNS = {field.name: PARSE[field.type] for field in fields(PairRow)}  # and what reads their texts
 
 
 def write_results(
@@ -49,7 +49,7 @@ def write_results(
         estimates=summarise(ordered, thresholds=thresholds),
         correspondence_loss=correspondence_loss,
         settings=plain(dict(settings or {})),
-        bpnp_version=_version(),
+        bpnp_version=__version__,
         written=datetime.now(UTC).isoformat(timespec="seconds"),
     )
     summary = {
@@ -157,7 +157,7 @@ def _rows(path: Path, *, cut: bool = False) -> tuple[PairRow, ...]:
             raise ValueError(f"expected {len(header)} columns in {path}, line {number}, got {len(cells)}")
         row = dict(zip(header, cells, strict=True))
         try:
-            rows.append(PairRow(**{field.name: PARSE[field.type](row[field.name]) for field in fields(PairRow)}))
+            rows.append(PairRow(**{name: parse(row[name]) for name, parse in COLUMNS.items()}))
         except (ValueError, KeyError) as error:
             raise ValueError(f"expected numbers in {path}, line {number}, got {error}") from error
     if not rows and not cut:
@@ -180,13 +180,6 @@ def _ordered(rows: Iterable[PairRow]) -> tuple[PairRow, ...]:
     if len(first) != len(ids) * len(counts):
         raise ValueError(f"expected each estimate for all {len(ids)} pairs, got {dict(counts)}")
     return tuple(sorted(first.values(), key=lambda row: (row.index, pipeline_order(row.estimate))))
-
-
-def _version() -> str:
-    try:
-        return version("bpnp")
-    except PackageNotFoundError:  # run from its source
-        return "unknown"
 
 
 def _encoded(rows: Iterable[Iterable[Any]]) -> bytes:
