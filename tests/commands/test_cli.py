@@ -73,6 +73,11 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
         (["test", *MESHES, "--ckpt_path=nothing.ckpt"], "nothing.ckpt"),
         (["report", "nowhere"], "expected a results folder"),
+        (
+            ["view", "nowhere"],
+            "expected the folder of a test or the JSON of a solution, got nowhere, which is not there",
+        ),
+        (["view", __file__, "pair"], "expected no pair beside the solution"),
         (["report", "nowhere", "--paper", "modelnet"], "expected paper as modelnet40 or megadepth, got 'modelnet'"),
     ],
 )

@@ -21,6 +21,7 @@ from bpnp.report.pictures import solution_picture
 
 PLANTED = plant(1, 40, seed=2)
 X, P = PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy()
+UP = ["--up_camera", "0", "-1", "0", "--up_scene", "0", "0", "1"]
 CAMERA = ["--camera", "SIMPLE_PINHOLE,800,320,240"]
 
 
@@ -106,6 +107,10 @@ def test_gravity_is_three_numbers_of_either_side(tmp_path: Path, capsys: pytest.
         (lambda files: [*files, "--solver", "search2"], "expected `solver`"),
         (lambda files: [*files, "--solver", "nothing.ckpt"], "nothing.ckpt"),
         (lambda files: [*files, "--prior", "nothing.json"], "nothing.json"),
+        (lambda files: [*files, *UP[:4]], "expected --up_camera and --up_scene together"),
+        (lambda files: [*files, *UP, "--prior", "a.json"], "expected --prior or --up_camera with --up_scene, got both"),
+        (lambda files: [*files, "--image", "a.jpg"], "--image with a COLMAP model as --camera, got 'a.jpg' alone"),
+        (lambda files: [*files, "--photo", "a.jpg"], "expected --photo with --picture and --camera, got it without"),
         (lambda files: [*files, "--time-limit", "0"], "positive `time_limit`"),
         (lambda files: [*files, "--surface", "100"], "a mesh to draw 100 points from"),
         (lambda files: [*files, "--picture", "a.jpeg"], "--picture that ends in .png, .svg, .pdf"),
