@@ -77,6 +77,7 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
             ["view", "nowhere"],
             "expected the folder of a test or the JSON of a solution, got nowhere, which is not there",
         ),
+        (["view", __file__], "test_cli.py: expected"),
         (["view", __file__, "pair"], "expected no pair beside the solution"),
         (["report", "nowhere", "--paper", "modelnet"], "expected paper as modelnet40 or megadepth, got 'modelnet'"),
     ],
