@@ -5,7 +5,8 @@ Methods: views (the three views given that share most points with the photo), ma
 the same with SIFT descriptors, a ratio test and PoseLib.
 pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of all
 photos, aligned by the views that both models have. Keypoints: OpenCV's SIFT for the first two, those of COLMAP's
-database for the others. Seconds are those of matching and of the pose, without detection.
+database for the others. Seconds are those of matching and of the pose, without detection. Rows in --output are kept:
+a run that was interrupted goes on where it was.
 """
 
 import argparse
@@ -107,7 +108,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="JSON to write the rows to")
     options = parser.parse_args()
-    rows: list[dict] = []
+    kept_rows = options.output is not None and options.output.is_file()
+    rows: list[dict] = json.loads(options.output.read_text()) if kept_rows else []
     for name in options.scenes:
         kept = options.maps / f"{name}-{options.features}"
         scene = PhotoScene(options.data / "photos" / name, kept, tuple(options.camera), options.features)
@@ -115,7 +117,11 @@ def main() -> None:
         names = [photo for photo in scene.names() if photo in full.view_numbers]
         count = min(options.limit or len(names), len(names))
         for photo in (names[int(k * len(names) / count)] for k in range(count)):
-            done = turn_rows(scene, photo, full, options.methods, time_limit=options.time_limit, seed=options.seed)
+            before = {row["method"] for row in rows if row["photo"] == f"{name}/{photo}"}
+            methods = [method for method in options.methods if method not in before]
+            if not methods:
+                continue
+            done = turn_rows(scene, photo, full, methods, time_limit=options.time_limit, seed=options.seed)
             for row in done:
                 print(f"{row['photo']:24s} {summary([row])}", flush=True)
             rows += done
