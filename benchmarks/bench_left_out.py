@@ -31,15 +31,25 @@ Answer = tuple[Array, Array, str]  # rotation, translation, verdict
 
 
 def answers(
-    scene: PhotoScene, photo: str, place: SceneMap, views: list[str], methods: Sequence[str], **search: Any
+    scene: PhotoScene,
+    photo: str,
+    place: SceneMap,
+    views: list[str],
+    methods: Sequence[str],
+    *,
+    scored: bool,
+    **search: Any,
 ) -> dict[str, Callable[[], Answer]]:
-    """What finds the photo, by method; reading and detecting is done before. search: options of `SceneMap.localize`."""
+    """What finds the photo, by method; reading and detecting is done before.
+
+    scored: whether the search is told the scales of the keypoints. search: options of `SceneMap.localize`.
+    """
     found = detected_keypoints(scene.photos / photo)
     described = DescribedMap(scene.without(photo), scene.database) if any("sift" in m for m in methods) else None
 
     def by_keypoints(views: list[str] | None) -> Answer:
         camera = ("PINHOLE", scene.camera)
-        solution = place.localize(found.pixels, camera, views=views, scores=found.scores, **search)
+        solution = place.localize(found.pixels, camera, views=views, scores=found.scores if scored else None, **search)
         return solution.rotation, solution.translation, solution.verdict
 
     def by_descriptors(views: list[str] | None) -> Answer:
@@ -105,6 +115,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     parser.add_argument("--limit", type=int, help="photos of a scene, evenly spread (default: all)")
     parser.add_argument("--time-limit", type=float, help="seconds of a search (default: none)")
+    parser.add_argument("--unscored", action="store_true", help="try all keypoints that are detected, not the largest")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--output", type=Path, help="JSON to write the rows to")
     options = parser.parse_args()
@@ -121,7 +132,8 @@ def main() -> None:
             methods = [method for method in options.methods if method not in before]
             if not methods:
                 continue
-            done = turn_rows(scene, photo, full, methods, time_limit=options.time_limit, seed=options.seed)
+            search = {"time_limit": options.time_limit, "seed": options.seed, "scored": not options.unscored}
+            done = turn_rows(scene, photo, full, methods, **search)
             for row in done:
                 print(f"{row['photo']:24s} {summary([row])}", flush=True)
             rows += done

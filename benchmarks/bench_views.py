@@ -6,7 +6,7 @@ as `PosePrior`), auto (the same, with the packaged matcher where the search is i
 of the distance off, 2 s); the packaged networks by themselves, in the axes that they expect; learned (around the pose
 of one); oracle (RANSAC on the true pairs). Photos are left out of their map.
 solve, view-prior, auto and rough-prior use the cones from which the points are seen; --known: these, and the lengths of
-the tracks, or nothing.
+the tracks, or nothing. --elsewhere: each photo against the views of another scene; none may be confident.
 """
 
 import argparse
@@ -14,6 +14,7 @@ import json
 import time
 import warnings
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -136,6 +137,15 @@ def measured(pair: ViewPair, method: str, seed: int, time_limit: float | None) -
     }  # fmt: skip
 
 
+def elsewhere(pairs: Sequence[ViewPair]) -> list[ViewPair]:
+    """The views of each pair with the photo of the pair that comes half of them later."""
+    others = [*pairs[len(pairs) // 2 :], *pairs[: len(pairs) // 2]]
+    return [
+        replace(pair, points2d=other.points2d, focal=other.focal, match3d=np.full_like(pair.match3d, -1))
+        for pair, other in zip(pairs, others, strict=True)
+    ]
+
+
 def turned_by(rotation: Array) -> float:
     """Angle of a rotation, degrees."""
     return float(np.degrees(Rotation.from_matrix(rotation).magnitude()))
@@ -177,6 +187,7 @@ def main() -> None:
     )
     parser.add_argument("--all-points", action="store_true", help="do not thin to 1,024")
     parser.add_argument("--best", action="store_true", help="for k = 1 the view that overlaps most, not a random one")
+    parser.add_argument("--elsewhere", action="store_true", help="photos of other scenes, with two or more scenes")
     parser.add_argument("--limit", type=int, default=12, help="photos of a scene (default: 12)")
     parser.add_argument(
         "--known", nargs="*", choices=sorted(KNOWN), default=["cones"], help="of the points (default: cones)"
@@ -196,6 +207,8 @@ def main() -> None:
             for name in options.scenes
             for pair in scene_pairs(options.data, name, outliers=outliers, **chosen)
         ]  # fmt: skip
+        if options.elsewhere:
+            pairs = elsewhere(pairs)
         for method in options.methods:
             rows = [measured(pair, method, options.seed, options.time_limit) for pair in pairs]
             row = {"method": method, "views": options.views, "outliers": outliers} | summary(rows)

@@ -25,7 +25,7 @@ MOST_KEYPOINTS = (
     2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
 )
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
-BRIEF = replace(DEFAULT, max_batches=1, beside_poses=0)  # one batch that is looked up
+BRIEF = replace(DEFAULT, max_batches=1, beside_poses=0, anywhere=())  # one batch that is looked up
 LONGER = replace(DEFAULT, max_batches=8, beside_poses=0)  # four of each kind, as many as must find a doubtful pose
 PROMISING = 3  # views that are tried longer if none is confident
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import cache
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from bpnp.compilation import NEVER, Deadline
 from bpnp.search.annealing import finish, run_batch
+from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
@@ -91,6 +92,7 @@ def search_poses(
         rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
         candidates = replace(few.candidates, rotation=rotation, translation=translation)
     batches, best = 0, -math.inf
+    cones = sets.cones3d is not None and not is_few(sets)  # few points were enumerated
     searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
 
     def finished(poses: Candidates, annealed: int) -> SearchResult:
@@ -106,6 +108,26 @@ def search_poses(
             return None
         result = finished(candidates[np.isfinite(candidates.log10_false_alarms)], 1)
         return result if result.verdict == "confident" else None
+
+    def different(parts: list[Candidates]) -> Candidates:
+        together = Candidates.concatenated(parts)
+        return best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
+
+    def looks() -> Iterator[Candidates]:
+        """Poses that clusters hide, look after look."""
+        yield from around_each(turned)
+        for rule in settings.anywhere if cones else ():
+            yield (found := anywhere(scene, rule))
+            yield from around_each(different([found]))
+
+    def around_each(poses: Candidates) -> Iterator[Candidates]:
+        since = 0  # looks since the best log-likelihood was bettered
+        for k in range(len(poses)):
+            if since == settings.beside_patience:
+                break
+            best = float(candidates.score[0])
+            yield beside(scene, poses[k : k + 1], settings.beside)
+            since = 0 if candidates.score[0] > best else since + 1
 
     exhausted = False
     while searched < settings.max_batches and not (exhausted or deadline.passed()):
@@ -129,22 +151,19 @@ def search_poses(
         settled = stalled or is_unique(leaders, sets, rule)
         if settled and (safe := certain(leaders)) is not None:
             return safe
-        together = Candidates.concatenated([turned, found])
-        turned = best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
+        turned = different([turned, found])
         exhausted = is_exhausted(candidates, scene, searched - bettered)
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
-    if result.log10_false_alarms > 0 and len(candidates) and candidates.hits[0] <= batches / 2:
-        since = 0  # looks since the best log-likelihood was bettered
-        for k in range(len(turned)):
-            if deadline.passed() or since == settings.beside_patience:
-                break
-            best = float(candidates.score[0])
-            candidates = merged([candidates, beside(scene, turned[k : k + 1], settings.beside)], scene)
-            since = 0 if candidates.score[0] > best else since + 1
+    ended_alike = len(candidates) and candidates.hits[0] > batches / 2
+    if result.log10_false_alarms > 0 and (cones or not ended_alike) and not deadline.passed():
+        for found in looks():
+            candidates = merged([candidates, found], scene)
             candidates, leaders = _weighed_leaders(candidates, scene, sets)
             if (safe := certain(leaders)) is not None:
                 return safe
+            if deadline.passed():
+                break
         result = finished(candidates, settings.finished)
     if proposals is None or result.verdict == "confident" or deadline.passed():
         return result

@@ -45,17 +45,23 @@ def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> 
 
 def likeliest(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
-    scale = rule.first_scale
-    raster = raster_of(scene, rule, scale)
+    raster = raster_of(scene, rule, rule.first_scale)
     for points, kept in zip(rule.points, rule.kept, strict=True):
         poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
-    again = scene.sides(points=rule.points_again)[1]
+    return narrowed(scene, poses, rule)
+
+
+def narrowed(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
+    """Distinct poses from those that are left at the first scale: step by step to the last one, annealed."""
+    again, scale = scene.sides(points=rule.points_again)[1], rule.first_scale
     for step in range(1, rule.steps + 1):
         if scene.deadline.passed():
             break
         scale = rule.first_scale * (rule.last_scale / rule.first_scale) ** (step / rule.steps)
-        raster = raster_of(scene, rule, scale)
-        poses = looked_up(scene, moved(scene, poses, scale, rule.copies), raster, again, rule.kept[-1])
+        copies, family, kept = moved(scene, poses, scale, rule.copies), 1, rule.kept[-1]
+        if rule.halved:
+            family, kept = rule.copies, kept // 2**step
+        poses = looked_up(scene, copies, raster_of(scene, rule, scale), again, kept, family)
     outliers = max(scene.settings.outliers, rule.outliers)
     return anneal_on_points(scene, poses[: rule.annealed], scale * scene.spread, outliers=outliers)
 
@@ -94,8 +100,10 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
     return turned_about_middle(scene, rotation, translation, vectors, shifts, hits=1)
 
 
-def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int) -> Candidates:
-    """The `kept` poses under which the points fall best, best first."""
+def looked_up(
+    scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int, family: int = 1
+) -> Candidates:
+    """The `kept` poses under which the points fall best, best first; of `family` in a row the best one only."""
     side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
@@ -103,7 +111,8 @@ def looked_up(scene: Scene, poses: Candidates, raster: Raster, points: WeightedP
         add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight)
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
-    return poses[np.argsort(-score[:done], kind="stable")[:kept]]
+    best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
+    return poses[best[np.argsort(-score[best], kind="stable")[:kept]]]
 
 
 def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:

@@ -8,8 +8,7 @@ from dataclasses import dataclass, replace
 class Recipe:
     """How the starts of a batch are drawn around the weak-perspective pose.
 
-    off_centre: 0 puts the mean of the 3D points on the mean bearing; up to 1, a point between it and any 3D point, for
-        cameras that see a part of the scene.
+    off_centre: 0 puts the mean of the 3D points on the mean bearing; 1, any 3D point, for cameras that see a part.
     log_depth: the depth is multiplied by exp(u), u uniform in [-log_depth, log_depth].
     """
 
@@ -22,8 +21,7 @@ class ClusterStage:
     """Annealing of many poses on weighted clusters of both sides.
 
     clusters: of each side, at most; one iteration costs their number squared.
-    first_scale, last_scale: in spreads of the bearings. iterations: scales from one to the other, one Gauss-Newton step
-        each.
+    first_scale, last_scale: in spreads of the bearings. iterations: from one to the other, a Gauss-Newton step each.
     kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
     """
 
@@ -77,12 +75,12 @@ class Nearby:
     width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
     points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each.
     first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
-        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other; with
-        factors below 0.7 the narrower optimum is lost more often. With 0 there is the first scale alone.
-    copies: of a pose at each step. points_again: 3D points that are looked up there.
-    annealed: poses that are annealed on all points from the last scale.
-    background: scale of the density that is chance, in scales. cells: of the raster, a scale; most_cells: a side.
-    outliers: share of the points without a partner, at least. starts_a_check: between two looks at the clock.
+        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
+        factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
+    copies: of a pose at each step. points_again: 3D points that are looked up there. halved: half of the poses go on
+        each time, the best copy of each, so that those of some do not crowd out the others.
+    annealed: on all points from the last scale. outliers: share without a partner, at least. cells: of the raster, a
+        scale; most_cells: a side. background: scales of the density that is chance. starts_a_check: of the clock.
     """
 
     starts: int = 2**17
@@ -96,6 +94,7 @@ class Nearby:
     steps: int = 5
     copies: int = 16
     points_again: int = 1500
+    halved: bool = False
     annealed: int = 40
     background: float = 8.0
     cells: float = 2.0
@@ -157,23 +156,20 @@ class Evidence:
 class SearchSettings:
     """All of it; the stages are described in docs/search.md.
 
-    max_batches: full batches of starts. starts: of a full one; 1200 rotations leave no gap over 25 degrees.
+    max_batches: full batches of starts. recipes: of them, in turn. starts: of a full one; 1200 leave no gap of 25 deg.
     first_starts: of the first batch; each next one has twice as many until it is full. Easy pairs need no more. A small
         batch hands on the square root of its share of a full one from stage to stage, and least_kept at least.
-    recipes: of the batches, in turn.
-    least_annealed: points of the smaller side; fewer are only enumerated (`bpnp.search.few`), since the soft assignment
-        of so few has no smooth optimum.
+    least_annealed: points of the smaller side; fewer are enumerated only (`search.few`): they have no smooth optimum.
     outliers: share of the points without a partner that the assignment expects where the caller gives none.
     end_outliers: shares that the best poses are annealed with in the last stage too, and the likelihood chooses.
     least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
-    around: batches from a guess of the pose before those from anywhere.
+    around: batches from a guess of the pose before those from anywhere. kept: candidates, from batch to batch.
     refined_directly: starts of `refine_poses` that need no clusters.
-    beside: how poses around the likeliest `beside_poses`, no two turned by less than `beside_deg`, are looked up, if
-        the batches end without a pose that exceeds chance: among many outliers the right pose is no optimum on
-        clusters, but is often some degrees beside one. After `beside_patience` without a likelier pose it ends.
-    kept: candidates, from batch to batch.
+    anywhere, beside: rules of the looks after batches without a pose that exceeds chance, since clusters hide the right
+        one among many outliers: around the likeliest `beside_poses`, no two turned by less than `beside_deg`, until
+        `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
@@ -193,6 +189,10 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
+    anywhere: tuple[Nearby, ...] = (
+        Nearby(2**13, points=(300,), kept=(2**12,), copies=32, halved=True),
+        Nearby(2**14, points=(300,), kept=(2**12,), first_scale=0.09, steps=6, copies=32, halved=True),
+    )
     beside: Nearby = Nearby(
         2**17, 10.0, 0.1, 2**15, (50, 300), (2**14, 2**9), 0.03, 0.015, 2, 16, points_again=600, annealed=12
     )

@@ -1,0 +1,79 @@
+"""From where points are seen leads to poses among outliers that hide them from the annealing on clusters."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.anywhere import best_shifts, drawn_in_cones, shifted
+from bpnp.search.candidates import Candidates
+from bpnp.search.many import search_poses
+from bpnp.search.nearby import raster_of
+from bpnp.search.point_sets import PointSets
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
+
+Array = NDArray[np.float64]
+CONE = np.cos(np.radians(35))
+
+
+def seen_in_cones(seed: int, true: int, outliers: int) -> tuple[PointSets, Array, Array]:
+    """Bearings and points of which `true` are pairs, all seen from within 35 degrees of a direction 20 degrees off."""
+    rng = np.random.default_rng(seed)
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
+    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
+    depth = rng.uniform(3.5, 6.5, (len(plane), 1))
+    points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
+    seen = plane + 1e-3 * rng.standard_normal(plane.shape)
+    bearings = np.column_stack([seen, np.ones(len(seen))])
+    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+    image, scene = np.r_[:true, true : true + outliers], np.r_[:true, true + outliers : len(points)]
+    towards = -rotation.T @ translation - points[scene]
+    axes = Rotation.from_rotvec([0.35, 0, 0]).apply(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
+    sets = PointSets(bearings[image], points[scene], axes, cosines3d=np.full(len(scene), CONE))
+    return sets, rotation, translation
+
+
+def test_a_pose_among_six_outliers_a_true_pair_is_found_within_the_cones() -> None:
+    """Without these starts the best pose of the search is 2 degrees off."""
+    sets, rotation, translation = seen_in_cones(0, true=150, outliers=900)
+    found = search_poses(sets, settings=replace(DEFAULT, max_batches=2))
+    np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
+    np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+
+
+def test_a_camera_that_looks_beside_the_scene_is_aimed_at_it() -> None:
+    sets, rotation, translation = seen_in_cones(0, true=300, outliers=100)
+    scene = Scene(sets, 0, DEFAULT)
+    turn, moved = scene.enter(rotation, translation)
+    beside = Rotation.from_rotvec([0.11, -0.17, 0]).as_matrix().astype(np.float32)
+    aside = Candidates.unscored((beside @ turn)[None], (beside @ moved)[None])
+    scale = 0.06
+    raster = raster_of(scene, replace(DEFAULT.nearby, cells=1.0), scale)
+    _, shift = best_shifts(aside, raster, scene.sides()[1])
+    aimed = shifted(aside, shift)
+    off = Rotation.from_matrix(aimed.rotation[0] @ turn.T).magnitude()
+    assert off < 1.5 * scale * scene.spread + 0.11 * 0.17
+    assert shifted(aimed, -shift).rotation[0] == pytest.approx(aside.rotation[0], abs=1e-2)
+
+
+def test_starts_see_a_point_within_its_cone_and_the_middle_in_front() -> None:
+    sets, *_ = seen_in_cones(1, true=60, outliers=60)
+    scene = Scene(sets, 0, DEFAULT)
+    starts = drawn_in_cones(scene, 500)
+    np.testing.assert_allclose(
+        starts.rotation @ starts.rotation.transpose(0, 2, 1), np.tile(np.eye(3), (500, 1, 1)), atol=1e-5
+    )
+    np.testing.assert_allclose(np.linalg.det(starts.rotation), 1, atol=1e-5)
+    middle = starts.rotation @ scene.bulk3d.mean(0) + starts.translation
+    np.testing.assert_allclose(middle[:, :2], 0, atol=1e-4)
+    assert (middle[:, 2] > 0).all()
+    centre = -np.einsum("sij,si->sj", starts.rotation, starts.translation)
+    towards = centre[:, None] - scene.points3d
+    towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    within = (towards * scene.seen.cones[:, :3]).sum(-1) > scene.seen.cones[:, 3] - 1e-4
+    assert within.any(1).all()
+    roll = np.arctan2(starts.rotation[:, 0, 1], starts.rotation[:, 0, 0])
+    assert np.histogram(roll, 6, (-np.pi, np.pi))[0].min() > 30
