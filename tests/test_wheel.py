@@ -34,7 +34,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_it_holds_what_is_used_and_no_more(wheel: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     for name in ("py.typed", "configs/quickstart.yaml", "configs/presets/debug.yaml", "weights/procedural-so3.ckpt",
-                 "report/page/assets/page.html", "report/page/assets/pairs.js"):  # fmt: skip
+                 "report/page/assets/page.html", "report/page/assets/page.js"):  # fmt: skip
         assert f"bpnp/{name}" in names
     assert any(name.endswith("LICENSE") for name in names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bpnp"}
