@@ -9,6 +9,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any, TypeVar
 
 import torch
+from threadpoolctl import threadpool_limits
 
 Result = TypeVar("Result")
 
@@ -72,6 +73,7 @@ def _run(work: Callable[..., Any], items: Sequence[int], ticket: Any, results: C
     """Work on the next item until there is none."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
     torch.set_num_threads(1)
+    threadpool_limits(1)  # numpy's BLAS has threads of its own, which would wait for each other's cores
     try:
         while True:
             with ticket.get_lock():
