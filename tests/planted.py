@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -104,6 +105,20 @@ def _normal(generator: torch.Generator, *shape: int) -> Tensor:
 def directions(points: Any) -> Any:
     """Unit vectors along points (..., 3)."""
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def view_with_outliers(
+    rng: np.random.Generator, true: int, outliers: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Bearings, points, rotation and translation; the first `true` of both are pairs with noise of 1e-3, and as many
+    outliers of each fill the frame."""
+    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
+    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
+    depth = rng.uniform(3.5, 6.5, (len(plane), 1))
+    points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
+    bearings = directions(np.column_stack([plane + 1e-3 * rng.standard_normal(plane.shape), np.ones(len(plane))]))
+    image, scene = np.r_[:true, true : true + outliers], np.r_[:true, true + outliers : len(points)]
+    return bearings[image], points[scene], rotation, translation
 
 
 def degrees_between(one: Any, other: Any) -> float:

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.anywhere import best_shifts, drawn_in_cones, shifted
@@ -22,17 +23,9 @@ CONE = np.cos(np.radians(35))
 def seen_in_cones(seed: int, true: int, outliers: int) -> tuple[PointSets, Array, Array]:
     """Bearings and points of which `true` are pairs, all seen from within 35 degrees of a direction 20 degrees off."""
     rng = np.random.default_rng(seed)
-    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
-    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
-    depth = rng.uniform(3.5, 6.5, (len(plane), 1))
-    points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
-    seen = plane + 1e-3 * rng.standard_normal(plane.shape)
-    bearings = np.column_stack([seen, np.ones(len(seen))])
-    bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
-    image, scene = np.r_[:true, true : true + outliers], np.r_[:true, true + outliers : len(points)]
-    towards = -rotation.T @ translation - points[scene]
-    axes = Rotation.from_rotvec([0.35, 0, 0]).apply(towards / np.linalg.norm(towards, axis=-1, keepdims=True))
-    sets = PointSets(bearings[image], points[scene], axes, cosines3d=np.full(len(scene), CONE))
+    bearings, points, rotation, translation = view_with_outliers(rng, true, outliers)
+    axes = Rotation.from_rotvec([0.35, 0, 0]).apply(directions(-rotation.T @ translation - points))
+    sets = PointSets(bearings, points, axes, cosines3d=np.full(len(points), CONE))
     return sets, rotation, translation
 
 

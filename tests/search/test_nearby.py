@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import degrees_between, directions
+from planted import degrees_between, directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import Deadline
@@ -25,16 +25,9 @@ Array = NDArray[np.float64]
 def cluttered(seed: int, true: int = 80, outliers: int = 220) -> tuple[Array, Array, Array, Array]:
     """Bearings and points in random order and their pose; noise of 1e-3, and outliers that fill the frame of both."""
     rng = np.random.default_rng(seed)
-    rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
-    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
-    depth = rng.uniform(3.5, 6.5, (len(plane), 1))
-    points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
-    seen = plane + 1e-3 * rng.standard_normal(plane.shape)
-    rays = np.column_stack([seen, np.ones(len(seen))])
-    bearings = directions(rays)
-    image = np.r_[:true, true : true + outliers]
-    scene = np.r_[:true, true + outliers : true + 2 * outliers]
-    return bearings[rng.permutation(image)], points[rng.permutation(scene)], rotation, translation
+    bearings, points, rotation, translation = view_with_outliers(rng, true, outliers)
+    image, scene = rng.permutation(len(bearings)), rng.permutation(len(points))
+    return bearings[image], points[scene], rotation, translation
 
 
 def off(rotation: Array, translation: Array, points: Array, rng: np.random.Generator) -> PosePrior:
