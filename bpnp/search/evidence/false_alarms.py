@@ -16,7 +16,9 @@ at most 1 / b (Markov). From this follow
 
 T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2). The three largest
 x_i are left out, whatever their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number
-of image points within 2 s of point i: keypoints that lie together are one observation. The mean over a fixed set of
+of image points within 2 s of point i: keypoints that lie together are one observation. So is the place of a clump: of
+log x_i, what is gained from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where
+more points lie within 2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of
 (s, w) counts what was looked at. A prior reduces T to the share of the poses that it allows.
 
 A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
@@ -114,8 +116,8 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
 
 
 def _log_evidence(sets: PointSets, seen: Array) -> Array:
-    """log of sum_w prod_i x_i^(1 / c_i) / (S W), the largest x_i left out, at each of S scales, of points seen in
-    directions (n, 3)."""
+    """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
+    points seen in directions (n, 3)."""
     logs = point_evidence(sets, seen, sets.image.scales, SHARES)
     terms = sets.image.weights @ logs
     fixing = np.partition(terms * sets.image.together[:, :, None], len(logs) - FIXING, 0)[-FIXING:]

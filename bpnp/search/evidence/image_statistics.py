@@ -25,7 +25,8 @@ class ImageStatistics:
     plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
     most 4 pi.
     scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
-    chosen: (k,) places of the image points that are looked at. weights: (k, S, S), see `_weights`.
+    chosen: (k,) places of the image points that are looked at. together: (k, S) how many lie within `TOGETHER` scales.
+    weights: (k, S, S) of the evidence, see `_weights`.
     """
 
     def __init__(self, bearings: Array, floor: float | None) -> None:
