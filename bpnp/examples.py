@@ -1,12 +1,15 @@
 """Problems to try, with the true pose.
 
-Nothing is downloaded: the points come from the generators that the package trains on.
+Nothing is downloaded: the points come from the generators that the package trains on, photos are drawn.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from PIL import Image, ImageDraw, ImageEnhance
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.meshes.procedural import procedural_shape
@@ -17,6 +20,17 @@ Kind = Literal["mesh", "photo", "leds"]
 CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # of 1280 x 960 pixels
 NOISE_PX = 0.5
 LEDS, LIGHTS = 17, 3
+PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's, pixels
+TEXELS = 80.0  # of a texture, a metre: about as many as the photos have pixels
+LIGHT = (0.95, 0.6, 0.8, 0.7, 1.0, 0.4)  # on the faces of a box towards -y, y, -x, x, z, -z
+COLOURS = {
+    "brick": np.array([(150, 70, 60), (180, 90, 70), (190, 170, 150), (90, 50, 40), (190, 200, 200)]),
+    "ground": np.array([(70, 110, 60), (110, 120, 80), (150, 150, 140), (100, 90, 90), (60, 80, 50)]),
+    "wood": np.array([(170, 110, 60), (120, 70, 40), (200, 150, 90), (180, 190, 200)]),
+    "slate": np.array([(60, 70, 90), (90, 100, 120), (50, 50, 60), (120, 130, 140)]),
+}  # RGB
+Array = np.ndarray[Any, np.dtype[np.float64]]
+Face = tuple[Array, Array, Array, Image.Image]  # corner, edges a and b (metres, a x b outward), texture
 
 
 @dataclass(frozen=True)
@@ -26,12 +40,12 @@ class Example:
     normals3d: (n, 3) outward normals, None where points have none.
     """
 
-    points2d: np.ndarray[Any, np.dtype[np.float64]]
-    points3d: np.ndarray[Any, np.dtype[np.float64]]
-    camera: np.ndarray[Any, np.dtype[np.float64]]
-    rotation: np.ndarray[Any, np.dtype[np.float64]]
-    translation: np.ndarray[Any, np.dtype[np.float64]]
-    normals3d: np.ndarray[Any, np.dtype[np.float64]] | None = None
+    points2d: Array
+    points3d: Array
+    camera: Array
+    rotation: Array
+    translation: Array
+    normals3d: Array | None = None
 
     def rotation_error_deg(self, rotation: Any) -> float:
         """Angle between a rotation and the true one, degrees."""
@@ -94,3 +108,85 @@ def _leds(rng: np.random.Generator) -> Example:
 def _pixels(points: Any, rotation: Any, translation: Any) -> Any:
     camera = points @ rotation.T + translation
     return camera[:, :2] / camera[:, 2:] @ CAMERA[:2, :2].T + CAMERA[:2, 2]
+
+
+def draw_photos(folder: Path | str, *, count: int = 14, seed: int = 0) -> dict[str, tuple[Array, Array]]:
+    """Draw photos of a house and some boxes, taken on an arc around them, for COLMAP to build a map from.
+
+    Writes 00.png, 01.png, ... into the folder, seen by `PHOTO_CAMERA`. Returns the true pose of each by its name:
+    rotation (3, 3) and translation (3,), camera = R p + t, metres.
+    """
+    rng = np.random.default_rng(seed)
+    faces, poses = _place(rng), {}
+    Path(folder).mkdir(parents=True, exist_ok=True)
+    for number, angle in enumerate(np.radians(np.linspace(-75, 15, count))):
+        distance, height = rng.uniform(8, 10), rng.uniform(1.5, 3.4)
+        centre = np.array([distance * np.sin(angle), -distance * np.cos(angle), height])
+        forward = rng.uniform(-0.5, 0.5, 3) + [-0.5, -0.5, 1.1] - centre  # to the corner of the house
+        right = np.cross(forward, [0, 0, 1])
+        axes = np.stack([right, np.cross(forward, right), forward])
+        upright = axes / np.linalg.norm(axes, axis=1, keepdims=True)
+        rotation = Rotation.from_euler("z", rng.normal(0, 3), degrees=True).as_matrix() @ upright
+        name = f"{number:02d}.png"
+        poses[name] = rotation, -rotation @ centre
+        _seen(faces, *poses[name]).save(Path(folder) / name)
+    return poses
+
+
+def _place(rng: np.random.Generator) -> list[Face]:
+    """Ground, a house with a flat roof, and boxes around its corner."""
+    edges = np.diag([15.0, 14.0, 0.0])
+    faces = [(np.array([-7.0, -8.0, 0.0]), edges[0], edges[1], _texture(15, 14, "ground", rng))]
+    for corner, size, colours in (
+        ((-2.0, -1.0, 0.0), (5.0, 4.0, 3.2), "brick"),
+        ((-2.3, -1.3, 3.2), (5.6, 4.6, 0.3), "slate"),
+        ((-3.6, -2.6, 0.0), (1.2, 1.0, 1.0), "wood"),
+        ((1.0, -3.0, 0.0), (1.5, 1.2, 0.8), "wood"),
+        ((-4.5, 1.0, 0.0), (1.0, 1.6, 1.5), "slate"),
+    ):
+        low, (x, y, z) = np.array(corner), np.diag(size)
+        sides = (low, x, z), (low + x + y, -x, z), (low + y, -y, z), (low + x, y, z), (low + z, x, y), (low, y, x)
+        for (start, a, b), light in zip(sides, LIGHT, strict=True):
+            texture = _texture(np.linalg.norm(a), np.linalg.norm(b), colours, rng)
+            faces.append((start, a, b, ImageEnhance.Brightness(texture).enhance(light)))
+    return faces
+
+
+def _texture(width: Any, height: Any, colours: str, rng: np.random.Generator) -> Image.Image:
+    """Rectangles of all sizes over each other (metres): detail at every scale, as in images of nature.
+
+    Source: Lee, Mumford, Huang, Occlusion models for natural images (dead leaves), IJCV 2001.
+    """
+    w, h = round(TEXELS * width), round(TEXELS * height)
+    picture = Image.new("RGB", (w, h), tuple(COLOURS[colours].mean(0).astype(int)))
+    pen = ImageDraw.Draw(picture)
+    sides = np.sort(rng.uniform(90.0**-2, 3.0**-2, w * h // 60) ** -0.5)[::-1]  # texels, density side^-3
+    for side in sides:
+        colour = rng.choice(COLOURS[colours]) + rng.normal(0, 20)
+        low = rng.uniform((-side, -side), (w, h))
+        high = low + side * rng.uniform((1.0, 0.5), (1.8, 1.0))
+        pen.rectangle([*low, *high], tuple(np.clip(colour, 0, 255).astype(int)))
+    return picture
+
+
+def _seen(faces: Sequence[Face], rotation: Array, translation: Array) -> Image.Image:
+    """The photo of faces by `PHOTO_CAMERA`: each pixel the mean of four of the nearest face."""
+    _, width, height, (fx, fy, cx, cy) = PHOTO_CAMERA
+    camera = np.array([[2 * fx, 0, 2 * cx], [0, 2 * fy, 2 * cy], [0, 0, 1]])
+    y, x = np.indices((2 * height, 2 * width), np.float32) + np.float32(0.5)
+    pixels = np.stack([x, y, np.ones_like(x)]).reshape(3, -1)
+    photo = Image.new("RGB", (2 * width, 2 * height), (160, 206, 235))  # the sky
+    nearest = np.zeros(x.shape)  # 1 / depth
+    for corner, a, b, texture in faces:
+        to_pixels = camera @ np.column_stack([rotation @ a, rotation @ b, rotation @ corner + translation])
+        if np.linalg.det(to_pixels) >= 0:
+            continue  # seen from behind
+        to_face = np.linalg.inv(to_pixels).astype(np.float32)
+        u, v, inverse_depth = (to_face @ pixels).reshape(3, *x.shape)
+        seen = (np.minimum(u, v) >= 0) & (np.maximum(u, v) <= inverse_depth) & (inverse_depth > nearest)
+        nearest[seen] = inverse_depth[seen]
+        to_texels = np.diag([*texture.size, 1]) @ to_face
+        mapping = (to_texels / to_texels[2, 2]).ravel()[:8]
+        warped = texture.transform(photo.size, Image.Transform.PERSPECTIVE, mapping, Image.Resampling.BILINEAR)
+        photo.paste(warped, mask=Image.fromarray(seen))
+    return photo.resize((width, height), Image.Resampling.BOX)

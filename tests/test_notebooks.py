@@ -10,8 +10,8 @@ import pytest
 NOTEBOOKS = sorted((Path(__file__).parents[1] / "examples").glob("*.ipynb"))
 
 
-def test_there_are_three() -> None:
-    assert [notebook.stem for notebook in NOTEBOOKS] == ["layers", "solve", "train"]
+def test_there_are_four() -> None:
+    assert [notebook.stem for notebook in NOTEBOOKS] == ["layers", "localize_photo", "solve", "train"]
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda path: path.stem)
