@@ -1,5 +1,6 @@
 """The command line: `bpnp fit|validate|test|predict` are Lightning's own, the others are typed functions."""
 
+import ctypes
 import difflib
 import logging
 import os
@@ -14,6 +15,8 @@ from bpnp.commands.parser import first_line, parsed_arguments
 from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
 from bpnp.configs import config_names, packaged_config
 
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
+
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command. A mistake of the user's ends in one line on stderr and exit status 2, not in a traceback."""
@@ -21,6 +24,8 @@ def main(args: Sequence[str] | None = None) -> None:
     logging.captureWarnings(True)
     _quieten()
     try:
+        if args is None and arguments and arguments[0] in LIGHTNING:
+            keep_freed_memory()
         _run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:  # the reader of a pipe, such as head, has what it wants
@@ -61,6 +66,20 @@ def _run(arguments: list[str]) -> None:
             word, *rest = rest
             name, command = f"{name} {word}", command[_known(word, list(command), f"one of bpnp {name}")]
         command(**parsed_arguments(name, command, rest))
+
+
+def keep_freed_memory() -> None:
+    """Until this process ends, freed memory stays with it, and torch, imported afterwards, asks for large pages.
+
+    A step of training makes and frees hundreds of results of 8 to 64 MB, and the page faults of new memory cost more
+    than their arithmetic. Large pages are not asked for where THP_MEM_ALLOC_ENABLE is set otherwise; a C library other
+    than glibc has no `mallopt` and does as it does.
+    """
+    os.environ.setdefault("THP_MEM_ALLOC_ENABLE", "1")
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, 1 << 30)
+        mallopt(M_TRIM_THRESHOLD, -1)
 
 
 def _known(name: str, names: Sequence[str], what: str) -> str:

@@ -1,5 +1,6 @@
 import contextlib
 import inspect
+import platform
 import re
 import subprocess
 import sys
@@ -142,6 +143,32 @@ def test_two_trainings_do_not_write_to_one_folder(tmp_path: Path, fails: Callabl
     arguments = ["fit", *MESHES, f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
     with claimed(tmp_path):
         assert "expected a folder that no other process writes to" in fails(*arguments)
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="the C library has no mallopt")
+@pytest.mark.parametrize(("command", "kept"), [("fit", True), ("solve", False)])
+def test_the_program_that_trains_writes_to_freed_memory_without_page_faults(command: str, kept: bool) -> None:
+    program = f"""
+import ctypes, resource, sys
+from bpnp.cli import main
+sys.argv = ["bpnp", "{command}", "--help"]
+try:
+    main()
+except SystemExit:
+    pass
+libc, size = ctypes.CDLL(None), 64 << 20
+libc.malloc.restype = ctypes.c_void_p
+def faults():
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    block = ctypes.c_void_p(libc.malloc(ctypes.c_size_t(size)))
+    ctypes.memset(block, 1, size)
+    libc.free(block)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+sys.stderr.write(str([faults() for _ in range(3)][-1]))
+"""
+    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    least_pages = 64 // 2  # of 2 MB, the largest that the system gives by itself
+    assert (int(run.stderr) < least_pages) == kept
 
 
 @pytest.mark.parametrize(

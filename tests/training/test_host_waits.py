@@ -15,6 +15,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import bpnp
 import bpnp.layers.compiled
+import bpnp.models.nets.context_norm
 from bpnp import Batch
 from bpnp.layers import RansacPnP
 from bpnp.training.task import BlindPnPTask
@@ -22,6 +23,7 @@ from bpnp.training.task import BlindPnPTask
 PACKAGE = Path(bpnp.__file__).parent
 METHODS, FUNCTIONS = {"item", "cpu", "tolist", "numpy", "nonzero"}, {"bool", "int", "float"}
 FILES = [
+    PACKAGE / "types.py",
     *sorted((PACKAGE / "layers").glob("*.py")),
     *sorted((PACKAGE / "models/nets").glob("*.py")),
     *(PACKAGE / f"models/{name}.py" for name in ("bpnpnet", "matcher")),
@@ -47,8 +49,9 @@ READS = {
     "layers/transport.py:_solve": 2,  # the end, and which samples go on
     "layers/transport.py:solve_plan": 2,  # which samples need float64
     "layers/transport.py:sweep": 1,
+    "models/nets/context_norm.py:_array": 1,  # on the CPU only
     "models/nets/normalisation.py:_of_real_points": 1,  # on the CPU only
-    "models/nets/pointwise.py:unpadded": 1,  # on the CPU only
+    "types.py:unpadded": 1,  # on the CPU only
 }
 ATEN = torch.ops.aten
 WAITING = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal}
@@ -88,7 +91,8 @@ def test_the_calls_that_read_a_value_back_are_listed() -> None:
 
 @pytest.mark.parametrize("pose_weight", [0.0, 1.0])
 def test_a_training_step_waits_at_no_other_place(pose_weight: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bpnp.layers.compiled, "applies_to", lambda tensor: False)  # as on a GPU
+    for loops in (bpnp.layers.compiled, bpnp.models.nets.context_norm):
+        monkeypatch.setattr(loops, "applies_to", lambda tensor: False)  # as on a GPU
     net = small_net()
     net.ransac = RansacPnP(backend="torch", max_iterations=50)
     task = BlindPnPTask(net, pose_weight=pose_weight)
