@@ -5,6 +5,8 @@ import hashlib
 import json
 import os
 import shutil
+import signal
+import threading
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -88,6 +90,22 @@ def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
                 finally:
                     (folder / ".lock").unlink(missing_ok=True)
                 return
+
+
+@contextmanager
+def interruptions_later() -> Iterator[None]:
+    """Hold Ctrl-C back until the block ends; a thread other than the main one never gets it."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    held: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
+        if held:
+            signal.raise_signal(signal.SIGINT)
 
 
 def checksum(*parts: bytes | memoryview) -> int:

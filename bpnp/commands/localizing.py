@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bpnp.commands.output import console, progress, say
-from bpnp.files import claimed, keep_settings
+from bpnp.files import claimed, interruptions_later, keep_settings
 
 
 def localize(
@@ -102,7 +102,8 @@ def _localize_photos(
             for name, found in (attempts if cluster is None else _attempts_on(cluster))(scene, left, options):
                 shown.update(task, description=f"localized {name}", advance=1)
                 try:
-                    done[name] = kept(output, name, files[name], found, picture=pictures)
+                    with interruptions_later():
+                        done[name] = kept(output, name, files[name], found, picture=pictures)
                 except (ValueError, OSError) as error:
                     errors[name] = str(error)
         finally:

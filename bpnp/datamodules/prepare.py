@@ -20,7 +20,7 @@ from rich.console import Console
 from rich.progress import track
 
 from bpnp.datamodules.store import MANIFEST, Store, StoreError, is_store, new_store, open_store, read_manifest
-from bpnp.files import cache_folder, claimed, fingerprint
+from bpnp.files import cache_folder, claimed, fingerprint, interruptions_later
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ def _made(recipe: Recipe, jobs: Mapping[Path, Any], processes: int) -> Generator
     context.set_forkserver_preload([recipe.work.__module__])
     with ProcessPoolExecutor(processes, context, initializer=_end_with_parent) as pool:
         try:
-            with _interrupts_later():
+            with _interruptions_masked():
                 futures = [pool.submit(make, path, job) for path, job in jobs.items()]
             yield from (future.result() for future in as_completed(futures))
         except BrokenProcessPool as error:
@@ -157,24 +157,17 @@ def _make_part(
 
 
 @contextmanager
-def _interrupts_later() -> Iterator[None]:
+def _interruptions_masked() -> Iterator[None]:
     """Hold Ctrl-C back while workers start, so that all of them are known and ended; it never reaches the workers.
 
     They inherit the mask. It is not enough here: a thread of another library may have the signal instead.
     """
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    held: list[int] = []
-    handler = signal.signal(signal.SIGINT, lambda number, _: held.append(number))
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-        signal.signal(signal.SIGINT, handler)
-        if held:
-            raise KeyboardInterrupt
+    with interruptions_later():
+        mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            yield
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 def _end_with_parent() -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bpnp.files import written_whole
+from bpnp.files import interruptions_later, written_whole
 from bpnp.report.page.charts import RECALLS, Error, sorted_errors, within
 from bpnp.report.palette import DASHES, LIGHT, QUIET
 from bpnp.report.photos import box_of
@@ -122,7 +122,8 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"expected a file name that ends in {', '.join(SUFFIXES)}, got {path.name!r}")
     content = io.BytesIO()
-    figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
+    with interruptions_later():  # matplotlib would take Ctrl-C for an error of its input
+        figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
     with written_whole(path) as temporary:
         temporary.write_bytes(content.getvalue())
     return path

@@ -2,15 +2,23 @@
 
 import json
 import shutil
+import signal
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.transforms import BboxBase
 from PIL import Image
+from planted_model import plant_model
 from scipy.spatial.transform import Rotation
 
+import bpnp
 from bpnp import SceneMap, Solution
+from bpnp.cli import main
+from bpnp.examples import load
+from bpnp.localization import in_maps
 
 CAMERA = "PINHOLE,1379.7,1382.1,760.3,503.4"
 
@@ -81,3 +89,36 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     )  # fmt: skip
     assert "expected names of views of the map, got nowhere.jpg" in error
     assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] is False
+
+
+def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Matplotlib's C++ code converts boxes by this method and takes any exception in it for a box that is invalid."""
+    converted = BboxBase.__array__
+
+    def interrupted(self: BboxBase, *arguments: Any, **options: Any) -> Any:
+        signal.raise_signal(signal.SIGINT)
+        return converted(self, *arguments, **options)
+
+    plant_model(tmp_path / "map")
+    for name in "ab":
+        Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")
+    example = load("mesh")
+    solution = bpnp.solve(example.points2d, example.points3d, example.camera)
+    monkeypatch.setattr(in_maps, "localize_photo", lambda *_: solution)
+    monkeypatch.setattr(BboxBase, "__array__", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        main(
+            [
+                "localize",
+                *(str(tmp_path / part) for part in ("map", "a.png", "b.png")),
+                "--output",
+                str(tmp_path / "out"),
+            ]
+        )
+    assert stop.value.code == 130
+    kept = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
+    assert sorted(map(str, kept)) == ["pictures/a.png.png", "poses.txt", "settings.json", "solutions/a.png.json"]
+    assert "a.png" in (tmp_path / "out/poses.txt").read_text()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
