@@ -137,7 +137,7 @@ def view_pair(
         rotation=query.rotation,
         translation=query.translation,
         views=tuple(view.name for view in chosen),
-        focal=query.focal,
+        focal=query.camera.focal,
         scene=map_of(scene, query, index3d[order3d]),
     )
 

@@ -55,6 +55,14 @@ class Lens:
         ahead, aside = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0], [step, 0.0, 1.0]]))
         return float(self.camera.mean_focal_length() or np.linalg.norm(aside - ahead) / step)
 
+    @property
+    def matrix(self) -> Array:
+        """(3, 3) focal lengths and principal point in pixels: the pinhole camera of the undistorted image."""
+        if self.camera.mean_focal_length():
+            return np.asarray(self.camera.calibration_matrix(), np.float64)
+        ((x, y),) = self.camera.img_from_cam(np.array([[0.0, 0.0, 1.0]]))
+        return np.array([[self.focal, 0, x], [0, self.focal, y], [0, 0, 1]])
+
     def normalise(self, pixels: Array) -> Array:
         """Normalised, undistorted coordinates (k, 2) of pixels (k, 2), NaN where there are none.
 

@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from rich.text import Text
 
+from bpnp.cameras import Pinhole
 from bpnp.datamodules.augment import Augmentation, augment
 from bpnp.datamodules.colmap.pairs import ColmapSource
 from bpnp.datamodules.colmap.photos import photo_finder
@@ -104,9 +105,9 @@ def localize_image(source: ColmapSource, index: int, **options: Any) -> Localize
     pair, image = turned_pair(source, index), source.images[index][1]
     assert pair.rotation is not None
     assert pair.match3d is not None
-    focal = float(pair.focal)
-    pixels = focal * pair.points2d[0].double().numpy()
-    solution = solve(pixels, pair.points3d[0].numpy(), np.diag([focal, focal, 1.0]), **options)
+    undistorted = Pinhole(image.camera.matrix)
+    pixels = undistorted.project(np.pad(pair.points2d[0].double().numpy(), ((0, 0), (0, 1)), constant_values=1))
+    solution = solve(pixels, pair.points3d[0].numpy(), undistorted, **options)
     rotation = solution.rotation @ pair.rotation[0].numpy().T @ image.rotation
     translation = solution.translation - rotation @ source.origins[index]
     estimate = torch.as_tensor(rotation)[None], torch.as_tensor(translation)[None]

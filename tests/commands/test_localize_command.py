@@ -12,7 +12,7 @@ from planted_model import plant_model
 
 from bpnp.cli import main
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.localization.from_models import image_source, turned_pair
+from bpnp.localization.from_models import image_source, localize_image, turned_pair
 
 
 def run(model: Path, output: Path, *more: str) -> list[dict]:
@@ -67,6 +67,14 @@ def test_one_image_by_its_name_and_clutter(tmp_path: Path) -> None:
     scene = read_reconstruction(tmp_path / "model")
     everything = turned_pair(image_source(scene, "photo 1.jpg", "all", 0.0, 0), 0)
     assert (int(everything.count2d), int(everything.count3d)) == (80, 120)
+
+
+def test_a_solution_is_in_pixels_of_the_undistorted_photo(tmp_path: Path) -> None:
+    truth = plant_model(tmp_path)  # a camera with fx, fy, cx, cy = 520, 500, 405, 290
+    solution = localize_image(image_source(read_reconstruction(tmp_path), "photo 1.jpg", "seen", 0.0, 0), 0).solution
+    pixels = solution.camera.project(np.column_stack([solution.points2d, np.ones(40)]))
+    expected = truth.points2d[1] * [520, 500] + [405, 290]
+    np.testing.assert_allclose(sorted(pixels.tolist()), sorted(expected.tolist()), atol=1e-3)
 
 
 def test_the_scene_is_turned_before_it_is_solved(tmp_path: Path) -> None:

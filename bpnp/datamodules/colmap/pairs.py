@@ -83,7 +83,7 @@ class ColmapSource:
             matched=len(image.seen),
             rotation=image.rotation,
             translation=image.translation + image.rotation @ origin,
-            focal=image.focal,
+            focal=image.camera.focal,
             origin=origin,
         )
 

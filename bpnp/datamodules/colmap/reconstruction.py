@@ -24,7 +24,7 @@ class ImagePoints:
 
     points2d (k, 2) sees the scene's points3d[seen], seen (k,) without repetition. clutter2d (c, 2): the keypoints
     without a 3D point. observed: every 3D point the image has a keypoint of, `seen` and those that were dropped.
-    focal: pixels per unit of normalised coordinates. image_id, camera_id: of the model.
+    image_id, camera_id: of the model.
     """
 
     name: str
@@ -36,7 +36,7 @@ class ImagePoints:
     observed: NDArray[np.int64]
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
-    focal: float
+    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -162,5 +162,5 @@ def _image_points(
         observed=np.unique(place[known]),
         rotation=rotation,
         translation=record.translation,
-        focal=camera.focal,
+        camera=camera,
     )
