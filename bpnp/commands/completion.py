@@ -34,7 +34,7 @@ def completion_script(commands: Commands, shell: str) -> str:
     """The script that completes commands and options, for bash, or for zsh by way of bash's."""
     weights = " ".join(sorted(file.stem for file in WEIGHTS.glob("*.ckpt")))
     known = {"--config": " ".join(config_names()), "-c": " ".join(config_names()), "--ckpt_path": f"{weights} last"}
-    known |= {"--prior": f"{weights} learned", "--solver": f"{weights} search", "--help": " ".join(GROUPS)}
+    known |= {"--prior": f"{weights} learned", "--solver": f"{weights} auto search", "--help": " ".join(GROUPS)}
     options = dict(_options(commands)) | {
         name: " ".join(dict.fromkeys(option.split()[0] for option in OPTIONS)) for name in LIGHTNING
     }

@@ -48,11 +48,11 @@ def solve(
         image: name of the image whose camera to take, where the --camera model has several.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
-        photo: the photo, under the points of --picture; needs --camera.
+        photo: the photo, of the size of the --camera or smaller, under the points of --picture.
         colmap: folder to write, a COLMAP model of this image.
         json: print JSON instead of a table.
         surface: points to draw from a mesh; its vertices by default.
-        prior: rough pose, the JSON of a solution; or a checkpoint.
+        prior: rough pose, the JSON of a solution; or a network, packaged weights by name or a checkpoint.
         prior_degrees: standard deviation of its rotation.
         prior_distance: standard deviation of its translation, scene units; unknown by default.
         up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is known.
@@ -60,12 +60,13 @@ def solve(
         up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
         solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
-            checkpoint of a network.
+            network, packaged weights by name or a checkpoint.
         inlier_threshold: largest error of a match, pixels with a camera.
         time_limit: seconds.
         seed: of the search.
         device: such as cuda; cpu by default.
     """
+    from bpnp.cameras import camera_from
     from bpnp.localization.point_files import read_camera, read_image, read_prior, read_scene
     from bpnp.localization.solved import solution_table
     from bpnp.search.starts import GravityPrior
@@ -81,7 +82,7 @@ def solve(
         raise ValueError("expected --photo with --picture and --camera, got it without")
     if picture is not None:
         from bpnp.report.figures import SUFFIXES, save_figure  # matplotlib, where something is drawn
-        from bpnp.report.pictures import read_photo, solution_picture
+        from bpnp.report.pictures import photo_size, read_photo, solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
             raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
@@ -92,6 +93,8 @@ def solve(
     scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
     lens = None if camera is None else read_camera(camera, image)
     under = None if photo is None or picture is None else read_photo(photo)
+    if under is not None:
+        photo_size(under, camera_from(lens))
     for path in (output, picture):  # raises before the search where its result could not be written
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.cameras import Camera, in_front
+from bpnp.cameras import Camera, Lens, in_front
 from bpnp.report.palette import LIGHT, QUIET, VERDICTS
 from bpnp.report.photos import Box, picture_box
 from bpnp.report.samples import Array, PairView
@@ -31,6 +31,23 @@ def read_photo(path: Path | str) -> Array:
             return np.asarray(photo.convert("RGB"))
     except OSError as error:
         raise ValueError(f"expected a picture, got {path}: {error}") from error
+
+
+def photo_size(photo: Array, camera: Camera | None) -> tuple[int, int]:
+    """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
+
+    Raises ValueError for a photo of another shape than the camera's images.
+    """
+    height, width = photo.shape[:2]
+    known = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
+    if not all(known):
+        return width, height
+    if abs(width * known[1] - height * known[0]) > max(*known, width, height):  # a pixel of rounding on a side
+        raise ValueError(
+            f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
+            f"{height}; try the photo of this camera"
+        )
+    return known
 
 
 def solution_picture(
@@ -70,7 +87,7 @@ def plot_image(
     if photo is not None and (box is not None or view.camera is None):
         frame = Box(*_in_unit(np.reshape(box or picture_box(view.points2d), (2, 2)), view.camera).ravel().tolist())
     else:
-        frame = picture_box(seen) if photo is None else Box(0, 0, photo.shape[1], photo.shape[0])
+        frame = picture_box(seen) if photo is None else Box(0, 0, *photo_size(photo, view.camera))
     if photo is not None:
         axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
     size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))

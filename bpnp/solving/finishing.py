@@ -22,7 +22,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     """Matches, a last fit to them, and the inliers of every candidate."""
     start, found = time.perf_counter(), result.candidates
     if not len(found):
-        return without_pose(problem, result.reason, inlier_threshold)
+        return without_pose(problem, result.reason, inlier_threshold, seconds)
     threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
     poses = list(zip(found.rotation, found.translation, strict=True))
     if result.batches:  # an enumerated pose is a least-squares fit in float64 already
@@ -59,7 +59,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
     )
 
 
-def without_pose(problem: Problem, reason: str, inlier_threshold: float | None) -> Solution:
+def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
     dropped, taken = problem.left_out
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
@@ -67,6 +67,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None) 
         verdict="failed",
         reason=reason,
         stats=SolutionStats(dropped2d=dropped, taken2d=taken),
+        seconds=seconds,
         points2d=problem.points2d,
         points3d=problem.points3d,
         camera=problem.camera,

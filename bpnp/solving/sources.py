@@ -3,6 +3,7 @@
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -101,6 +102,8 @@ def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tup
             deadline=deadline, settings=options.settings,
             progress=None if options.progress is None else partial(options.progress, i),
         )  # fmt: skip
+        if not len(result.candidates) and deadline.passed():
+            result = replace(result, reason=f"no pose was found in {options.time_limit:g} s; try a longer time limit")
         yield i, result, time.perf_counter() - start
 
 

@@ -129,7 +129,7 @@ class InterruptedCheckpoint(Callback):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit" and trainer.global_step > 0:
             path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
-            trainer.save_checkpoint(path)
+            trainer.save_checkpoint(path, weights_only=False)
             rank_zero_info(f"interrupted in epoch {trainer.current_epoch}; go on with --ckpt_path {path}")
 
 

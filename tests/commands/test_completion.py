@@ -18,6 +18,7 @@ pytestmark = pytest.mark.skipif(shutil.which("bash") is None, reason="needs bash
         (["solve"], "solve"),
         (["solve", "--pri"], "--prior --prior_degrees --prior_distance"),
         (["solve", "--prior", "matcher-s"], "matcher-sfm"),
+        (["solve", "--solver", "au"], "auto"),
         (["solve", "points2"], "points2d.csv"),
         (["fit", "--config", "qui"], "quickstart"),
         (["fit", "--trainer.max_e"], "--trainer.max_epochs"),

@@ -59,6 +59,15 @@ def test_a_photo_as_it_was_taken_fills_the_picture_and_is_not_faded() -> None:
     assert photo.get_alpha() is None
 
 
+def test_a_smaller_photo_is_stretched_to_the_pixels_of_its_camera() -> None:
+    pixels = camera_from(LENS).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), LENS)
+    (photo,) = solution.plot(photo=np.zeros((160, 213, 3), np.uint8)).axes[0].get_images()
+    assert tuple(photo.get_extent()) == (0, 640, 480, 0)
+    with pytest.raises(ValueError, match="expected a photo of 640 x 480 pixels .* got 480 x 480"):
+        solution.plot(photo=np.zeros((480, 480, 3), np.uint8))
+
+
 def test_the_legend_names_only_what_is_drawn() -> None:
     solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
     figure = solution.plot()

@@ -1,6 +1,7 @@
 """What `solve` does with a user's modules, with its time, and in several threads."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -110,3 +111,11 @@ def test_the_time_limit_of_a_pair_counts_once(limit: float | None, monkeypatch: 
     first, second = deadlines
     assert first is second
     assert np.isinf(first.at) == (limit is None)
+
+
+def test_a_net_that_takes_all_the_time_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    planted = plant(1, 30)
+    monkeypatch.setattr(sources, "pose_prior", lambda *_: time.sleep(0.02))
+    solution = solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=0.01)
+    assert solution.reason == "no pose was found in 0.01 s; try a longer time limit"
+    assert solution.seconds >= 0.02
