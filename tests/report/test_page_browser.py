@@ -232,7 +232,7 @@ def test_all_pairs_open_and_photos_lie_under_the_points(browser: Any, tmp_path: 
         opened(browser, f"{page.as_uri()}#open={names[index].replace('/', '%2F')}")
         assert points in browser.find_element("id", "image-text").text
         assert browser.find_element("css selector", "#lines [value=assigned]").get_property("disabled") == few
-        assert len(browser.find_elements("css selector", "#pair-numbers tbody tr")) == 3
+        assert len(browser.find_elements("css selector", "#pair-numbers tbody tr .swatch")) == 3
         options = [option.text for option in browser.find_elements("css selector", "#pose option")]
         assert options == ["true pose", "ransac", "pnp", "refined"]
         assert "× 0 of" not in browser.find_element("id", "image-text").text

@@ -57,7 +57,7 @@ def figures() -> dict[str, dict[str, Any]]:
     scene = {
         "data": [
             _marks("scatter3d", size=3.5, line={"width": 0}),
-            {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 9}},
+            {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 18}},
         ],
         "layout": {
             "margin": dict.fromkeys("lrtb", 0), "hovermode": "closest",

@@ -127,9 +127,9 @@ function selectPairs() {
   return found.sort((a, b) => Number.isNaN(values[a]) - Number.isNaN(values[b]) || order(a, b) || a - b);
 }
 
-function pairRow(series, i, head) {
+function pairRow(series, i, ...head) {
   const cause = column(series, "cause")[i];
-  return element("tr", {}, element("th", { scope: "row" }, head),
+  return element("tr", {}, element("th", { scope: "row" }, ...head),
     ...DATA.keys.map((key) => element("td", {}, number(column(series, key)[i]))),
     element("td", { className: "words" }, element("span", { className: `fill cause${cause}` }), ` ${DATA.causes[cause]}`));
 }

@@ -22,13 +22,15 @@ function viewOf(series, i) {
     cameras: cameras.filter(({ pose }) => pose) };
 }
 
+const swatch = (series) => byId(`series${SERIES.indexOf(series)}`).nextElementSibling.cloneNode(true);
+
 function openPair(i) {
   const series = listed();
   const at = (other) => (other.ids === series.ids ? i : other.ids.indexOf(series.ids[i]));
   setState({ open: series.ids[i] });
   byId("pair-title").textContent = series.ids[i];
   const runs = SERIES.filter((other) => at(other) >= 0);
-  byId("pair-numbers").tBodies[0].replaceChildren(...runs.map((other) => pairRow(other, at(other), other.name)));
+  byId("pair-numbers").tBodies[0].replaceChildren(...runs.map((other) => pairRow(other, at(other), swatch(other), other.name)));
   const rank = chosen.indexOf(i);
   [byId("previous").disabled, byId("next").disabled] = [rank <= 0, rank < 0 || rank === chosen.length - 1];
   const owner = [series, ...runs].find((other) => other.lines[at(other)] >= 0);
@@ -88,6 +90,9 @@ function drawScene({ points3d, ids2d, ids3d, match3d, box: [left, top, width, he
   const figure = themed(DATA.figures.scene);
   const text = match3d.map((i, j) => `3D point ${ids3d[j]}${i < 0 ? ", no match" : `, 2D point ${ids2d[i]}`}`);
   Object.assign(figure.data[0], xyz(points), { text }).marker.color = match3d.map((i) => ink(i < 0 ? "line" : "quiet"));
+  const { clientWidth, clientHeight } = byId("scene");
+  const { eye } = figure.layout.scene.camera;  // from further away where the picture is narrow, as on a phone
+  for (const axis of "xyz") eye[axis] *= Math.max(1, (1.3 * clientHeight) / clientWidth);
   const far = [];
   for (const { name, pose, colour, k } of cameras.filter((camera) => shown(camera.k))) {
     const own = corners.map((c) => upright(toScene(pose, c)));
