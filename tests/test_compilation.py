@@ -132,6 +132,29 @@ def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(
     assert list(cache.rglob("*.nbi"))
 
 
+NOTE_COLLECTOR = """
+import atexit, gc
+from numba.core import event
+class Listener(event.Listener):
+    def on_start(self, event):
+        print(f"compiling: {gc.isenabled()}")
+    def on_end(self, event):
+        pass
+event.register("numba:compile", Listener())
+atexit.register(lambda: print(f"afterwards: {gc.isenabled()}"))
+"""
+
+
+@pytest.mark.parametrize(("before", "afterwards"), [("", True), ("gc.disable()\n", False)])
+def test_the_collector_rests_while_a_loop_is_compiled(
+    before: str, afterwards: bool, package: Path, tmp_path: Path
+) -> None:
+    printed, _ = started(package, str(tmp_path / "cache"), NOTE_COLLECTOR + before).communicate(timeout=120)
+    compiling, called, values, last = printed.splitlines()
+    assert (compiling, called, values) == ("compiling: False", "compiling: False", "8 10")
+    assert last == f"afterwards: {afterwards}"
+
+
 def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path, tmp_path: Path) -> None:
     cache = str(tmp_path / "cache")
     assert doubled(package, cache)[0] == "8 10\n"
