@@ -6,6 +6,7 @@ import logging
 import os
 import re
 import sys
+import textwrap
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -16,6 +17,7 @@ from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
 from bpnp.configs import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
+WIDTH = 80  # columns of the help
 
 
 def main(args: Sequence[str] | None = None) -> None:
@@ -28,7 +30,7 @@ def main(args: Sequence[str] | None = None) -> None:
             keep_freed_memory()
         _run(arguments)
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader of a pipe, such as head, has what it wants
+    except BrokenPipeError:  # the reader of a pipe, such as head, closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
     except (ValueError, OSError) as error:
@@ -60,7 +62,7 @@ def _run(arguments: list[str]) -> None:
         command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]
         if isinstance(command, Mapping):
             if not rest or rest[0] in ("-h", "--help"):
-                lines = (f"  {word:<14}{first_line(own)}" for word, own in command.items())
+                lines = (_row(f"  {word:<14}", first_line(own)) for word, own in command.items())
                 print("\n".join([f"usage: bpnp {name} WHAT [options]", "", *lines]))
                 return
             word, *rest = rest
@@ -96,7 +98,7 @@ def help_text() -> str:
         name: "Pack a data set, once: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
         for name, command in COMMANDS.items()
     }
-    lines = [f"  {name:<17}{text}" for name, text in (own | LIGHTNING).items()]
+    lines = [_row(f"  {name:<17}", text) for name, text in (own | LIGHTNING).items()]
     return "\n".join(
         [
             "usage: bpnp COMMAND [options]",
@@ -106,9 +108,13 @@ def help_text() -> str:
             *lines,
             "",
             "bpnp COMMAND --help shows the options of a command, bpnp --version the version.",
-            f"Packaged configurations, for --config: {', '.join(config_names())}.",
+            textwrap.fill(f"Packaged configurations, for --config: {', '.join(config_names())}.", WIDTH),
         ]
     )
+
+
+def _row(head: str, text: str) -> str:
+    return textwrap.fill(text, WIDTH, initial_indent=head, subsequent_indent=" " * len(head))
 
 
 def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:

@@ -109,7 +109,7 @@ def interruptions_later() -> Iterator[None]:
 
 
 def checksum(*parts: bytes | memoryview) -> int:
-    """CRC-32 of the bytes of all parts, one after the other: it tells damaged data from what was written."""
+    """CRC-32 of the bytes of all parts, one after the other: it differs where data were damaged after the writing."""
     value = 0
     for part in parts:
         value = zlib.crc32(part, value)

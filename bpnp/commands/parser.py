@@ -22,6 +22,13 @@ class OneLineParser(ArgumentParser):
         text = plain(message)
         _, found, unknown = text.rpartition("nrecognized arguments: ")
         known = [option for action in self._actions for option in action.option_strings]
+        if required := text.partition("arguments are required: ")[2]:
+            command, options = self.prog, []
+            for path in required.split(", "):
+                parent, _, name = path.rpartition(".")  # `fit.data` is an option of `bpnp fit`
+                command = f"{self.prog} {parent}".rstrip()
+                options.append(f"--{name}" if parent or f"--{name}" in known else name)
+            raise ValueError(f"expected {', '.join(options)}, got none; try: {command} --help") from ex
         close = difflib.get_close_matches(re.split("[= ]", unknown)[0], known, n=1) if found else []
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         raise ValueError(text + hint) from ex

@@ -18,5 +18,5 @@ def packaged_config(name: str) -> str:
 
 
 def config_names() -> list[str]:
-    """The names that `packaged_config` knows."""
+    """The names that `packaged_config` takes."""
     return sorted(str(path.relative_to(FOLDER).with_suffix("")) for path in FOLDER.rglob("*.yaml"))

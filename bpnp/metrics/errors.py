@@ -85,7 +85,7 @@ def reprojection_error(
 
 
 def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
-    """All four errors against the batch's true pose. `reprojection_deg` is NaN if the batch knows no matches.
+    """All four errors against the batch's true pose. `reprojection_deg` is NaN if the batch has no `match3d`.
 
     Raises ValueError if the true pose is absent or not finite.
     """

@@ -21,7 +21,7 @@ from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 REFINED = "refined"  # name of the third pose
 FIRST_WIDTH = 5.0  # s of the first round, in widths of the last
-FEATURE_WEIGHT = 0.03  # of the feature distances in a round, where the pose tells more about a pair than they do
+FEATURE_WEIGHT = 0.03  # of the feature distances in a round, where the pose tells true pairs from others better
 FARTHEST = 12.0  # nats; d of a pair five widths apart, beyond which pairs are alike
 TRUST = 0.7  # weight of the assignment in `log_support`; the rest is uniform
 ALONE = 0.2  # share of the image points without a partner
@@ -106,8 +106,8 @@ def log_support(prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tenso
     """Log-likelihood ratio of the bearings: under the pose and the assignment, against bearings without a partner.
 
     L = sum_i log(o + (1 - o) sum_j Q_ij A exp(-d_ij) / (2 pi s^2)) with A = 2 pi times the variance of the bearings, o
-    = `ALONE` and Q_ij = P(j | i) mixed with a uniform distribution (`TRUST`). In nats: above zero the assignment
-    speaks for the pose, below against it; -inf without a pose.
+    = `ALONE` and Q_ij = P(j | i) mixed with a uniform distribution (`TRUST`). In nats: above zero the bearings are
+    likelier under the pose and the assignment; -inf without a pose.
     """
     assignment = prediction.assignment
     assert assignment is not None

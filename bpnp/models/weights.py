@@ -79,7 +79,7 @@ class TrainedNet(nn.Module):
 
 
 def pretrained_names() -> list[str]:
-    """Names that `from_pretrained` knows."""
+    """Names that `from_pretrained` takes."""
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 

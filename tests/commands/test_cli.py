@@ -21,9 +21,10 @@ MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])
     text = capsys.readouterr().out
-    listed = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
+    listed = [line.split()[0] for line in text.splitlines() if re.match("  \\w", line)]
     assert listed == [*COMMANDS, "fit", "validate", "test", "predict"]
     assert "quickstart" in text
+    assert max(map(len, text.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,9 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
         (["prepare", "megadepth", ".", "--min_points=3"], "min_points"),
         (["localize", "--modle=x"], "did you mean --model?"),
         (["fit", *MESHES, "--trainer.max_epoch=3"], "did you mean --trainer.max_epochs?"),
-        (["fit"], "required: fit.data"),
+        (["fit"], "expected --data, got none; try: bpnp fit --help"),
+        (["table"], "expected --data, --methods, got none; try: bpnp table --help"),
+        (["solve", "points2d.csv"], "expected points3d, got none; try: bpnp solve --help"),
         (["fit", *MESHES, "--model.learning_rat=3"], "unrecognized arguments: --model.learning_rat"),
         (["fit", *MESHES, "--model.learning_rate=fast"], "error: expected model.learning_rate as float, got 'fast'\n"),
         (["fit", *MESHES, "--data.nonsense=3"], "error: data: Option 'nonsense' is not accepted\n"),
