@@ -85,9 +85,11 @@ def _photo(rng: np.random.Generator) -> Example:
         num_points=300, min_points=150, outliers=0.33, views=(1, 1), kinds={"facades": 1.0}, noise_px=NOISE_PX
     )
     pair = draw_map_pair("photo", options, rng)
-    camera = np.diag([LONG_SIDE, LONG_SIDE, 1.0])
+    middle = LONG_SIDE / 2  # of the photo, upright or not
+    camera = np.array([[pair.focal, 0.0, middle], [0.0, pair.focal, middle], [0.0, 0.0, 1.0]])
+    pixels = pair.focal * pair.points2d.astype(np.float64) + middle
     return Example(
-        LONG_SIDE * pair.points2d.astype(np.float64), pair.points3d.astype(np.float64), camera,
+        rng.permutation(pixels), pair.points3d.astype(np.float64), camera,
         np.asarray(pair.rotation, np.float64), np.asarray(pair.translation, np.float64),
     )  # fmt: skip
 
