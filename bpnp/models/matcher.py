@@ -18,6 +18,7 @@ from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
 from bpnp.models.nets.normalisation import centred, principal_axes, robust_frame
 from bpnp.models.nets.pointwise import Pointwise
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
+from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction, SolveStats
 
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
@@ -126,7 +127,7 @@ class Matcher(TrainedNet):
         """Features of both sides after the last block, normalised by layer, not to unit length."""
         points3d = batch.points3d
         if self.principal:
-            points3d = points3d @ principal_axes(points3d, batch.mask3d)
+            points3d = full_precision(torch.matmul)(points3d, principal_axes(points3d, batch.mask3d))
         centre2d, radius2d = robust_frame(batch.points2d, batch.mask2d)
         centre3d, radius3d = robust_frame(points3d, batch.mask3d)
         local2d, local3d = (batch.points2d - centre2d) / radius2d, (points3d - centre3d) / radius3d

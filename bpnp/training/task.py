@@ -16,6 +16,7 @@ from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.weights import AnyModule, TrainedNet, chosen, described, fitting_state, read_checkpoint
+from bpnp.precision import exact_products
 from bpnp.training.losses import (
     Losses,
     MatchingLoss,
@@ -101,7 +102,8 @@ class BlindPnPTask(LightningModule):
         needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection" or own_pose
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
-        losses = self.losses(prediction, batch)
+        with exact_products(self.device):
+            losses = self.losses(prediction, batch)
         loss = losses.total.mean()
         self._log_train(loss=loss, skipped_steps=self.skipped[0].float(), **self._figures(losses, prediction, batch))
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
@@ -183,9 +185,11 @@ class BlindPnPTask(LightningModule):
             prediction = self.solver(batch)
             _wait(self.device)
         seconds = time.perf_counter() - start
-        for name in self.estimates[stage]:
-            self.metrics[f"{stage}_{name}"].update(pose_errors(prediction.poses[name], batch))  # type: ignore[operator]
-        losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        with exact_products(self.device):
+            for name in self.estimates[stage]:
+                errors = pose_errors(prediction.poses[name], batch)
+                self.metrics[f"{stage}_{name}"].update(errors)  # type: ignore[operator]
+            losses = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if losses is not None:
             self.metrics[stage].update(losses, batch.index)  # type: ignore[operator]
         return {"prediction": prediction, "seconds": seconds, "losses": losses}
@@ -198,7 +202,8 @@ class BlindPnPTask(LightningModule):
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """What a training step logs beside its loss."""
         figures: dict[str, Tensor] = {}
-        known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        with exact_products(self.device):
+            known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if known is not None:
             figures["correspondence_loss"] = known.detach().mean()
         if self.loss is not None or self.matching_loss != "correspondence":

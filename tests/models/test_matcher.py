@@ -67,6 +67,22 @@ def test_each_side_hears_of_the_other() -> None:
     assert (net.features(other)[0] - net.features(batch)[0]).abs().max() > 1e-3
 
 
+@pytest.mark.parametrize("padded", [True, False])
+def test_attention_in_half_precision_is_that_of_float32_to_its_digits(padded: bool) -> None:
+    torch.manual_seed(0)
+    layer, x, seen = Attention(32, 4), torch.randn(2, 40, 32), 2 * torch.randn(2, 50, 32)
+    mask = torch.arange(50) < (torch.tensor([[50], [20]]) if padded else 50)
+    seen = seen.masked_fill(~mask.expand(2, -1).unsqueeze(-1), 1e4)
+
+    def results(half: bool) -> list[Tensor]:
+        with torch.autocast("cpu", torch.bfloat16, enabled=half):
+            out = layer(x, seen, mask.expand(2, -1)).float()
+        return [out.detach(), *torch.autograd.grad(out.square().sum(), list(layer.parameters()))]
+
+    for value, exact in zip(results(True), results(False), strict=True):
+        assert (value - exact).norm() < 0.02 * exact.norm() + 1e-3
+
+
 def test_along_principal_axes_the_rotation_of_the_scene_does_not_matter() -> None:
     given, batch = small(), cluttered(12, 20)
     turn = Rotation.random(random_state=0).as_matrix()

@@ -6,6 +6,8 @@ import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from bpnp.precision import full_precision
+
 ROUNDS = 20  # of reweighting, towards the point with the smallest sum of distances
 NEAR = 2.0  # median distances from the centre at which a point's weight is a quarter
 FARTHEST = 3.0  # median distances; a point beyond counts as much as one there for the direction of an axis
@@ -79,6 +81,7 @@ def robust_frame(
     return centre, _radius(torch.linalg.vector_norm(hidden - centre, dim=-1))
 
 
+@full_precision
 @torch.no_grad()
 def principal_axes(points: Float[Tensor, "b k 3"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b 3 3"]:
     """Columns: axes of the points' covariance about their geometric median, far points counting less; shortest first.
