@@ -70,14 +70,17 @@ def named(path: Path) -> Iterator[None]:
 def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Hold a folder for this process; it is made if it is not there.
 
-    Raises ValueError if another process holds it, unless told to wait. The lock ends with the process, however it ends.
+    Raises ValueError if it is a file, or if another process holds it, unless told to wait. The lock ends with the
+    process, however it ends.
     """
     while True:
-        folder.mkdir(parents=True, exist_ok=True)
         try:
+            folder.mkdir(parents=True, exist_ok=True)
             file = (folder / ".lock").open("w")
         except FileNotFoundError:
             continue  # another process has just removed the folder
+        except (FileExistsError, NotADirectoryError) as error:
+            raise ValueError(f"expected a folder to write to, got {folder}, which is or lies in a file") from error
         with file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))

@@ -57,21 +57,27 @@ def localize(
         seed: of the rotation and of the search.
         device: such as cuda; cpu by default.
     """
+    if (map is None) == (model is None):
+        raise ValueError("expected MAP PHOTO... or --model MODEL, got " + ("neither" if map is None else "both"))
+    of_maps = {"camera": camera, "views": views, "keypoints": keypoints, "leave-one-out": leave_one_out}
+    of_models = {"image": image != "all", "points": points != "seen", "inlier-threshold": inlier_threshold}
+    others = of_maps | {"cluster": cluster} if map is None else of_models | {"device": device}
+    if useless := [f"--{name}" for name, value in others.items() if value]:
+        raise ValueError(f"expected {', '.join(useless)} with {'MAP PHOTO...' if map is None else '--model'} only")
     shared = {"solver": solver, "seed": seed, "time_limit": time_limit}
-    if map is not None and model is None:
+    if map is not None:
         given = {"camera": camera, "views": views, "keypoints": keypoints, "leave_one_out": leave_one_out, **shared}
         _localize_photos(map, photos or [], given, output, cluster, pictures=not no_pictures)
-    elif model is not None and map is None:
+    elif model is not None:
         options = {"inlier_threshold": inlier_threshold, "device": device, **shared}
         _localize_images(model, (image, points, clutter), options, output, pictures=not no_pictures)
-    else:
-        raise ValueError("expected MAP PHOTO... or --model MODEL, got " + ("neither" if map is None else "both"))
 
 
 def _localize_photos(
     place: Path, photos: list[Path], given: Mapping[str, Any], output: Path, cluster: str | None, *, pictures: bool
 ) -> None:
     """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
+    from bpnp.cameras import camera_from
     from bpnp.localization.in_maps import (
         PhotoOptions,
         attempts,
@@ -84,11 +90,14 @@ def _localize_photos(
     from bpnp.localization.point_files import read_camera
     from bpnp.maps.regions import read_pairs
     from bpnp.maps.scene_map import SceneMap
+    from bpnp.solving.arguments import source_from
 
     camera, views, features, *rest = given.values()
-    options = PhotoOptions(
-        None if camera is None else read_camera(camera), None if views is None else read_pairs(views), features, *rest
-    )
+    known = None if camera is None else camera_from(read_camera(camera))
+    if features is not None and not features.is_file():
+        raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {features}, which is no file")
+    source_from(given["solver"])  # raises, where each photo would
+    options = PhotoOptions(known, None if views is None else read_pairs(views), features, *rest)
     files, scene = photo_files(photos), SceneMap.from_colmap(place)
     out, errors = console(), dict[str, str]()
     with claimed(output), progress() as shown:
@@ -112,7 +121,8 @@ def _localize_photos(
         out.print(photos_table({name: done[name] for name in files if name in done}))
     for name, reason in errors.items():
         say(f"{name}: {reason}", to=out)
-    say(f"wrote poses.txt, solutions/ in {output}", to=out)
+    folders = ", solutions/, pictures/" if pictures else ", solutions/"
+    say(f"wrote poses.txt{folders if done else ''} in {output}", to=out)
     if errors:
         name, reason = next(iter(errors.items()))
         raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")

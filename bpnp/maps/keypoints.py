@@ -34,7 +34,8 @@ def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
     """
     import cv2
 
-    image = cv2.imread(str(photo), cv2.IMREAD_GRAYSCALE)
+    as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads photos
+    image = cv2.imread(str(photo), as_stored)
     if image is None:
         raise ValueError(f"expected a photo that OpenCV can read, got {photo}")
     found = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True).detect(image)

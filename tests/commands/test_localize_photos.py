@@ -76,10 +76,22 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     assert "expected one or more photos" in fails("localize", str(model), *out)
     assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
-    assert "focal length in the EXIF data" in fails("localize", str(model), str(tmp_path / "plain.jpg"), *out)
-    error = fails(
-        "localize", str(model), str(tmp_path / "plain.jpg"), "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out
-    )
+    plain = ("localize", str(model), str(tmp_path / "plain.jpg"))
+    # What no photo can be localised with is said once, before the first photo.
+    for given, message in (
+        (("--camera", "PINHOLE,1"), "expected 4 parameters of a PINHOLE camera, got [1.0]"),
+        (("--keypoints", "nothing.h5"), "of keypoints, got nothing.h5, which is no file"),
+        (("--solver", "nothing"), "or packaged weights"),
+        (("--points", "all", "--image", "a"), "expected --image, --points with --model only"),
+        (("--output", str(tmp_path / "plain.jpg")), "expected a folder to write to, got"),
+    ):
+        error = fails(*plain, *out, *given)
+        assert message in error
+        assert "could not be tried" not in error
+    error = fails("localize", "--model", str(model), "--keypoints", "a.h5", "--leave-one-out")
+    assert "expected --keypoints, --leave-one-out with MAP PHOTO... only" in error
+    assert "focal length in the EXIF data" in fails(*plain, *out)
+    error = fails(*plain, "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out)
     assert "expected photos of 128 x 96 pixels as --camera says, got plain.jpg of 64 x 48" in error
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")

@@ -37,6 +37,17 @@ def test_discs_are_found_at_their_centres_and_large_ones_are_stronger(blobs) -> 
     np.testing.assert_allclose(sizes / radii, np.median(sizes / radii), rtol=0.25)
 
 
+def test_keypoints_of_a_photo_to_be_shown_turned_are_where_its_pixels_are_stored(blobs, tmp_path: Path) -> None:
+    """As COLMAP has them, and the camera of EXIF, the check of sizes and the picture over the photo."""
+    path, *_ = blobs
+    tags = Image.Exif()
+    tags[0x0112] = 6  # to be shown turned by 90 degrees, as phones have it
+    Image.open(path).save(tmp_path / "turned.png", exif=tags)
+    found = detected_keypoints(tmp_path / "turned.png")
+    assert found.size == photo_size(tmp_path / "turned.png")
+    np.testing.assert_array_equal(found.pixels, detected_keypoints(path).pixels)
+
+
 def test_keypoints_are_as_faint_as_those_of_colmap_and_the_largest(tmp_path: Path) -> None:
     """A map's points come from them, so that without the faint ones most of the map would have no partner."""
     noise = np.random.default_rng(0).normal(size=(200, 240))
