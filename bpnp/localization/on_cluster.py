@@ -2,6 +2,7 @@
 
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -35,7 +36,7 @@ def attempts_on_cluster(
     plugin = MapOfWorker(scene)
     with connected(cluster) as client:
         client.register_plugin(plugin)
-        names: dict[str, str] = {}
+        names: dict[object, str] = {}
 
         def submitted(photos: Iterable[tuple[str, Path]]) -> Iterator[Future]:
             for name, photo in photos:
@@ -52,16 +53,22 @@ def attempts_on_cluster(
         client.unregister_worker_plugin(plugin.name)
 
 
-def connected(cluster: str) -> Client:
+@contextmanager
+def connected(cluster: str) -> Iterator[Client]:
     """A client of the scheduler at an address, or of as many single-threaded processes as a number says."""
     if cluster.isdecimal():
         if int(cluster) < 1:
             raise ValueError(f"expected one or more processes, got {cluster}")
-        return Client(LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None))
+        own = LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None)
+        with own, Client(own) as client:
+            yield client
+        return
     try:
-        return Client(cluster, timeout=PATIENCE)
+        found = Client(cluster, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         raise ValueError(f"expected the address of a Dask scheduler or a number, got {cluster}: {error}") from error
+    with found as client:
+        yield client
 
 
 def _attempt(plugin: str, name: str, photo: Path, options: PhotoOptions) -> Solution | str:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pycolmap
 import pytest
 from distributed import Client, LocalCluster
@@ -84,6 +85,16 @@ def test_each_worker_is_sent_the_map_once(place: tuple[Path, Path, Path], cluste
     assert len(results) == PHOTOS
     assert len(pickled) == 1
     assert "expected views for new5.png" in str(results["new5.png"])
+
+
+def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> None:
+    model, photos, database = place
+    before = set(psutil.Process().children(recursive=True))
+    options = PhotoOptions(camera=CAMERA, features=database)
+    lost = {"lost.png": photos / "lost.png"}
+    ((name, reason),) = attempts_on_cluster(SceneMap.from_colmap(model), lost, options, "1")
+    assert (name, "expected a photo that can be read" in str(reason)) == ("lost.png", True)
+    assert set(psutil.Process().children(recursive=True)) <= before
 
 
 def test_the_command_goes_on_where_it_was(
