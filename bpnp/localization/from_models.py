@@ -73,9 +73,15 @@ class Localized:
 
 
 def read_model(folder: Path) -> tuple[Reconstruction, PhotoFinder]:
-    """A model, and what finds its photos, by the name of the scene and of the image: photos lie beside the model."""
+    """A model, or the only one of a scene, and what finds its photos, by the name of the scene and of the image.
+
+    Photos lie beside the model. Raises ValueError for a folder of several models that is none itself.
+    """
     names = {path: name for models in find_scenes(folder).values() for name, path in models.items()}
-    return read_reconstruction(folder, name=names[folder.absolute()]), photo_finder(folder)
+    model = folder.absolute() if folder.absolute() in names else next(iter(names))
+    if model != folder.absolute() and len(names) > 1:
+        raise ValueError(f"expected one COLMAP model as --model, got {len(names)} below {folder}; try {model}")
+    return read_reconstruction(model, name=names[model]), photo_finder(folder)
 
 
 def image_source(scene: Reconstruction, wanted: str, points: str, clutter: float, seed: int) -> ColmapSource:

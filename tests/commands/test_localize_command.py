@@ -54,6 +54,15 @@ def test_images_txt_is_read_by_colmap(tmp_path: Path) -> None:
         np.testing.assert_allclose(image.cam_from_world().translation, truth.translations[i], atol=1e-5)
 
 
+def test_a_scene_is_its_only_model_and_of_several_one_is_asked_for(tmp_path: Path, fails: Callable[..., str]) -> None:
+    truth = plant_model(tmp_path / "scene" / "sparse" / "0")
+    image, *_ = run(tmp_path / "scene", tmp_path / "out", "--no-pictures")
+    np.testing.assert_allclose(image["rotation"], truth.rotations[0], atol=1e-5)
+    plant_model(tmp_path / "scene" / "sparse" / "1")
+    error = fails("localize", "--model", f"{tmp_path}/scene", "--output", f"{tmp_path}/out")
+    assert f"expected one COLMAP model as --model, got 2 below {tmp_path}/scene; try {tmp_path}/scene/sparse/0" in error
+
+
 def test_one_image_by_its_name_and_clutter(tmp_path: Path) -> None:
     plant_model(tmp_path / "model", points=120, seen=60, clutter=20)
     (image,) = run(tmp_path / "model", tmp_path / "out", "--no-pictures", "--image", "photo 1.jpg")
