@@ -192,7 +192,7 @@ def main() -> None:
     parser.add_argument(
         "--known", nargs="*", choices=sorted(KNOWN), default=["cones"], help="of the points (default: cones)"
     )
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of the views, the thinning, rough poses and the search")
     parser.add_argument("--time-limit", type=float)
     parser.add_argument("--output", type=Path, help="JSON to write the rows to")
     options = parser.parse_args()
@@ -200,7 +200,7 @@ def main() -> None:
     KNOWN.intersection_update(options.known)
     results = []
     for outliers in options.outliers:
-        chosen = {"limit": options.limit, "views": options.views, "best": options.best}
+        chosen = {"limit": options.limit, "views": options.views, "best": options.best, "seed": options.seed}
         chosen |= {"most": None if options.all_points else MOST_POINTS}
         pairs = [
             pair

@@ -108,15 +108,16 @@ def directions(points: Any) -> Any:
 
 
 def view_with_outliers(
-    rng: np.random.Generator, true: int, outliers: int
+    rng: np.random.Generator, true: int, outliers: int, *, noise: float = 1e-3, frame: float = 0.4
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Bearings, points, rotation and translation; the first `true` of both are pairs with noise of 1e-3, and as many
-    outliers of each fill the frame."""
+    """Bearings, points, rotation and translation; the first `true` of both are pairs with noise (radians about), and as
+    many outliers of each fill the frame, of this half width and three quarters of it high."""
     rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 5.0])
-    plane = rng.uniform((-0.4, -0.3), (0.4, 0.3), (true + 2 * outliers, 2))
+    half = frame * np.array([1.0, 0.75])
+    plane = rng.uniform(-half, half, (true + 2 * outliers, 2))
     depth = rng.uniform(3.5, 6.5, (len(plane), 1))
     points = (np.column_stack([plane, np.ones(len(plane))]) * depth - translation) @ rotation
-    bearings = directions(np.column_stack([plane + 1e-3 * rng.standard_normal(plane.shape), np.ones(len(plane))]))
+    bearings = directions(np.column_stack([plane + noise * rng.standard_normal(plane.shape), np.ones(len(plane))]))
     image, scene = np.r_[:true, true : true + outliers], np.r_[:true, true + outliers : len(points)]
     return bearings[image], points[scene], rotation, translation
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import distinct, same_pose
 from bpnp.search.scene import Scene
 
+EXCEEDS = 1e3  # nats a bearing, more than any log-likelihood
+
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
@@ -54,6 +56,12 @@ class Candidates:
     def none(cls) -> "Candidates":
         return cls.unscored(np.empty((0, 3, 3), np.float32), np.empty((0, 3), np.float32))
 
+    @property
+    def preference(self) -> NDArray[np.float64]:
+        """(c,) what is largest for the best: the score, and above any score a pose that is known to exceed chance."""
+        exceeds = self.log10_false_alarms < 0  # not NaN
+        return np.where(exceeds, EXCEEDS - self.log10_false_alarms, self.score)
+
     def __len__(self) -> int:
         return len(self.rotation)
 
@@ -85,7 +93,7 @@ def best_distinct(
         scene.settings.same_shift if shift is None else shift,
     )
     poses = candidates.rotation, candidates.translation * scene.shift_weight
-    kept = distinct(*poses, candidates.score, count, *limits)
+    kept = distinct(*poses, candidates.preference, count, *limits)
     same = same_pose(*poses, kept, *limits)
     origin = np.zeros(len(candidates), np.int64) if sources is None else sources
     own = (np.where(same & (origin == source), candidates.hits, 0).max(-1, initial=0) for source in np.unique(origin))

@@ -15,7 +15,7 @@ from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.few.search import is_few, search_few
-from bpnp.search.nearby import beside, cooled, drawn_around, likeliest, nearby_batch
+from bpnp.search.nearby import beside, cooled, drawn_around, is_near, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
@@ -31,6 +31,7 @@ from bpnp.search.verdict import (
     with_false_alarms,
 )
 
+ROUND = 3  # batches with a prior, of which the last is without
 Progress = Callable[[int, float], None]  # batches so far, seconds
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
@@ -72,6 +73,8 @@ def search_poses(
     def entered() -> Scene:
         return Scene(sets, seed, settings, deadline)
 
+    # With a prior more points are enumerated, whose noise may exceed what the enumeration allows: it may miss a pose.
+    crowd = not is_few(replace(sets, prior=None))
     if is_few(sets) and not deadline.passed():
         found, exhausted = search_few(sets, deadline, settings)
         few = judged(found, sets, batches=0, exhaustive=True, rule=rule)
@@ -80,7 +83,7 @@ def search_poses(
             progress(0, time.monotonic() - start)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        if exhausted or small or few.log10_false_alarms <= 0:
+        if few.verdict == "confident" or small or not crowd and (exhausted or few.log10_false_alarms <= 0):
             return few
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
@@ -92,12 +95,16 @@ def search_poses(
         rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
         candidates = replace(few.candidates, rotation=rotation, translation=translation)
     batches, best = 0, -math.inf
-    cones = sets.cones3d is not None and not is_few(sets)  # few points were enumerated
+    near = isinstance(known, PosePrior) and is_near(scene, known)
+    cones = sets.cones3d is not None and crowd  # few points were enumerated
     searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
 
     def finished(poses: Candidates, annealed: int) -> SearchResult:
-        poses = finish(scene, poses, annealed) if len(poses) else poses
-        result = judged(in_user_frame(poses, scene), sets, batches=batches, rule=rule)
+        ends = finish(scene, poses, annealed) if len(poses) else poses
+        if sets.prior is not None and len(ends):  # of a pose before and after, that which chance explains less
+            ends, _ = _weighed_leaders(ends, scene, sets)
+            ends = best_distinct(Candidates.concatenated([ends, poses]), scene, settings.kept)
+        result = judged(in_user_frame(ends, scene), sets, batches=batches, rule=rule)
         if few.log10_false_alarms < result.log10_false_alarms:
             return replace(few, batches=batches)
         return _against_repetitions(result, sets, entered, rule)
@@ -121,13 +128,13 @@ def search_poses(
             yield from around_each(different([found]))
 
     def around_each(poses: Candidates) -> Iterator[Candidates]:
-        since = 0  # looks since the best log-likelihood was bettered
+        since = 0  # looks since the best pose was bettered
         for k in range(len(poses)):
             if since == settings.beside_patience:
                 break
-            best = float(candidates.score[0])
+            best = candidates.preference.max()
             yield beside(scene, poses[k : k + 1], settings.beside)
-            since = 0 if candidates.score[0] > best else since + 1
+            since = 0 if candidates.preference.max() > best else since + 1
 
     exhausted = False
     while searched < settings.max_batches and not (exhausted or deadline.passed()):
@@ -137,6 +144,8 @@ def search_poses(
         else:
             found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
             searched += size
+        if near:
+            found, _ = _weighed_leaders(found, scene, sets)
         candidates = merged([candidates, found], scene)
         batches += 1
         if progress is not None:
@@ -152,11 +161,16 @@ def search_poses(
         if settled and (safe := certain(leaders)) is not None:
             return safe
         turned = different([turned, found])
-        exhausted = is_exhausted(candidates, scene, searched - bettered)
+        exhausted = is_exhausted(candidates, scene, 0.0 if near else searched - bettered)
+        if near and batches >= ROUND * rule.hits and not (candidates.log10_false_alarms < 0).any():
+            # The prior may be wrong: what was found near it would only be in the way.
+            known, near, best, searched, bettered = None, False, -math.inf, 0.0, 0.0
+            candidates = turned = Candidates.none()
     result = finished(candidates, settings.finished)
     # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
     ended_alike = len(candidates) and candidates.hits[0] > batches / 2
-    if result.log10_false_alarms > 0 and (cones or not ended_alike) and not deadline.passed():
+    doubtful = result.log10_false_alarms > (0.0 if sets.prior is None else rule.false_alarms)
+    if doubtful and (cones or not ended_alike) and not deadline.passed():
         for found in looks():
             candidates = merged([candidates, found], scene)
             candidates, leaders = _weighed_leaders(candidates, scene, sets)
@@ -201,23 +215,30 @@ def _against_repetitions(
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:
     """One batch of starts, and its share of a full one.
 
-    Of a rough pose all batches are full, and every other one is looked up in a raster, which finds other poses.
+    Every third one does not know the prior, which may be wrong. Of the others those around a rough pose are full, and
+    looked up in a raster or annealed in turn, which finds other poses.
     """
     settings, coarse = scene.settings, scene.settings.coarse
-    if isinstance(prior, PosePrior) and prior.translation is not None and math.isfinite(prior.translation_sigma):
-        if number % 2 == 0:
-            return nearby_batch(scene, prior), 1.0
-        poses, coarse = drawn_around(scene, prior, settings.starts), cooled(coarse, prior, scene)
-    else:
-        recipe = settings.recipes[number % len(settings.recipes)]
-        drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
-        poses = Candidates.unscored(*drawn, hits=1)
+    if prior is not None:
+        number, kind = divmod(number, ROUND)
+        if kind == 2:
+            prior = None
+        elif isinstance(prior, PosePrior) and is_near(scene, prior):
+            if kind == 0:
+                return nearby_batch(scene, prior), 1.0
+            poses = drawn_around(scene, prior, settings.starts)
+            return run_batch(scene, poses, cooled(coarse, prior, scene), best), 1.0
+        else:
+            number = 2 * number + kind
+    recipe = settings.recipes[number % len(settings.recipes)]
+    drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
+    poses = Candidates.unscored(*drawn, hits=1)
     return run_batch(scene, poses, coarse, best), len(poses) / settings.starts
 
 
 def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:
     """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
-    count = scene.settings.finished
+    count = scene.settings.finished if sets.prior is None else scene.settings.kept
     leaders = with_false_alarms(in_user_frame(candidates[:count], scene), sets)
     known = {
         name: np.concatenate([getattr(leaders, name), getattr(candidates, name)[count:]])

@@ -31,6 +31,7 @@ from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby, Stages
 from bpnp.search.starts import PosePrior
 
+MOST_VOLUMES = 100.0  # of a prior against the widest that has as many starts as it needs; a map view's has 9
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
 
@@ -74,11 +75,21 @@ def beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
     return replace(found, hits=np.zeros_like(found.hits))
 
 
+def is_near(scene: Scene, prior: PosePrior) -> bool:
+    """Whether a prior is narrow enough for starts around it to meet the basin of the right pose."""
+    return prior.translation is not None and _volume(scene, prior, scene.settings.nearby) <= MOST_VOLUMES
+
+
 def starts_of(scene: Scene, prior: PosePrior, rule: Nearby) -> int:
     """As many starts as lie as densely around a narrow prior as `Nearby.starts` do around a wide one."""
-    wide = math.radians(rule.wide_deg), rule.wide_shift * _distance(scene, prior)
-    share = (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
+    share = min(_volume(scene, prior, rule), 1.0)
     return int(np.clip(rule.starts * share, rule.least_starts, rule.starts))
+
+
+def _volume(scene: Scene, prior: PosePrior, rule: Nearby) -> float:
+    """Of the poses that a prior allows, in that of the rule's wide one."""
+    wide = math.radians(rule.wide_deg), rule.wide_shift * _distance(scene, prior)
+    return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
 
 
 def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:

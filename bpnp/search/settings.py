@@ -99,7 +99,7 @@ class Nearby:
     background: float = 8.0
     cells: float = 2.0
     most_cells: int = 1024
-    outliers: float = 0.5
+    outliers: float = 0.85
     starts_a_check: int = 4096
 
 
@@ -203,7 +203,7 @@ class SearchSettings:
     evidence: Evidence = Evidence()
     least_annealed: int = 12
     outliers: float = 0.3
-    end_outliers: tuple[float, ...] = (0.03, 0.6)
+    end_outliers: tuple[float, ...] = (0.03, 0.6, 0.85)
     least_outliers: float = 0.02
     finished: int = 3
     around: int = 4

@@ -42,6 +42,12 @@ def test_two_starts_of_a_batch_are_one_hit_and_those_of_several_batches_add_up(s
     assert found.score.tolist() == [np.float32(2.1), 1.0]
 
 
+def test_a_pose_that_exceeds_chance_is_kept_before_likelier_ones(scene: Scene) -> None:
+    alarms = np.array([-3.0, 5.0, -8.0, np.nan])
+    found = replace(poses([0, 30, 60, 90], [1.0, 2.0, 1.5, 1.9], [1] * 4), log10_false_alarms=alarms)
+    assert best_distinct(found, scene, 4).score.tolist() == [1.5, 1.0, 2.0, np.float32(1.9)]
+
+
 def test_a_pose_without_a_score_is_left_out(scene: Scene) -> None:
     assert best_distinct(poses([0, 90], [-np.inf, 1.0], [1, 1]), scene, 8).score.tolist() == [1.0]
     assert len(best_distinct(Candidates.none(), scene, 8)) == 0

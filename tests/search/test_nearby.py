@@ -1,5 +1,6 @@
 """Starts around a rough pose find a planted one among more outliers than annealing on clusters can stand."""
 
+import math
 import time
 import weakref
 from dataclasses import replace
@@ -22,10 +23,10 @@ from bpnp.search.starts import PosePrior
 Array = NDArray[np.float64]
 
 
-def cluttered(seed: int, true: int = 80, outliers: int = 220) -> tuple[Array, Array, Array, Array]:
-    """Bearings and points in random order and their pose; noise of 1e-3, and outliers that fill the frame of both."""
+def cluttered(seed: int, true: int = 80, outliers: int = 220, **view: float) -> tuple[Array, Array, Array, Array]:
+    """Bearings and points in random order and their pose, with outliers that fill the frame of both."""
     rng = np.random.default_rng(seed)
-    bearings, points, rotation, translation = view_with_outliers(rng, true, outliers)
+    bearings, points, rotation, translation = view_with_outliers(rng, true, outliers, **view)
     image, scene = rng.permutation(len(bearings)), rng.permutation(len(points))
     return bearings[image], points[scene], rotation, translation
 
@@ -46,6 +47,50 @@ def test_a_rough_prior_pays_among_three_outliers_a_true_pair(seed: int) -> None:
     found = search_poses(PointSets(bearings, points, prior=prior))
     assert degrees_between(found.best[0], rotation) < 0.3
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_rough_prior_is_certain_among_seven_outliers_a_true_pair(seed: int) -> None:
+    """Likelier poses that chance explains come up in every batch annealed around the prior."""
+    bearings, points, rotation, translation = cluttered(seed, outliers=600)
+    found = search_poses(
+        PointSets(bearings, points, prior=off(rotation, translation, points, np.random.default_rng(seed)))
+    )
+    assert found.verdict == "confident"
+    assert degrees_between(found.best[0], rotation) < 0.3
+
+
+def test_noise_beyond_the_enumeration_leaves_no_doubt_near_a_prior() -> None:
+    """A rotation known to 4 degrees lets 200 x 200 points be enumerated, with a radius narrower than this noise."""
+    bearings, points, rotation, translation = cluttered(1, true=200, outliers=0, noise=0.01, frame=0.9)
+    prior = off(rotation, translation, points, np.random.default_rng(1))
+    found = search_poses(PointSets(bearings, points, prior=prior))
+    assert found.verdict == "confident"
+    assert degrees_between(found.best[0], rotation) < 0.5
+
+
+@pytest.mark.parametrize(
+    ("translation_sigma", "degrees"), [(0.3, 6.0), (30.0, 120.0), (math.inf, 6.0)],
+    ids=["wrong", "uninformative", "wrong rotation alone"],
+)  # fmt: skip
+def test_a_prior_that_does_not_help_hides_no_pose_that_is_found_without(
+    translation_sigma: float, degrees: float
+) -> None:
+    bearings, points, rotation, translation = cluttered(0, outliers=80)
+    assert search_poses(PointSets(bearings, points)).verdict == "confident"
+    wrong = Rotation.from_rotvec([0, 2, 0]).as_matrix() @ rotation
+    where = None if math.isinf(translation_sigma) else translation
+    found = search_poses(PointSets(bearings, points, prior=PosePrior(wrong, where, degrees, translation_sigma)))
+    assert found.verdict == "confident"
+    assert degrees_between(found.best[0], rotation) < 0.3
+
+
+def test_what_only_looks_around_poses_from_anywhere_find_is_found_with_a_wrong_prior_too() -> None:
+    """Poses near the wrong one are likelier than any beside the right one."""
+    bearings, points, rotation, translation = cluttered(2, outliers=300)
+    wrong = Rotation.from_rotvec([0, 2, 0]).as_matrix() @ rotation
+    found = search_poses(PointSets(bearings, points, prior=PosePrior(wrong, translation, 6.0, 0.3)))
+    assert degrees_between(found.best[0], rotation) < 0.3
 
 
 def test_a_raster_is_computed_once_and_ends_with_its_scene() -> None:
