@@ -179,6 +179,13 @@ def search_poses(
             if deadline.passed():
                 break
         result = finished(candidates, settings.finished)
+    while result.verdict != "confident" and result.log10_false_alarms <= 0 and not deadline.passed():
+        best_pose = Candidates.unscored(*scene.enter(*(values[None] for values in result.best)))
+        candidates = merged([candidates, beside(scene, best_pose, settings.beside)], scene)
+        better = finished(candidates, settings.finished)
+        if better.verdict != "confident" and better.log10_false_alarms > result.log10_false_alarms - rule.lead:
+            break
+        result = better
     if proposals is None or result.verdict == "confident" or deadline.passed():
         return result
     proposed = Candidates.unscored(*scene.enter(*proposals()))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from planted import directions, plant
+from planted import degrees_between, directions, plant
 from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import Deadline
@@ -14,6 +14,8 @@ from bpnp.geometry import bearings
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
 from bpnp.models.search_solver import best_poses, refine
+from bpnp.search import many
+from bpnp.search.candidates import Candidates
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -251,3 +253,22 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     assert np.degrees(Rotation.from_matrix(turned.T @ aside @ rotation).magnitude()) < 0.2
     assert np.linalg.norm(moved - aside @ translation) < 0.002 * translation[2]
     assert found.residual == pytest.approx(0.002 * spread, rel=0.3)
+
+
+def test_a_search_in_doubt_looks_beside_its_best_pose(monkeypatch):
+    """All batches end at a pose that beats chance and is 4 degrees off, as in a wide optimum beside the right one."""
+    planted = plant(1, 200, seed=5, noise=1e-3, outliers2d=20, outliers3d=20)
+    sets = PointSets(planted.bearings[0].double().numpy(), planted.points3d[0].double().numpy())
+    truth, middle = planted.rotation[0].double().numpy(), sets.points3d.mean(0)
+    wrong = Rotation.from_rotvec([np.radians(4), 0, 0]).as_matrix() @ truth
+    translation = planted.translation[0].double().numpy() + (truth - wrong) @ middle
+
+    def ends(scene, *_):
+        pose = Candidates.unscored(*scene.enter(wrong[None], translation[None]), hits=1)
+        return replace(pose, scale=np.full(1, 0.03, np.float32), score=np.full(1, -9, np.float32)), 1.0
+
+    monkeypatch.setattr(many, "_batch", ends)
+    monkeypatch.setattr(many, "finish", lambda scene, poses, annealed=None: poses)
+    result = search_poses(sets, settings=replace(DEFAULT, max_batches=2))
+    assert result.verdict == "confident"
+    assert degrees_between(result.best[0], truth) < 0.5
