@@ -277,6 +277,14 @@ def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_p
     assert severe(browser) == []
 
 
+OVERLAPS = """return [...document.querySelectorAll('.js-plotly-plot')].flatMap((chart) => {
+    const texts = [...chart.querySelectorAll('.xtick text')];
+    const places = texts.map((text) => [text.getBoundingClientRect(), text.textContent]);
+    places.sort(([a], [b]) => a.left - b.left);
+    return places.slice(1).filter(([own], k) => own.left < places[k][0].right).map(([, text]) => text);
+})"""  # labels of a horizontal axis that begin before the one to the left ends
+
+
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1280])
 def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], width: int, scheme: str) -> None:
@@ -292,6 +300,7 @@ def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], wid
         assert page("return document.documentElement.scrollWidth") == width
         wide = "return [...document.querySelectorAll('.js-plotly-plot .main-svg')].map((e) => [e.clientWidth, "
         assert all(own <= room for own, room in page(wide + "e.closest('.js-plotly-plot').clientWidth])"))
+        assert page(OVERLAPS) == []
         colours = page("return [...new Set(document.querySelector('#recall .chart').data.map((t) => t.line.color))]")
         assert set(colours) == set((LIGHT if scheme == "light" else DARK)[:4])
     finally:

@@ -59,16 +59,16 @@ def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = _figure(title, unit, "pairs up to this error", log=True)
+    figure = _figure(title, unit, "pairs up to this error")
     figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
     for place, errors in enumerate(known):
         _line(figure, runs, place, limits, within(errors, limits), "%{y:.1%}")
-    return figure
+    return _logarithmic(figure)
 
 
 def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
     """Median rotation error of groups of pairs of similar `size` ("m", "n" or "true_pairs")."""
-    figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees", log=True)
+    figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees")
     figure.update_yaxes(type="log")
     for place, own in enumerate(series_of(runs)):
         rows = sorted(runs[own.run].of(own.estimate), key=lambda row: getattr(row, size))
@@ -80,7 +80,7 @@ def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
         groups = [part for part in np.split(np.arange(len(x)), edges) if len(part)]
         medians = [max(float(np.median(error[part])), 1e-6) for part in groups]
         _line(figure, runs, place, [np.median(x[part]) for part in groups], medians, "%{y:.3g} deg")
-    return figure if figure.data else None
+    return _logarithmic(figure) if figure.data else None
 
 
 def time_charts(runs: Mapping[str, Results]) -> "list[Figure]":
@@ -94,14 +94,14 @@ def time_charts(runs: Mapping[str, Results]) -> "list[Figure]":
     if not len(positive):
         return []
     limits = np.geomspace(positive.min() * 0.9, positive.max() * 1.1, POINTS)
-    shares = _figure("Pairs done within a time", "seconds per pair", "pairs within", log=True)
+    shares = _figure("Pairs done within a time", "seconds per pair", "pairs within")
     shares.update_yaxes(range=[0, 1.01], tickformat=".0%")
     total = _figure("Cumulative run time", "pairs, in the order of the data set", "seconds")
     for run, values in reversed(times.items()):
         _line(shares, runs, first[run], limits, within(np.sort(values), limits), "%{y:.1%}", name=run)
         shown = np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))
         _line(total, runs, first[run], shown + 1, np.cumsum(values)[shown], "%{y:.3g} s", name=run)
-    return [shares, total]
+    return [_logarithmic(shares), total]
 
 
 def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
@@ -151,15 +151,24 @@ def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) ->
     return {name: charts for name, charts in known.items() if charts}
 
 
-def _figure(title: str, x: str, y: str, *, log: bool = False) -> "Figure":
+def _figure(title: str, x: str, y: str) -> "Figure":
     from plotly.graph_objects import Figure
 
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
-    figure.update_xaxes(
-        title={"text": x}, type="log" if log else "linear", hoverformat=".3~g", **({"tickformat": "~g"} if log else {})
-    )
+    figure.update_xaxes(title={"text": x}, hoverformat=".3~g")
     figure.update_yaxes(title={"text": y})
     return figure
+
+
+def _logarithmic(figure: "Figure") -> "Figure":
+    """The figure with a logarithmic x axis.
+
+    Of one to two decades plotly labels every digit, which overlap, unless it is asked for fewer: then 1, 2 and 5.
+    """
+    x = np.concatenate([trace.x for trace in figure.data])
+    decades = float(np.log10(x.max() / x.min()))
+    few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # more than 0.3 decades a label
+    return figure.update_xaxes(type="log", tickformat="~g", **few)
 
 
 def _line(
