@@ -1,11 +1,13 @@
 """What `bpnp.solve` returns, and its JSON file."""
 
+import base64
 import io
 import json
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -140,13 +142,15 @@ class Solution:
         drawn = self if camera is None else replace(self, camera=camera_from(camera))
         return solution_picture(drawn, photo=picture)
 
-    def _repr_png_(self) -> bytes | None:
-        """The picture that a notebook shows; None without points in front of the camera."""
+    def _repr_html_(self) -> str:
+        """What a notebook shows: `repr`, and below it the picture if a point is in front of the camera."""
+        text = f"<pre>{escape(repr(self))}</pre>"
         if not np.isfinite(self.points2d).all(-1).any():
-            return None
+            return text
         content = io.BytesIO()
         self.plot().savefig(content, format="png", dpi=80)
-        return content.getvalue()
+        picture = base64.b64encode(content.getvalue()).decode()
+        return f'{text}<img style="max-width: 100%" alt="the matches" src="data:image/png;base64,{picture}">'
 
     def to_colmap(
         self, folder: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None

@@ -1,11 +1,16 @@
 """What a solution shows of itself."""
 
+import base64
+import io
 import pickle
+from dataclasses import replace
+from html.parser import HTMLParser
 from typing import Any
 
 import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
 from planted import plant
 
 import bpnp
@@ -32,6 +37,36 @@ def test_the_text_of_a_solution_is_short_and_has_its_pose() -> None:
     assert text.startswith("Solution(confident: ")
     assert all(f"{value:.6f}" in text for value in solution.rotation.ravel())
     assert "matches: 40 of 40" in text
+
+
+class Page(HTMLParser):
+    """The text of a page, and the attributes of its images."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.text, self.images = "", list[dict[str, str | None]]()
+        self.feed(page)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += [dict(attrs)] if tag == "img" else []
+
+
+def test_a_notebook_shows_the_text_and_the_picture_of_a_solution() -> None:
+    solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
+    page = Page(solution._repr_html_())
+    assert page.text == repr(solution)
+    (image,) = page.images
+    kind, content = str(image["src"]).split(",")
+    assert kind == "data:image/png;base64"
+    with Image.open(io.BytesIO(base64.b64decode(content))) as picture:
+        assert min(picture.size) > 300
+        assert len(picture.convert("RGB").getcolors(10**6)) > 100
+    unsafe = replace(solution, reason="<b>1 < 2</b>", points2d=np.full((3, 2), np.nan))
+    assert Page(unsafe._repr_html_()).text == repr(unsafe)
+    assert Page(unsafe._repr_html_()).images == []
 
 
 @pytest.mark.parametrize("camera", [LENS, MATRIX], ids=["lens", "matrix"])
