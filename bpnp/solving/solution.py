@@ -144,7 +144,7 @@ class Solution:
 
     def _repr_html_(self) -> str:
         """What a notebook shows: `repr`, and below it the picture if a point is in front of the camera."""
-        text = f"<pre>{escape(repr(self))}</pre>"
+        text = f"<pre style='white-space: pre-wrap'>{escape(repr(self))}</pre>"
         if not np.isfinite(self.points2d).all(-1).any():
             return text
         content = io.BytesIO()
