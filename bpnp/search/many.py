@@ -27,7 +27,7 @@ from bpnp.search.verdict import (
     is_unique,
     judged,
     no_pose,
-    weighed,
+    weighed_leaders,
     with_false_alarms,
 )
 
@@ -102,7 +102,7 @@ def search_poses(
     def finished(poses: Candidates, annealed: int) -> SearchResult:
         ends = finish(scene, poses, annealed) if len(poses) else poses
         if sets.prior is not None and len(ends):  # of a pose before and after, that which chance explains less
-            ends, _ = _weighed_leaders(ends, scene, sets)
+            ends, _ = weighed_leaders(ends, scene, sets)
             ends = best_distinct(Candidates.concatenated([ends, poses]), scene, settings.kept)
         result = judged(in_user_frame(ends, scene), sets, batches=batches, rule=rule)
         if few.log10_false_alarms < result.log10_false_alarms:
@@ -145,7 +145,7 @@ def search_poses(
             found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
             searched += size
         if near:
-            found, _ = _weighed_leaders(found, scene, sets)
+            found, _ = weighed_leaders(found, scene, sets)
         candidates = merged([candidates, found], scene)
         batches += 1
         if progress is not None:
@@ -155,7 +155,7 @@ def search_poses(
         stalled = candidates.score[0] < best + rule.better
         bettered = bettered if stalled else searched
         best = float(candidates.score[0])
-        candidates, leaders = _weighed_leaders(candidates, scene, sets)
+        candidates, leaders = weighed_leaders(candidates, scene, sets)
         # A pose that was just found may be an optimum beside a better one, which starts around it will find.
         settled = stalled or is_unique(leaders, sets, rule)
         if settled and (safe := certain(leaders)) is not None:
@@ -173,7 +173,7 @@ def search_poses(
     if doubtful and (cones or not ended_alike) and not deadline.passed():
         for found in looks():
             candidates = merged([candidates, found], scene)
-            candidates, leaders = _weighed_leaders(candidates, scene, sets)
+            candidates, leaders = weighed_leaders(candidates, scene, sets)
             if (safe := certain(leaders)) is not None:
                 return safe
             if deadline.passed():
@@ -241,14 +241,3 @@ def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> 
     drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
     poses = Candidates.unscored(*drawn, hits=1)
     return run_batch(scene, poses, coarse, best), len(poses) / settings.starts
-
-
-def _weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:
-    """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
-    count = scene.settings.finished if sets.prior is None else scene.settings.kept
-    leaders = with_false_alarms(in_user_frame(candidates[:count], scene), sets)
-    known = {
-        name: np.concatenate([getattr(leaders, name), getattr(candidates, name)[count:]])
-        for name in ("log10_false_alarms", "log10_rough")
-    }
-    return replace(candidates, **known), weighed(leaders, sets, scene.settings.evidence)

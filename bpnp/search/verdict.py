@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import turned_by
-from bpnp.search.candidates import Candidates
+from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.uncertainty import Misfit, rotation_bound, systematic_misfit
 from bpnp.search.point_sets import PointSets
@@ -80,6 +80,17 @@ def weighed(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.ev
     first = int(np.flatnonzero(alarms <= alarms.min() + rule.lead)[0])
     order = np.r_[first, np.delete(np.arange(len(alarms)), first)]
     return candidates[order]
+
+
+def weighed_leaders(candidates: Candidates, scene: Scene, sets: PointSets) -> tuple[Candidates, Candidates]:
+    """The candidates of a scene, of which the first ones have their false alarms; and those as a verdict needs them."""
+    count = scene.settings.finished if sets.prior is None else scene.settings.kept
+    leaders = with_false_alarms(in_user_frame(candidates[:count], scene), sets)
+    known = {
+        name: np.concatenate([getattr(leaders, name), getattr(candidates, name)[count:]])
+        for name in ("log10_false_alarms", "log10_rough")
+    }
+    return replace(candidates, **known), weighed(leaders, sets, scene.settings.evidence)
 
 
 def lead(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence) -> tuple[float, int]:
