@@ -203,7 +203,7 @@ class SearchSettings:
     evidence: Evidence = Evidence()
     least_annealed: int = 12
     outliers: float = 0.3
-    end_outliers: tuple[float, ...] = (0.03, 0.6, 0.85)
+    end_outliers: tuple[float, ...] = (0.03, 0.6)
     least_outliers: float = 0.02
     finished: int = 3
     around: int = 4
