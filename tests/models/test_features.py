@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from bpnp.models.nets import context_norm as context_norm_loops
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
 from bpnp.models.nets.normalisation import MaskedBatchNorm, principal_axes, robust_frame
 from bpnp.models.nets.pointwise import pointwise_norm
@@ -188,25 +187,6 @@ def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: 
     assert torch.autograd.gradcheck(
         lambda x, w, b, s: pointwise_norm(x, w, b, mask if padded else None, s if residual else None), inputs
     )
-
-
-@pytest.mark.parametrize("residual", [True, False])
-@pytest.mark.parametrize("padded", [True, False])
-def test_the_compiled_norm_gives_the_digits_of_torch(
-    padded: bool, residual: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    x, skip, incoming = torch.randn(3, 2, 4500, 32)  # more than 16^3 points: sums of sums of sums
-    mask = torch.rand(2, 4500) < 0.7 if padded else None
-
-    def results() -> list[Tensor]:
-        leaf, weight = x.clone().requires_grad_(), torch.eye(32).requires_grad_()
-        y = pointwise_norm(leaf, weight, torch.zeros(32), mask, skip if residual else None)
-        return [y.detach(), *torch.autograd.grad(y, (leaf, weight), incoming)]
-
-    found = results()
-    monkeypatch.setattr(context_norm_loops, "applies_to", lambda _: False)
-    for value, expected in zip(found, results(), strict=True):
-        assert torch.equal(value, expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -15,7 +15,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 import bpnp
 import bpnp.layers.compiled
-import bpnp.models.nets.context_norm
 from bpnp import Batch
 from bpnp.layers import RansacPnP
 from bpnp.training.task import BlindPnPTask
@@ -49,7 +48,6 @@ READS = {
     "layers/transport.py:_solve": 2,  # the end, and which samples go on
     "layers/transport.py:solve_plan": 2,  # which samples need float64
     "layers/transport.py:sweep": 1,
-    "models/nets/context_norm.py:_array": 1,  # on the CPU only
     "models/nets/normalisation.py:_of_real_points": 1,  # on the CPU only
     "types.py:unpadded": 1,  # on the CPU only
 }
@@ -91,8 +89,7 @@ def test_the_calls_that_read_a_value_back_are_listed() -> None:
 
 @pytest.mark.parametrize("pose_weight", [0.0, 1.0])
 def test_a_training_step_waits_at_no_other_place(pose_weight: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    for loops in (bpnp.layers.compiled, bpnp.models.nets.context_norm):
-        monkeypatch.setattr(loops, "applies_to", lambda tensor: False)  # as on a GPU
+    monkeypatch.setattr(bpnp.layers.compiled, "applies_to", lambda tensor: False)  # as on a GPU
     net = small_net()
     net.ransac = RansacPnP(backend="torch", max_iterations=50)
     task = BlindPnPTask(net, pose_weight=pose_weight)

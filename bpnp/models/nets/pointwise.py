@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.grad import conv2d_weight
 
-from bpnp.models.nets.context_norm import context_norm_, context_norm_gradient
+CONTEXT_EPS = 1e-3  # as in the released code
 
 
 def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Tensor | None) -> Float[Tensor, "b k d"]:
@@ -58,31 +58,41 @@ def pointwise_norm(
 
 
 class _PointwiseNorm(torch.autograd.Function):
-    """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic."""
+    """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic.
+
+    dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std for the gradient g of y.
+    """
 
     @staticmethod
     def forward(
         ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None
     ) -> Tensor:  # fmt: skip
         z = pointwise(x, weight, bias)
-        wide = z if z.dtype == torch.float64 else z.float()
-        real = None if mask is None else mask.to(wide.dtype)
-        if wide is z:
-            y, scale, out = context_norm_(z, real, skip)
-        else:
-            wide, scale, _ = context_norm_(wide, real)
-            y = wide.to(x.dtype)
-            out = y if skip is None else torch.relu(y).add_(skip)
-        ctx.save_for_backward(x, weight, y, scale, real)
+        y = z if z.dtype == torch.float64 else z.float()
+        real = None if mask is None else mask.unsqueeze(-1).to(y.dtype)
+        count = y.new_full((1, 1, 1), y.shape[1]) if real is None else real.sum(1, keepdim=True)
+        y.sub_((y if real is None else y * real).sum(1, keepdim=True) / count)
+        y = y if real is None else y.mul_(real)
+        variance = y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        scale = torch.rsqrt(variance + CONTEXT_EPS)
+        y = y.mul_(scale).to(x.dtype)
+        ctx.save_for_backward(x, weight, y, scale, count, real)
         ctx.rectified = skip is not None
-        return out
+        return y if skip is None else torch.relu(y).add_(skip)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        x, weight, y, scale, real = ctx.saved_tensors
-        g, wide = gradient.to(scale.dtype), y.to(scale.dtype)
-        dz = context_norm_gradient(g, wide, scale, real, rectified=ctx.rectified).to(x.dtype)
+        x, weight, y, scale, count, real = ctx.saved_tensors
+        g = gradient.to(y.dtype)
+        g = torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g
+        g = g if real is None else g * real
+        wide = y.to(scale.dtype)
+        dz = g * wide
+        along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
+        torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
+        dz = (dz if real is None else dz.mul_(real)).to(x.dtype)
         to_x, to_weight = ctx.needs_input_grad[:2]
         dx = pointwise(dz, weight.mT, None) if to_x else None
         dw = _weight_gradient(x, dz) if to_weight else None
