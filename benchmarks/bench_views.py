@@ -1,12 +1,13 @@
 """Photos against the points of k map views, by the protocol of GoMatch (ECCV 2022): AUC at 1, 5 and 10 px and more.
 
 python benchmarks/bench_views.py --data ../shared/data --methods solve view-prior --outliers 0.5 0.75 1 castle-P30
-Methods: solve; localize (a map's `localize` with the names of the k views, or none); view-prior (the first view's pose
-as `PosePrior`), auto (the same, with the packaged matcher where the search is in doubt); rough-prior (4 degrees and 4 %
-of the distance off, 2 s); the packaged networks by themselves, in the axes that they expect; learned (around the pose
-of one); oracle (RANSAC on the true pairs). Photos are left out of their map.
-solve, view-prior, auto and rough-prior use the cones from which the points are seen; --known: these, and the lengths of
-the tracks, or nothing. --elsewhere: each photo against the views of another scene; none may be confident.
+Methods: solve; default (the same, with a packaged matcher where the search is in doubt); localize (a map's `localize`
+with the names of the k views, or none); view-prior (the first view's pose as `PosePrior`), auto (the same, with the
+packaged matcher where the search is in doubt); rough-prior (4 degrees and 4 % of the distance off, 2 s);
+the packaged networks by themselves, in the axes that they expect; learned (around the pose of one); oracle (RANSAC on
+the true pairs). Photos are left out of their map.
+The searches are told the cones from which the points are seen, but localize and learned; --known: these, and the
+lengths of the tracks, or nothing. --elsewhere: each photo against the views of another scene; none may be confident.
 """
 
 import argparse
@@ -53,8 +54,8 @@ def by_search(
     return found.rotation, found.translation, found.verdict
 
 
-def plain(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
-    return by_search(pair, None, seed, time_limit)
+def plain(pair: ViewPair, seed: int, time_limit: float | None, *, asks: bool = False) -> Answer:
+    return by_search(pair, None, seed, time_limit, asks=asks)
 
 
 def view_prior(pair: ViewPair, seed: int, time_limit: float | None, *, asks: bool = False) -> Answer:
@@ -112,7 +113,8 @@ def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 
 METHODS: dict[str, Callable[[ViewPair, int, float | None], Answer]] = {
-    "solve": plain, "localize": in_map, "view-prior": view_prior, "auto": partial(view_prior, asks=True),
+    "solve": plain, "default": partial(plain, asks=True), "localize": in_map,
+    "view-prior": view_prior, "auto": partial(view_prior, asks=True),
     "rough-prior": rough_prior, "learned": learned, "oracle": oracle,
     **{name: partial(by_network, name) for name in pretrained_names()},
 }  # fmt: skip

@@ -59,7 +59,7 @@ def solve(
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
-        solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
+        solver: auto, which asks a packaged matcher when the search is in doubt; search; or a
             network, packaged weights by name or a checkpoint.
         inlier_threshold: largest error of a match, pixels with a camera.
         time_limit: seconds.

@@ -57,7 +57,8 @@ def search_poses(
 
     around: a guess from the same points, such as a network's pose: the first `settings.around` batches start there, and
         that they end alike is no evidence. proposals: gives poses to start from, such as those that a network finds
-        likely; asked where the search ends in doubt, and no evidence either. seed: of all that is random.
+        likely, and no evidence either; asked where the search ends in doubt, without a prior of many points alone, and
+        where no pose exceeds chance. seed: of all that is random.
     clutter: share of the points without a partner to expect, from 0 to below 1 (`SearchSettings.expecting`); None for
         that of the settings, and several at the end.
     deadline: after it no batch of starts begins, and one that has begun goes on with the poses it has; the result then
@@ -126,6 +127,12 @@ def search_poses(
         for rule in settings.anywhere if cones else ():
             yield (found := anywhere(scene, rule))
             yield from around_each(different([found]))
+        if proposals is not None and sets.prior is None and crowd:
+            yield (found := proposed(proposals))
+            yield from around_each(different([found]))
+
+    def proposed(by: Proposals) -> Candidates:
+        return likeliest(scene, Candidates.unscored(*scene.enter(*by())), settings.nearby)
 
     def around_each(poses: Candidates) -> Iterator[Candidates]:
         since = 0  # looks since the best pose was bettered
@@ -186,11 +193,9 @@ def search_poses(
         if better.verdict != "confident" and better.log10_false_alarms > result.log10_false_alarms - rule.lead:
             break
         result = better
-    if proposals is None or result.verdict == "confident" or deadline.passed():
+    if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
         return result
-    proposed = Candidates.unscored(*scene.enter(*proposals()))
-    candidates = merged([candidates, likeliest(scene, proposed, settings.nearby)], scene)
-    return finished(candidates, settings.finished)
+    return finished(merged([candidates, proposed(proposals)], scene), settings.finished)
 
 
 def _against_repetitions(

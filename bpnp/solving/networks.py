@@ -1,7 +1,7 @@
 """What a trained network says of a problem: its poses, or poses to start a search from."""
 
 import copy
-from functools import cache
+from functools import cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.compilation import Deadline
+from bpnp.search.many import Proposals
 from bpnp.search.refine import score_poses
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
@@ -18,7 +19,8 @@ from bpnp.types import Batch
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
-VIEW_MATCHER = "matcher-maps"  # packaged weights of the frame "view"
+VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
+MOST_PAIRS = 2**22  # of a 2D and a 3D point: seconds of a matcher, whose time and memory grow with them
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 PROPOSED = 20_000  # triples of an assignment; one pair in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
@@ -67,11 +69,20 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
     ]
 
 
-def proposed(problem: Problem, seed: int) -> tuple[Array, Array]:
-    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of the packaged matcher for views."""
+def proposals_for(problem: Problem, seed: int) -> Proposals | None:
+    """Whom a search in doubt asks for poses: the packaged matcher for views around a known pose, and without a prior
+    that for scenes in any axes, unless the points are too many for it."""
+    if isinstance(problem.prior, PosePrior):
+        return partial(proposed, problem, seed, VIEW_MATCHER)
+    too_many = len(problem.bearings) * len(problem.points3d) > MOST_PAIRS
+    return None if too_many or problem.prior is not None else partial(proposed, problem, seed, SCENE_MATCHER)
+
+
+def proposed(problem: Problem, seed: int, weights: str) -> tuple[Array, Array]:
+    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of a packaged matcher."""
     from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
 
-    net = _view_matcher()
+    net = _packaged(weights)
     axes, batch = _given(net, [problem])
     with torch.no_grad():
         assignment = net.match(batch).assignment
@@ -82,10 +93,10 @@ def proposed(problem: Problem, seed: int) -> tuple[Array, Array]:
 
 
 @cache
-def _view_matcher() -> "Matcher":
+def _packaged(weights: str) -> "Matcher":
     from bpnp.models.matcher import Matcher
 
-    return Matcher.from_pretrained(VIEW_MATCHER)
+    return Matcher.from_pretrained(weights)
 
 
 def axes_for(net: nn.Module, problem: Problem) -> Array:

@@ -47,9 +47,10 @@ def solve(
         matched; -1 fits any.
     scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
         strength of a keypoint, or the number of views that see a point; only their ratios matter much.
-    solver: "search", which needs no training; "auto", the same, which with a `PosePrior`, such as the pose of a map's
-        view of the same place, asks the packaged matcher for poses to start from when it is in doubt; a module from
-        `Batch` to `Prediction`; or a checkpoint of a BPnPNet or a Matcher.
+    solver: "search", which needs no training; "auto", the same, which asks a packaged matcher for poses to start from
+        when it is in doubt: "matcher-maps" with a `PosePrior`, such as the pose of a map's view of the same place, and
+        "matcher-sfm" without a prior, of up to four million pairs of points; a module from `Batch` to `Prediction`; or
+        a checkpoint of a BPnPNet or a Matcher.
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.

@@ -13,10 +13,9 @@ from torch import nn
 from bpnp.compilation import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
-from bpnp.solving.networks import axes_for, device_of, evaluation_copy, pose_prior, predicted, proposed
+from bpnp.solving.networks import axes_for, device_of, evaluation_copy, pose_prior, predicted, proposals_for
 from bpnp.solving.problem import Problem
 from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
@@ -31,8 +30,8 @@ Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, 
 class Options(NamedTuple):
     """What applies to all pairs; see `bpnp.solve`.
 
-    solver: None for the search. asks: whether a search around a known pose that is in doubt asks the packaged matcher
-        for poses to start from. device: None for that of each module. settings: of the search.
+    solver: None for the search. asks: whether a search in doubt asks packaged matchers for poses (`proposals_for`).
+    device: None for that of each module. settings: of the search.
     """
 
     solver: nn.Module | None = None
@@ -95,10 +94,9 @@ def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tup
     for i, problem in problems.items():
         start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
         net = nets.get(id(problem.prior))
-        asks = options.asks and isinstance(problem.prior, PosePrior)
         result = search_poses(
             problem.sets, around=None if net is None else pose_prior(net, problem, deadline), clutter=options.clutter,
-            proposals=partial(proposed, problem, options.seed) if asks else None, seed=options.seed,
+            proposals=proposals_for(problem, options.seed) if options.asks else None, seed=options.seed,
             deadline=deadline, settings=options.settings,
             progress=None if options.progress is None else partial(options.progress, i),
         )  # fmt: skip

@@ -139,13 +139,13 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
 
 
 def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
-    """One start finds nothing; among 200 proposals one is 3 degrees off. Without need nobody is asked."""
+    """Three starts find nothing; among 200 proposals one is 3 degrees off. Without need nobody is asked."""
     planted = plant(1, 200, seed=5, noise=1e-4, outliers2d=100, outliers3d=100)
     sets = PointSets(planted.bearings[0].double().numpy(), planted.points3d[0].double().numpy())
     rotation, translation = planted.rotation[0].double().numpy(), planted.translation[0].double().numpy()
     others = super_fibonacci(200)
     others[77] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix() @ rotation
-    few = SearchSettings(max_batches=1, starts=1, first_starts=1, beside_poses=0)
+    few = SearchSettings(max_batches=3, starts=1, first_starts=1, beside_poses=0)
 
     def off(result):
         return np.degrees(Rotation.from_matrix(result.best[0] @ rotation.T).magnitude())

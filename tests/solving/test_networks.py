@@ -8,11 +8,11 @@ import torch
 from planted import plant
 from scipy.spatial.transform import Rotation
 
-from bpnp import PosePrior, solve
+from bpnp import GravityPrior, PosePrior, solve
 from bpnp.models import Matcher
 from bpnp.search.settings import DEFAULT
-from bpnp.solving import networks, sources
-from bpnp.solving.networks import proposed
+from bpnp.solving import networks
+from bpnp.solving.networks import proposals_for, proposed
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -88,32 +88,49 @@ class Knowing(torch.nn.Module):
 
 def test_poses_of_triples_of_a_right_assignment_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
     image, points, rotation, translation = scene(clutter=10)
-    monkeypatch.setattr(networks, "_view_matcher", Knowing)
+    monkeypatch.setattr(networks, "_packaged", lambda weights: Knowing())
     problem = problem_from(image, points, None, prior=PosePrior(VIEW, None, 20.0))
-    turns, shifts = proposed(problem, 0)
+    turns, shifts = proposed(problem, 0, "matcher-maps")
     off = np.abs(turns - rotation).max((1, 2)) + np.abs(shifts - translation).max(1)
     # Each triple that has different pairs has the true pose among up to four.
     assert (off < 1e-3).mean() > 0.25
 
 
-def test_a_search_in_doubt_asks_and_a_sure_one_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[int] = []
+@pytest.mark.parametrize(
+    ("prior", "name"),
+    [
+        (PosePrior(VIEW, np.array([0.2, -0.1, 7.0]), 8.0, 0.5), "matcher-maps"),
+        (None, "matcher-sfm"),
+        (GravityPrior(np.array([0, 1.0, 0]), np.array([0, 0, -1.0])), None),
+    ],
+)
+def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
+    prior: PosePrior | GravityPrior | None, name: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[int, str]] = []
 
-    def propose(problem, seed: int) -> tuple[np.ndarray, np.ndarray]:
-        asked.append(seed)
+    def propose(problem, seed: int, weights: str) -> tuple[np.ndarray, np.ndarray]:
+        asked.append((seed, weights))
         return np.empty((0, 3, 3)), np.empty((0, 3))
 
-    monkeypatch.setattr(sources, "proposed", propose)
-    image, points, rotation, translation = scene()
-    prior = PosePrior(VIEW, translation, 8.0, 0.5)
-    assert solve(image, points, prior=prior).verdict == "confident"
-    assert asked == []
+    monkeypatch.setattr(networks, "proposed", propose)
+    if name is not None:
+        image, points, *_ = scene()
+        assert solve(image, points, prior=prior).verdict == "confident"
+        assert asked == []
     rng = np.random.default_rng(0)
-    noise2d, noise3d = rng.uniform(-0.5, 0.5, (60, 2)), rng.normal(size=(60, 3))
+    noise2d, noise3d = rng.uniform(-0.5, 0.5, (150, 2)), rng.normal(size=(150, 3))
     problem = problem_from(noise2d, noise3d, None, prior=prior)
-    brief = replace(DEFAULT, max_batches=1, beside_poses=0)
+    brief = replace(DEFAULT, max_batches=2, beside_poses=0)
     alone, helped = (
         solutions_of({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
     )
-    assert asked == [3]
+    assert asked == ([] if name is None else [(3, name)])
     assert alone.verdict == helped.verdict != "confident"
+
+
+def test_a_matcher_is_not_asked_of_too_many_points() -> None:
+    rng = np.random.default_rng(0)
+    image, points = rng.uniform(-0.5, 0.5, (3000, 2)), rng.normal(size=(3000, 3))
+    assert proposals_for(problem_from(image, points, None), 0) is None
+    assert proposals_for(problem_from(image[:1000], points, None), 0) is not None
