@@ -37,7 +37,7 @@ def localize(
 
     Args:
         map: COLMAP model of the place, such as sparse/0.
-        photos: photos, or folders of them.
+        photos: photos, or folders of them; a photo in a folder has its path within it as its name, as in hloc.
         camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; EXIF by default.
         views: text file of pairs "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
@@ -98,10 +98,10 @@ def _localize_photos(
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {features}, which is no file")
     source_from(given["solver"])  # raises, where each photo would
     options = PhotoOptions(known, None if views is None else read_pairs(views), features, *rest)
-    files, scene = photo_files(photos), SceneMap.from_colmap(place)
+    files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(place)
     out, errors = console(), dict[str, str]()
     with claimed(output), progress() as shown:
-        if not any((output / "solutions").glob("*.json")):
+        if not any((output / "solutions").rglob("*.json")):
             (output / "settings.json").unlink(missing_ok=True)
         keep_settings(output / "settings.json", {"map": place, **given})
         done = finished_solutions(output, files)

@@ -1,6 +1,5 @@
 """Photos localised in a map, one after the other, into a folder; an interrupted run resumes."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,16 +41,24 @@ class PhotoOptions:
     time_limit: float | None = None
 
 
-def photo_files(given: Iterable[Path]) -> dict[str, Path]:
-    """Photos by name: the files given, and those in given folders. Raises ValueError for none, or one name twice."""
+def photo_files(given: Iterable[Path], besides: Path | None = None) -> dict[str, Path]:
+    """Photos by name: the files given, and those in given folders and folders within, named by their path in these.
+
+    besides: a folder whose files are no photos, such as that of the results.
+    Raises ValueError for none, or one name twice.
+    """
     files: dict[str, Path] = {}
     for path in given:
         if not path.exists():
             raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
-        inside = sorted(file for file in path.iterdir() if file.suffix.lower() in SUFFIXES) if path.is_dir() else [path]
-        for file in inside:
-            if files.setdefault(file.name, file) != file:
-                raise ValueError(f"expected photos of different names, got {files[file.name]} and {file}")
+        folder = path if path.is_dir() else path.parent
+        inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
+        for file in inside if path.is_dir() else [path]:
+            if besides is not None and besides.resolve() in file.resolve().parents:
+                continue
+            name = file.relative_to(folder).as_posix()
+            if files.setdefault(name, file) != file:
+                raise ValueError(f"expected photos of different names, got {files[name]} and {file}")
     if not files:
         raise ValueError("expected one or more photos, or folders with some, got none")
     return files
@@ -113,7 +120,7 @@ def kept(folder: Path, name: str, photo: Path, solution: Solution | str, *, pict
         raise ValueError(solution)
     if picture:
         figure = solution_picture(solution, title=f"{name}: {solution.view}", photo=read_photo(photo))
-        save_figure(figure, folder / "pictures" / f"{_safe(name)}.png")
+        save_figure(figure, folder / "pictures" / f"{name}.png")
     write_text(_solution_file(folder, name), solution.to_json() + "\n")
     return solution
 
@@ -145,8 +152,4 @@ def _keypoints(name: str, photo: Path, features: Path | None, size: tuple[int, i
 
 
 def _solution_file(folder: Path, name: str) -> Path:
-    return folder / "solutions" / f"{_safe(name)}.json"
-
-
-def _safe(name: str) -> str:
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", name)
+    return folder / "solutions" / f"{name}.json"

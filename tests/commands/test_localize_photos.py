@@ -103,6 +103,27 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] is False
 
 
+def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_photos(
+    place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]
+) -> None:
+    model, photos = place
+    folder = tmp_path / "query"
+    for name in ("day/0004.jpg", "night/0004.jpg"):
+        (folder / name).parent.mkdir(parents=True)
+        shutil.copy(photos / "0004.jpg", folder / name)
+    pairs = tmp_path / "pairs.txt"
+    pairs.write_text("day/0004.jpg 0003.jpg\n")
+    command = ["localize", str(model), str(folder), "--camera", CAMERA, "--views", str(pairs), "--no-pictures"]
+    error = fails(*command, "--output", str(folder / "found"))
+    assert "1 of 2 photos could not be tried, such as night/0004.jpg: expected views for night/0004.jpg" in error
+    solution = Solution.from_json(folder / "found/solutions/day/0004.jpg.json")
+    assert solution.verdict == "confident"
+    assert (folder / "found/poses.txt").read_text().splitlines()[1].startswith("day/0004.jpg ")
+    (folder / "found/pictures").mkdir()
+    shutil.copy(photos / "0005.jpg", folder / "found/pictures")
+    assert "1 of 2 photos" in fails(*command, "--output", str(folder / "found"))
+
+
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
