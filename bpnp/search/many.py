@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -10,26 +10,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.compilation import NEVER, Deadline
-from bpnp.search.annealing import finish, run_batch
+from bpnp.search.annealing import run_batch
 from bpnp.search.anywhere import anywhere
-from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
-from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.candidates import Candidates
 from bpnp.search.few.search import is_few, search_few
 from bpnp.search.nearby import beside, cooled, drawn_around, is_near, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
+from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
+from bpnp.search.settings import DEFAULT, Nearby, SearchSettings
 from bpnp.search.starts import PosePrior, Prior, draw_poses
-from bpnp.search.verdict import (
-    SearchResult,
-    is_certain,
-    is_exhausted,
-    is_unique,
-    judged,
-    no_pose,
-    weighed_leaders,
-    with_false_alarms,
-)
+from bpnp.search.verdict import SearchResult, is_exhausted, is_unique, judged, no_pose, weighed_leaders
 
 ROUND = 3  # batches with a prior, of which the last is without
 Progress = Callable[[int, float], None]  # batches so far, seconds
@@ -68,7 +59,11 @@ def search_poses(
     candidates. Raises ValueError for `clutter` out of range.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
-    start, rule, few = time.monotonic(), settings.evidence, no_pose("no pose was found")
+    start, few = time.monotonic(), no_pose("no pose was found")
+
+    def tell(batches: int) -> None:
+        if progress is not None:
+            progress(batches, time.monotonic() - start)
 
     @cache
     def entered() -> Scene:
@@ -77,11 +72,8 @@ def search_poses(
     # With a prior more points are enumerated, whose noise may exceed what the enumeration allows: it may miss a pose.
     crowd = not is_few(replace(sets, prior=None))
     if is_few(sets) and not deadline.passed():
-        found, exhausted = search_few(sets, deadline, settings)
-        few = judged(found, sets, batches=0, exhaustive=True, rule=rule)
-        few = _against_repetitions(few, sets, entered, rule, exhaustive=True)
-        if progress is not None:
-            progress(0, time.monotonic() - start)
+        few, exhausted = _enumerated(sets, entered, settings, deadline)
+        tell(0)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
         if few.verdict == "confident" or small or not crowd and (exhausted or few.log10_false_alarms <= 0):
@@ -89,139 +81,122 @@ def search_poses(
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
-    scene = entered()
-    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
-    candidates = turned = Candidates.none()  # turned: the likeliest ones of different rotations
-    if len(few.candidates):
-        rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
-        candidates = replace(few.candidates, rotation=rotation, translation=translation)
-    batches, best = 0, -math.inf
-    near = isinstance(known, PosePrior) and is_near(scene, known)
+    pool = Pool(entered(), sets, few)
+    if (safe := _from_batches(pool, around, tell)) is not None:
+        return safe
+    result = pool.result()
+    # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
+    ended_alike = len(pool.candidates) and pool.candidates.hits[0] > pool.batches / 2
     cones = sets.cones3d is not None and crowd  # few points were enumerated
-    searched, bettered = 0.0, 0.0  # starts in full batches: so far, and when the best pose was bettered last
+    doubtful = result.log10_false_alarms > (0.0 if sets.prior is None else settings.evidence.false_alarms)
+    if doubtful and (cones or not ended_alike) and not deadline.passed():
+        asked = proposals if sets.prior is None and crowd else None
+        if (safe := _from_looks(pool, settings.anywhere if cones else (), asked)) is not None:
+            return safe
+        result = pool.result()
+    result = _beside_best(pool, result)
+    if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
+        return result
+    pool.merge(_proposed(pool.scene, proposals))
+    return pool.result()
 
-    def finished(poses: Candidates, annealed: int) -> SearchResult:
-        ends = finish(scene, poses, annealed) if len(poses) else poses
-        if sets.prior is not None and len(ends):  # of a pose before and after, that which chance explains less
-            ends, _ = weighed_leaders(ends, scene, sets)
-            ends = best_distinct(Candidates.concatenated([ends, poses]), scene, settings.kept)
-        result = judged(in_user_frame(ends, scene), sets, batches=batches, rule=rule)
-        if few.log10_false_alarms < result.log10_false_alarms:
-            return replace(few, batches=batches)
-        return _against_repetitions(result, sets, entered, rule)
 
-    def certain(leaders: Candidates) -> SearchResult | None:
-        """The result, if it holds on all bearings too."""
-        if not is_certain(leaders, sets, rule, batches=batches):
-            return None
-        result = finished(candidates[np.isfinite(candidates.log10_false_alarms)], 1)
-        return result if result.verdict == "confident" else None
+def _enumerated(
+    sets: PointSets, entered: Callable[[], Scene], settings: SearchSettings, deadline: Deadline
+) -> tuple[SearchResult, bool]:
+    """The result of few points, and whether every hypothesis was tried."""
+    found, exhausted = search_few(sets, deadline, settings)
+    few = judged(found, sets, batches=0, exhaustive=True, rule=settings.evidence)
+    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=True), exhausted
 
-    def different(parts: list[Candidates]) -> Candidates:
-        together = Candidates.concatenated(parts)
-        return best_distinct(together, scene, settings.beside_poses, degrees=settings.beside_deg, shift=math.inf)
 
-    def looks() -> Iterator[Candidates]:
-        """Poses that clusters hide, look after look."""
-        yield from around_each(turned)
-        for rule in settings.anywhere if cones else ():
-            yield (found := anywhere(scene, rule))
-            yield from around_each(different([found]))
-        if proposals is not None and sets.prior is None and crowd:
-            yield (found := proposed(proposals))
-            yield from around_each(different([found]))
-
-    def proposed(by: Proposals) -> Candidates:
-        return likeliest(scene, Candidates.unscored(*scene.enter(*by())), settings.nearby)
-
-    def around_each(poses: Candidates) -> Iterator[Candidates]:
-        since = 0  # looks since the best pose was bettered
-        for k in range(len(poses)):
-            if since == settings.beside_patience:
-                break
-            best = candidates.preference.max()
-            yield beside(scene, poses[k : k + 1], settings.beside)
-            since = 0 if candidates.preference.max() > best else since + 1
-
+def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None]) -> SearchResult | None:
+    """Batch after batch of starts until a pose is certain: its result; None where more of them would not help."""
+    scene, sets, settings, rule = pool.scene, pool.sets, pool.scene.settings, pool.scene.settings.evidence
+    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
+    near = isinstance(known, PosePrior) and is_near(scene, known)
+    guesses = 0 if guess is None else settings.around
+    best, searched, bettered = -math.inf, 0.0, 0.0  # starts in full batches: so far, when the best pose was bettered
     exhausted = False
-    while searched < settings.max_batches and not (exhausted or deadline.passed()):
-        if guess is not None and batches < settings.around:
-            found, _ = _batch(scene, batches, guess, candidates)
+    while searched < settings.max_batches and not (exhausted or scene.deadline.passed()):
+        if pool.batches < guesses:
+            found, _ = _batch(scene, pool.batches, guess, pool.candidates)
             found = replace(found, hits=np.zeros_like(found.hits))
         else:
-            found, size = _batch(scene, batches - (0 if guess is None else settings.around), known, candidates)
+            found, size = _batch(scene, pool.batches - guesses, known, pool.candidates)
             searched += size
         if near:
             found, _ = weighed_leaders(found, scene, sets)
-        candidates = merged([candidates, found], scene)
-        batches += 1
-        if progress is not None:
-            progress(batches, time.monotonic() - start)
-        if not len(candidates):
+        pool.merge(found)
+        pool.batches += 1
+        tell(pool.batches)
+        if not len(pool.candidates):
             continue
-        stalled = candidates.score[0] < best + rule.better
+        stalled = pool.candidates.score[0] < best + rule.better
         bettered = bettered if stalled else searched
-        best = float(candidates.score[0])
-        candidates, leaders = weighed_leaders(candidates, scene, sets)
+        best = float(pool.candidates.score[0])
+        leaders = pool.leaders()
         # A pose that was just found may be an optimum beside a better one, which starts around it will find.
         settled = stalled or is_unique(leaders, sets, rule)
-        if settled and (safe := certain(leaders)) is not None:
+        if settled and (safe := pool.certain(leaders)) is not None:
             return safe
-        turned = different([turned, found])
-        exhausted = is_exhausted(candidates, scene, 0.0 if near else searched - bettered)
-        if near and batches >= ROUND * rule.hits and not (candidates.log10_false_alarms < 0).any():
+        pool.turned = pool.different([pool.turned, found])
+        exhausted = is_exhausted(pool.candidates, scene, 0.0 if near else searched - bettered)
+        if near and pool.batches >= ROUND * rule.hits and not (pool.candidates.log10_false_alarms < 0).any():
             # The prior may be wrong: what was found near it would only be in the way.
             known, near, best, searched, bettered = None, False, -math.inf, 0.0, 0.0
-            candidates = turned = Candidates.none()
-    result = finished(candidates, settings.finished)
-    # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
-    ended_alike = len(candidates) and candidates.hits[0] > batches / 2
-    doubtful = result.log10_false_alarms > (0.0 if sets.prior is None else rule.false_alarms)
-    if doubtful and (cones or not ended_alike) and not deadline.passed():
-        for found in looks():
-            candidates = merged([candidates, found], scene)
-            candidates, leaders = weighed_leaders(candidates, scene, sets)
-            if (safe := certain(leaders)) is not None:
-                return safe
-            if deadline.passed():
-                break
-        result = finished(candidates, settings.finished)
-    while result.verdict != "confident" and result.log10_false_alarms <= 0 and not deadline.passed():
-        best_pose = Candidates.unscored(*scene.enter(*(values[None] for values in result.best)))
-        candidates = merged([candidates, beside(scene, best_pose, settings.beside)], scene)
-        better = finished(candidates, settings.finished)
-        if better.verdict != "confident" and better.log10_false_alarms > result.log10_false_alarms - rule.lead:
+            pool.candidates = pool.turned = Candidates.none()
+    return None
+
+
+def _from_looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> SearchResult | None:
+    """Look after look for poses that clusters hide, until one is certain: its result."""
+    for found in _looks(pool, anywhere_rules, proposals):
+        pool.merge(found)
+        if (safe := pool.certain(pool.leaders())) is not None:
+            return safe
+        if pool.scene.deadline.passed():
+            break
+    return None
+
+
+def _looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> Iterator[Candidates]:
+    """Around the likeliest poses of different rotations, from within the cones of the points, from those proposed."""
+    yield from _around_each(pool, pool.turned)
+    for rule in anywhere_rules:
+        yield (found := anywhere(pool.scene, rule))
+        yield from _around_each(pool, pool.different([found]))
+    if proposals is not None:
+        yield (found := _proposed(pool.scene, proposals))
+        yield from _around_each(pool, pool.different([found]))
+
+
+def _around_each(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
+    settings, since = pool.scene.settings, 0  # looks since the best pose was bettered
+    for k in range(len(poses)):
+        if since == settings.beside_patience:
+            break
+        best = pool.candidates.preference.max()
+        yield beside(pool.scene, poses[k : k + 1], settings.beside)
+        since = 0 if pool.candidates.preference.max() > best else since + 1
+
+
+def _beside_best(pool: Pool, result: SearchResult) -> SearchResult:
+    """Looks beside a pose that exceeds chance but leaves a doubt, an optimum beside a better one, while they help."""
+    scene = pool.scene
+    while result.verdict != "confident" and result.log10_false_alarms <= 0 and not scene.deadline.passed():
+        best = Candidates.unscored(*scene.enter(*(values[None] for values in result.best)))
+        pool.merge(beside(scene, best, scene.settings.beside))
+        better = pool.result()
+        lead = scene.settings.evidence.lead
+        if better.verdict != "confident" and better.log10_false_alarms > result.log10_false_alarms - lead:
             break
         result = better
-    if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
-        return result
-    return finished(merged([candidates, proposed(proposals)], scene), settings.finished)
+    return result
 
 
-def _against_repetitions(
-    result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence, *, exhaustive: bool = False
-) -> SearchResult:
-    """A confident result once more, beside the poses that a repeated structure would confuse with it; if one of these
-    is better, so is that one."""
-    if result.verdict != "confident":
-        return result
-    best, scale = result.best, max(result.residual, sets.image.scales[0])
-    repeated, compared = repeated_poses(sets, *best, scale, rule)
-    if not len(repeated[0]):
-        return result
-    scene = entered()
-    starts = Candidates.unscored(*scene.enter(*repeated))
-    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
-    ends = finish(scene, starts)  # none after the deadline
-    rivals = with_false_alarms(in_user_frame(ends if len(ends) else starts, scene), sets)
-    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
-    behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
-    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
-    candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    beside = judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
-    if np.array_equal(beside.best[1], best[1]):
-        return beside
-    return _against_repetitions(beside, sets, entered, rule, exhaustive=exhaustive)
+def _proposed(scene: Scene, proposals: Proposals) -> Candidates:
+    return likeliest(scene, Candidates.unscored(*scene.enter(*proposals())), scene.settings.nearby)
 
 
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:

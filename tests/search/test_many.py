@@ -14,7 +14,7 @@ from bpnp.geometry import bearings
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
 from bpnp.models.search_solver import best_poses, refine
-from bpnp.search import many
+from bpnp.search import many, pool
 from bpnp.search.candidates import Candidates
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
@@ -268,7 +268,7 @@ def test_a_search_in_doubt_looks_beside_its_best_pose(monkeypatch):
         return replace(pose, scale=np.full(1, 0.03, np.float32), score=np.full(1, -9, np.float32)), 1.0
 
     monkeypatch.setattr(many, "_batch", ends)
-    monkeypatch.setattr(many, "finish", lambda scene, poses, annealed=None: poses)
+    monkeypatch.setattr(pool, "finish", lambda scene, poses, annealed=None: poses)
     result = search_poses(sets, settings=replace(DEFAULT, max_batches=2))
     assert result.verdict == "confident"
     assert degrees_between(result.best[0], truth) < 0.5

@@ -13,8 +13,8 @@ from bpnp import solve
 from bpnp.compilation import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.many import _against_repetitions
 from bpnp.search.point_sets import PointSets
+from bpnp.search.pool import against_repetitions
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
 from bpnp.search.verdict import SearchResult
@@ -94,7 +94,7 @@ def test_after_the_deadline_repetitions_are_still_compared() -> None:
     found = replace(Candidates.unscored(np.eye(3)[None], np.zeros((1, 3)), hits=9), scale=np.array([1e-3]))
     scene_of = partial(Scene, sets, 0, DEFAULT, Deadline.after(0.0))
     sure = SearchResult(found, "confident", "", 9)
-    assert _against_repetitions(sure, sets, scene_of, Evidence()).verdict == "ambiguous"
+    assert against_repetitions(sure, sets, scene_of, Evidence()).verdict == "ambiguous"
 
 
 def test_points_that_do_not_repeat_count_against_a_shift_and_those_that_do_not_where_the_map_ends() -> None:

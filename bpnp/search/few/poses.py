@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from bpnp.search.few.arrays import ImageArrays, SceneArrays, scene_arrays
 from bpnp.search.few.priors import knowledge_of, predicted_pose
 from bpnp.search.few.state import Enumeration, Stage
+from bpnp.search.few.symmetries import near_symmetries
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import PosePrior, Prior
-from bpnp.search.symmetries import near_symmetries
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
