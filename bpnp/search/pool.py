@@ -31,7 +31,12 @@ class Pool:
             self.candidates = replace(few.candidates, rotation=rotation, translation=translation)
 
     def merge(self, found: Candidates) -> None:
-        """Take up the poses of a batch or a look."""
+        """Take up the poses of a batch or a look.
+
+        They are weighed where a pose of before exceeds chance, which would else displace a better one beside it.
+        """
+        if (self.candidates.log10_false_alarms < 0).any():
+            found, _ = weighed_leaders(found, self.scene, self.sets)
         self.candidates = merged([self.candidates, found], self.scene)
 
     def leaders(self) -> Candidates:
