@@ -34,14 +34,6 @@ class Tensors:
         return _mapped(self, move)
 
 
-def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
-    """Whether every point is known to be real, so that masks need not be applied.
-
-    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
-    """
-    return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
-
-
 @dataclass(frozen=True)
 class SolveStats(Tensors):
     """How an iterative solver ended, per sample."""

@@ -82,7 +82,7 @@ def solve(
         raise ValueError("expected --photo with --picture and --camera, got it without")
     if picture is not None:
         from bpnp.report.figures import SUFFIXES, save_figure  # matplotlib, where something is drawn
-        from bpnp.report.pictures import photo_size, read_photo, solution_picture
+        from bpnp.report.pictures import read_photo, size_in_camera, solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
             raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")
@@ -94,7 +94,7 @@ def solve(
     lens = None if camera is None else read_camera(camera, image)
     under = None if photo is None or picture is None else read_photo(photo)
     if under is not None:
-        photo_size(under, camera_from(lens))
+        size_in_camera(under, camera_from(lens))
     for path in (output, picture):  # raises before the search where its result could not be written
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)

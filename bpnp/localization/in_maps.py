@@ -44,24 +44,26 @@ class PhotoOptions:
 def photo_files(given: Iterable[Path], besides: Path | None = None) -> dict[str, Path]:
     """Photos by name: the files given, and those in given folders and folders within, named by their path in these.
 
-    besides: a folder whose files are no photos, such as that of the results.
+    besides: a folder within a given one whose files are no photos, such as that of the results.
     Raises ValueError for none, or one name twice.
     """
     files: dict[str, Path] = {}
     for path in given:
         if not path.exists():
             raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
-        folder = path if path.is_dir() else path.parent
-        inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
-        for file in inside if path.is_dir() else [path]:
-            if besides is not None and besides.resolve() in file.resolve().parents:
-                continue
-            name = file.relative_to(folder).as_posix()
+        for file in _photos_in(path, besides) if path.is_dir() else [path]:
+            name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
                 raise ValueError(f"expected photos of different names, got {files[name]} and {file}")
     if not files:
         raise ValueError("expected one or more photos, or folders with some, got none")
     return files
+
+
+def _photos_in(folder: Path, besides: Path | None) -> list[Path]:
+    left_out = None if besides is None else besides.resolve()
+    inside = (file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES)
+    return sorted(file for file in inside if left_out not in file.resolve().parents)
 
 
 def localize_photo(scene: SceneMap, name: str, photo: Path, options: PhotoOptions) -> Solution:

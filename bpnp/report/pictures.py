@@ -33,7 +33,7 @@ def read_photo(path: Path | str) -> Array:
         raise ValueError(f"expected a picture, got {path}: {error}") from error
 
 
-def photo_size(photo: Array, camera: Camera | None) -> tuple[int, int]:
+def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
     """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
 
     Raises ValueError for a photo of another shape than the camera's images.
@@ -87,7 +87,7 @@ def plot_image(
     if photo is not None and (box is not None or view.camera is None):
         frame = Box(*_in_unit(np.reshape(box or picture_box(view.points2d), (2, 2)), view.camera).ravel().tolist())
     else:
-        frame = picture_box(seen) if photo is None else Box(0, 0, *photo_size(photo, view.camera))
+        frame = picture_box(seen) if photo is None else Box(0, 0, *size_in_camera(photo, view.camera))
     if photo is not None:
         axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
     size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))

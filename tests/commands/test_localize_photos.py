@@ -122,6 +122,8 @@ def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_pho
     (folder / "found/pictures").mkdir()
     shutil.copy(photos / "0005.jpg", folder / "found/pictures")
     assert "1 of 2 photos" in fails(*command, "--output", str(folder / "found"))
+    given = folder / "found/pictures/0005.jpg"  # by itself it is a photo, wherever it lies
+    assert in_maps.photo_files([given], besides=folder / "found") == {"0005.jpg": given}
 
 
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(

@@ -7,8 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.models.nets.normalisation import MaskedBatchNorm, centred
-from bpnp.models.nets.pointwise import Pointwise, pointwise_norm
-from bpnp.types import unpadded
+from bpnp.models.nets.pointwise import Pointwise, pointwise_norm, unpadded
 
 
 class ResidualBlock(nn.Module):

@@ -11,6 +11,14 @@ from torch.nn.grad import conv2d_weight
 CONTEXT_EPS = 1e-3  # as in the released code
 
 
+def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
+    """Whether every point is known to be real, so that masks need not be applied.
+
+    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
+    """
+    return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
+
+
 def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Tensor | None) -> Float[Tensor, "b k d"]:
     """x W^T + b.
 
