@@ -157,11 +157,13 @@ def _localize_images(
     source = image_source(scene, *chosen, options["seed"])
     settings, done, out = {"model": str(model), "points": chosen[1], "seed": options["seed"]}, [], console()
     with claimed(output), progress() as shown:
-        for index in shown.track(range(len(source.images)), description="localizing"):
-            done.append(localize_image(source, index, **options))
+        try:
+            for index in shown.track(range(len(source.images)), description="localizing"):
+                done.append(localize_image(source, index, **options))
+                if pictures:
+                    draw_image(find, scene, done[-1], output / "pictures")
+        finally:
             write_localized(output, done, settings)
-            if pictures:
-                draw_image(find, scene, done[-1], output / "pictures")
     out.print(localized_table(done))
     out.print(summary(done), highlight=False, soft_wrap=True)
     say(f"wrote {', '.join(['results.json', 'images.txt', *['pictures/'] * pictures])} in {output}", to=out)

@@ -21,7 +21,8 @@ from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.rows import number
 from bpnp.solving.solution import Solution
 
-SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"}
+# The last four are found too although Pillow may not read them, so that the error names the photo.
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif", ".dng"}
 Attempt = tuple[str, Solution | str]  # a photo's name, and its solution or why it could not be tried
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 

@@ -20,7 +20,7 @@ def photo_size(photo: Path) -> tuple[int, int]:
         with Image.open(photo) as image:
             return image.size
     except OSError as error:
-        raise ValueError(f"expected a photo that can be read, got {photo}: {error}") from error
+        raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
 
 
 def camera_from_exif(photo: Path) -> ColmapCamera:
