@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.uncertainty import Misfit, rotation_bound, systematic_misfit
+from bpnp.search.evidence.uncertainty import linearised, rotation_bound, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence
@@ -168,11 +168,12 @@ def judged(
     alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
     chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
     count = float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
-    pose = candidates.rotation[0], candidates.translation[0]
-    off = math.degrees(rotation_bound(sets, *pose, float(candidates.scale[0]), count))
-    certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches)
-    misfit = systematic_misfit(sets, *pose, float(candidates.scale[0]), count) if certain else Misfit(0.0, 0.0)
-    bent = math.degrees(misfit.turn) > rule.other_deg or misfit.shift > rule.other_shift
+    certain, off, bent = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches), math.inf, False
+    if certain:
+        pairs = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
+        off = math.degrees(rotation_bound(sets, pairs, count))
+        misfit = systematic_misfit(pairs, count)
+        bent = math.degrees(misfit.turn) > rule.other_deg or misfit.shift > rule.other_shift
     if certain and off <= rule.loose_deg and not bent:
         return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
     if alarms > 0:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import t as student
 
 from bpnp import solve
-from bpnp.search.evidence.uncertainty import OUTLIERS, rotation_bound, rotation_sigma, systematic_misfit
+from bpnp.search.evidence.uncertainty import OUTLIERS, linearised, rotation_bound, rotation_sigma, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.matches import fit_pose
@@ -25,6 +25,10 @@ def noisy(rays: Array, rng: np.random.Generator, noise: float = NOISE) -> Array:
     return directions(rays + noise * rng.standard_normal(rays.shape))
 
 
+def sigma_of(sets: PointSets, rotation: Array, translation: Array) -> float:
+    return rotation_sigma(sets, linearised(sets, rotation, translation, NOISE))
+
+
 @pytest.mark.parametrize("count", [6, 20])
 def test_it_is_the_spread_of_fits_to_repeated_noise(count: int) -> None:
     rng = np.random.default_rng(count)
@@ -35,7 +39,7 @@ def test_it_is_the_spread_of_fits_to_repeated_noise(count: int) -> None:
         found, _ = fit_pose(lambda r, t: directions(points @ r.T + t), noisy(rays, rng), rotation, SHIFT, scale=NOISE)
         turns.append(Rotation.from_matrix(found @ rotation.T).as_rotvec())
     spread = math.sqrt(np.linalg.eigvalsh(np.cov(np.array(turns).T))[-1])
-    sigmas = [rotation_sigma(PointSets(noisy(rays, rng), points), rotation, SHIFT, NOISE) for _ in range(20)]
+    sigmas = [sigma_of(PointSets(noisy(rays, rng), points), rotation, SHIFT) for _ in range(20)]
     assert np.median(sigmas) == pytest.approx(spread, rel=0.35)
     assert min(sigmas) > 0.7 * spread
 
@@ -67,7 +71,7 @@ def test_points_as_dense_as_their_residuals_fix_less_than_their_number_says() ->
             corners = [loss(s * step[a] + q * step[b]) * s * q for s in (1, -1) for q in (1, -1)]
             hessian[a, b] = sum(corners) / (4 * 0.2**2)
     by_differences = 1e-2 * math.sqrt(np.linalg.eigvalsh(np.linalg.inv(hessian)[:3, :3])[-1])
-    sigma = rotation_sigma(sets, np.eye(3), SHIFT, NOISE)
+    sigma = sigma_of(sets, np.eye(3), SHIFT)
     assert sigma == pytest.approx(by_differences, rel=0.2)
 
 
@@ -75,24 +79,25 @@ def test_a_bound_is_exceeded_once_in_a_thousand_by_students_law() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (8, 3))
     sets = PointSets(noisy(directions(points + SHIFT), rng), points)
-    sigma = rotation_sigma(sets, np.eye(3), SHIFT, NOISE)
+    pairs = linearised(sets, np.eye(3), SHIFT, NOISE)
+    sigma = rotation_sigma(sets, pairs)
     for count, free in ((4, 2), (8, 10), (500, 994)):
-        bound = rotation_bound(sets, np.eye(3), SHIFT, NOISE, float(count))
+        bound = rotation_bound(sets, pairs, float(count))
         assert 2 * student.sf(bound / sigma, free) == pytest.approx(1e-3, rel=1e-6)
-    assert rotation_bound(sets, np.eye(3), SHIFT, NOISE, 3.0) == math.inf
+    assert rotation_bound(sets, pairs, 3.0) == math.inf
 
 
 def test_a_prior_bounds_what_the_points_leave_loose() -> None:
     rng = np.random.default_rng(1)
     points = np.column_stack([1e-4 * rng.standard_normal((5, 2)), rng.uniform(-1, 1, 5)])  # nearly on one line
     rays = noisy(directions(points + [0, 0, 6.0]), rng)
-    free = rotation_sigma(PointSets(rays, points), np.eye(3), np.array([0, 0, 6.0]), NOISE)
+    free = sigma_of(PointSets(rays, points), np.eye(3), np.array([0, 0, 6.0]))
     known = PointSets(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
     assert free > math.radians(60)
-    assert rotation_sigma(known, np.eye(3), np.array([0, 0, 6.0]), NOISE) < math.radians(2.001)
+    assert sigma_of(known, np.eye(3), np.array([0, 0, 6.0])) < math.radians(2.001)
     up = np.array([0.0, 1, 0])
     upright = PointSets(rays, points, prior=GravityPrior(up, up, 1.0))  # the turn about the line tilts the vertical
-    assert rotation_sigma(upright, np.eye(3), np.array([0, 0, 6.0]), NOISE) == pytest.approx(math.radians(1), rel=0.1)
+    assert sigma_of(upright, np.eye(3), np.array([0, 0, 6.0])) == pytest.approx(math.radians(1), rel=0.1)
 
 
 def test_points_that_are_not_seen_fix_nothing() -> None:
@@ -100,8 +105,8 @@ def test_points_that_are_not_seen_fix_nothing() -> None:
     points = rng.uniform(-1, 1, (8, 3))
     rays = directions(points + SHIFT)
     away = directions(points + SHIFT)  # normals away from the camera
-    assert rotation_sigma(PointSets(rays, points, away), np.eye(3), SHIFT, NOISE) == math.inf
-    assert rotation_sigma(PointSets(-rays, points), np.eye(3), SHIFT, NOISE) == math.inf
+    assert sigma_of(PointSets(rays, points, away), np.eye(3), SHIFT) == math.inf
+    assert sigma_of(PointSets(-rays, points), np.eye(3), SHIFT) == math.inf
 
 
 CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
@@ -130,7 +135,7 @@ def test_the_misfit_says_how_far_off_the_pose_is(wrong: str) -> None:
         camera = camera * (1.04, 1.04, 1)
     image = directions(camera + RESIDUALS)
     turn, shift, scale = fitted(image)
-    misfit = systematic_misfit(PointSets(image, POINTS), turn.as_matrix(), shift, scale, 40.0)
+    misfit = systematic_misfit(linearised(PointSets(image, POINTS), turn.as_matrix(), shift, scale), 40.0)
     if wrong == "nothing":
         assert misfit == (0.0, 0.0)
         return

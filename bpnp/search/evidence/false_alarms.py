@@ -35,18 +35,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import compiler
-from bpnp.search.evidence.image_statistics import ImageStatistics, label_groups, nearest
+from bpnp.search.evidence.image_statistics import ImageStatistics, label_groups
+from bpnp.search.kernels.near import sums_near
 from bpnp.search.point_sets import PointSets, faces
 
 Array = NDArray[np.float64]
-compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
 
 FIXING = 3  # pairs that fix a pose
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
-FARTHEST = 18.0  # squared distance over s^2 beyond which a pair adds nothing to g
+FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair adds nothing to g
 OWN, ROUGH = 2.0, 4.0  # factors of the scale of a pose's residuals within which s is its own, and beyond which rougher
 
 
@@ -135,11 +134,10 @@ def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *
     logs = np.zeros((len(image.chosen), len(scales), len(shares)))
     for rows, columns in label_groups(image.chosen, sets.labels2d, sets.labels3d, len(seen)):
         used, bearings = seen[columns][np.isfinite(seen[columns, 0])], sets.bearings[image.chosen[rows]]
-        near2 = nearest(used, bearings, math.sqrt(FARTHEST) * float(scales[-1])) ** 2
+        predicted = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2)
         density = np.full(len(rows), len(columns) / image.solid_angle) if even else _density(image, bearings, used)
-        part = np.empty((len(rows), *logs.shape[1:]))
-        _log_ratios(near2, density, scales, shares, part)
-        logs[rows] = part
+        ratio = predicted / (2 * math.pi * scales**2 * density[:, None])
+        logs[rows] = np.log1p(shares * (ratio - 1)[:, :, None])
     return logs
 
 
@@ -153,27 +151,10 @@ def _density(image: ImageStatistics, bearings: Array, directions: Array) -> Arra
     width2 = (OUTLINE * image.spread) ** 2
     # From the centre of the view float32 has the digits of a narrow one.
     one, other = ((points - image.centre).astype(np.float32) for points in (bearings, some))
-    squared = (one * one).sum(1)[:, None] + (other * other).sum(1) - 2 * (one @ other.T)
-    kernel = np.exp(squared * np.float32(-0.5 / width2)).sum(1, dtype=np.float64)
+    sharp = np.float32(0.5 / width2)
+    exponent = one @ (2 * sharp * other.T)
+    exponent -= sharp * (one * one).sum(1)[:, None]
+    exponent -= sharp * (other * other).sum(1)
+    kernel = np.exp(exponent, out=exponent).sum(1, dtype=np.float64)
     smooth = kernel / (2 * math.pi * width2) * (len(directions) / len(some))
     return np.maximum(smooth, mean)
-
-
-@compiled
-def _log_ratios(near2: Array, density: Array, scales: Array, shares: Array, result: Array) -> None:
-    """log x_i for every image point, scale and share, into result (k, S, W).
-
-    near2 (k, l): squared chords to the nearest projected points, ascending. density (k,): l_i, per steradian.
-    """
-    count, width = near2.shape
-    for i in range(count):
-        for a in range(len(scales)):
-            variance = scales[a] * scales[a]
-            predicted = 0.0
-            for j in range(width):
-                if not near2[i, j] < FARTHEST * variance:
-                    break
-                predicted += math.exp(-0.5 * near2[i, j] / variance)
-            ratio = predicted / (2 * math.pi * variance * density[i])
-            for b in range(len(shares)):
-                result[i, a, b] = math.log(1 - shares[b] + shares[b] * ratio)

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+
+from bpnp.search.kernels.near import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -14,7 +15,6 @@ COARSEST = 0.5  # largest scale, in spacings sqrt(A / m) of the image points: be
 FLOOR = 2e-4  # smallest scale in spreads of the bearings: some hundredths of a pixel of an ordinary camera
 TOGETHER = 2.0  # distance in scales below which image points are one observation
 CROWDED = 2.0  # standard deviations by which the points around one exceed those of an even spread before it is a clump
-MOST_NEIGHBOURS = 64  # that are looked up around one point
 MOST_POINTS = 2000  # image points that are looked at, evenly spread over the given ones
 
 
@@ -43,9 +43,10 @@ class ImageStatistics:
         steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
         self.scales = np.geomspace(smallest, largest, steps)
         self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
-        crowd = nearest(bearings, bearings[self.chosen], TOGETHER * largest)
-        self.together = (crowd[:, None] <= TOGETHER * self.scales[:, None]).sum(-1)
-        expected = 1 + (m - 1) * math.pi * (TOGETHER * self.scales) ** 2 / self.solid_angle
+        within = TOGETHER * self.scales
+        together = sums_near(bearings[self.chosen], bearings, self.axes, within, np.zeros(steps))
+        self.together = together.astype(np.int64)
+        expected = 1 + (m - 1) * math.pi * within**2 / self.solid_angle
         self.weights = _weights(self.together, expected)
 
 
@@ -64,16 +65,6 @@ def _weights(together: NDArray[np.int64], expected: Array) -> Array:
     steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
     steps[:, :, 1:] -= steps[:, :, :-1]
     return np.asarray(steps)
-
-
-def nearest(directions: Array, bearings: Array, radius: float) -> Array:
-    """Chords (k, l) from each bearing to its nearest directions, ascending; infinite beyond `radius`."""
-    if not len(directions):
-        return np.full((len(bearings), 1), np.inf)
-    count = min(len(directions), MOST_NEIGHBOURS)
-    # The bound excludes what lies at it.
-    chords = cKDTree(directions).query(bearings, count, distance_upper_bound=radius * (1 + 1e-9))[0]
-    return np.asarray(chords).reshape(len(bearings), -1)
 
 
 def label_groups(

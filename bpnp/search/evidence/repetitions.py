@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
+from bpnp.search.kernels.hashed import HashedPoints
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
 
@@ -57,11 +58,12 @@ def repeated_poses(
     own = points[matched]
     own = own[np.argsort(np.linalg.norm(own - np.median(own, 0), axis=-1), kind="stable")]
     own = own[np.unique(np.r_[:REFERENCES, np.linspace(REFERENCES, len(own) - 1, MOST).astype(int)])]
-    tree = cKDTree(points)
-    found = [(share, np.eye(3), shift) for share, shift in _shifts(tree, own, np.eye(3), tolerance)]
+    around = points[np.argsort(np.linalg.norm(points - own[0], axis=-1), kind="stable")[:AROUND]]
+    scene = HashedPoints(points, tolerance)
+    found = [(share, np.eye(3), shift) for share, shift in _shifts(scene, around, own, np.eye(3))]
     turns = [] if sets.knows_rotation else _turns(own, found[0][2] if found else None)
     for turn in turns:
-        found += [(share, turn, shift) for share, shift in _shifts(tree, own, turn, tolerance)]
+        found += [(share, turn, shift) for share, shift in _shifts(scene, around, own, turn)]
     found = sorted(found, key=lambda motion: -motion[0])
     if not found:
         return none
@@ -136,30 +138,25 @@ def _turns(points: Array, shift: Array | None) -> list[Array]:
     return turns
 
 
-def _shifts(tree: "cKDTree[None]", points: Array, turn: Array, tolerance: float) -> list[tuple[float, Array]]:
-    """Shifts (3,) that take the turned points (k, 3) onto points of the tree, and the share that comes to lie on one;
-    those with the largest share first."""
+def _shifts(scene: HashedPoints, around: Array, points: Array, turn: Array) -> list[tuple[float, Array]]:
+    """Shifts (3,) that take the turned points (k, 3) onto points of the scene, and the share that comes to lie on one;
+    those with the largest share first. around: scene points that the first ones are laid onto."""
     turned = points @ turn.T
-    _, around = tree.query(points[0], min(AROUND, tree.n))
-    shifts = (tree.data[around] - turned[:REFERENCES, None]).reshape(-1, 3)
+    shifts = (around - turned[:REFERENCES, None]).reshape(-1, 3)
     if np.array_equal(turn, np.eye(3)):
-        shifts = shifts[np.linalg.norm(shifts, axis=-1) > 2 * tolerance]
-    some = turned[np.linspace(0, len(turned) - 1, FIRST).astype(int)]
-    share = _lying_on(tree, some, shifts, tolerance)
-    shifts = shifts[np.argsort(-share, kind="stable")[: min(CONFIRMED, int((share >= SHARE).sum()))]]
-    if not len(shifts):
-        return []
-    shifts = _apart(shifts, tolerance)
-    share = _lying_on(tree, turned, shifts, tolerance)
-    return [(float(share[k]), shifts[k]) for k in np.argsort(-share, kind="stable") if share[k] >= SHARE]
+        shifts = shifts[np.linalg.norm(shifts, axis=-1) > 2 * scene.tolerance]
+    shifts, _ = _lying_on(scene, turned[np.linspace(0, len(turned) - 1, FIRST).astype(int)], shifts)
+    shifts, share = _lying_on(scene, turned, _apart(shifts[:CONFIRMED], scene.tolerance))
+    return list(zip(share.tolist(), shifts, strict=True))
 
 
-def _lying_on(tree: "cKDTree[None]", points: Array, shifts: Array, tolerance: float) -> Array:
-    """Share (s,) of the points (k, 3) that each shift (s, 3) takes to within the tolerance of one in the tree."""
-    if not len(shifts):
-        return np.empty(0)
-    distance, _ = tree.query(points + shifts[:, None], distance_upper_bound=tolerance)
-    return np.asarray(np.isfinite(distance).mean(-1))
+def _lying_on(scene: HashedPoints, points: Array, shifts: Array) -> tuple[Array, Array]:
+    """The shifts (s, 3) that take `SHARE` of the points (k, 3) or more to within the tolerance of one of the scene, and
+    these shares (s,); the largest first."""
+    least = math.ceil(SHARE * len(points))
+    counts = scene.count_on(points, shifts, least)
+    best = np.argsort(-counts, kind="stable")[: int((counts >= least).sum())]
+    return shifts[best], counts[best] / len(points)
 
 
 def _apart(shifts: Array, tolerance: float) -> Array:

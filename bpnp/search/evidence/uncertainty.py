@@ -14,7 +14,7 @@ from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
-NEIGHBOURS = 64  # of an image point that may be
+FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
 OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
 EXCEEDED = 1e-3  # probability that the rotation is farther off than its bound, to either side
 
@@ -32,29 +32,31 @@ STRAINS = np.array(
 FITTED = 6 + len(STRAINS)  # numbers
 
 
-def rotation_bound(sets: PointSets, rotation: Array, translation: Array, scale: float, count: float) -> float:
+def rotation_bound(sets: PointSets, pairs: "Pairs | None", count: float) -> float:
     """Angle, radians, that the error about the least certain axis exceeds once in a thousand.
 
-    scale: standard deviation of the residuals, radians, estimated from `count` matches. The bound is sigma times the
-    quantile of Student's t with the degrees of freedom that the estimate had: 2 count, less those that were fitted.
+    pairs: `linearised` with the standard deviation of the residuals, estimated from `count` matches. The bound is sigma
+    times the quantile of Student's t with the degrees of freedom that the estimate had: 2 count, less those that were
+    fitted.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
     >>> points = rng.uniform(-1, 1, (12, 3))
     >>> seen = points + [0, 0, 6]
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> bounds = [rotation_bound(sets, np.eye(3), np.array([0.0, 0, 6]), 1e-3, count) for count in (4.0, 12.0)]
+    >>> pairs = linearised(sets, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
+    >>> bounds = [rotation_bound(sets, pairs, count) for count in (4.0, 12.0)]
     >>> [round(math.degrees(bound), 1) for bound in bounds]
     [5.1, 0.6]
     """
     free = 2 * count - 2 * sets.pairs_that_fix
     if free <= 0:
         return math.inf
-    return rotation_sigma(sets, rotation, translation, scale) * float(stdtrit(free, 1 - EXCEEDED / 2))
+    return rotation_sigma(sets, pairs) * float(stdtrit(free, 1 - EXCEEDED / 2))
 
 
-def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: float) -> float:
-    """Standard deviation of the rotation about its least certain axis, radians, from noise of `scale` radians.
+def rotation_sigma(sets: PointSets, pairs: "Pairs | None") -> float:
+    """Standard deviation of the rotation about its least certain axis, radians, from noise of `pairs.scale`.
 
     Image point i has scene point j as its partner with the probability p_ij. With J_ij the derivative of the direction
     u_j by the turn and the shift, and the scores g_ij = J_ij^T (f_i - u_j) / s^2, g_i = sum_j p_ij g_ij, the observed
@@ -69,12 +71,12 @@ def rotation_sigma(sets: PointSets, rotation: Array, translation: Array, scale: 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     H. White, Maximum likelihood estimation of misspecified models, Econometrica 1982.
     """
-    pairs = linearised(sets, rotation, translation, scale)
     if pairs is None:
         return math.inf
     chosen, probability = sets.image.chosen, pairs.probability
     score = np.einsum("kab,ka->kb", pairs.jacobian, pairs.residual)
-    complete = np.einsum("k,kab,kac->bc", probability, pairs.jacobian, pairs.jacobian, optimize=True)
+    rows = (np.sqrt(probability)[:, None, None] * pairs.jacobian).reshape(-1, 6)
+    complete = rows.T @ rows
     expected = np.zeros((len(chosen), 6))
     np.add.at(expected, pairs.image, probability[:, None] * score)
     between = expected.T @ expected
@@ -97,6 +99,7 @@ class Pairs(NamedTuple):
     image: (k,) places among the chosen image points. probability: (k,) of the pair. seen: (k, 3) direction in which the
     pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from their median. residual: (k, 3) of
     the image point, jacobian: (k, 3, 6) of `seen` by turn and shift of the points about that median; in scales.
+    scale: standard deviation of the residuals, radians. distance: of the middle of the scene from the camera.
     """
 
     image: NDArray[np.int64]
@@ -105,6 +108,8 @@ class Pairs(NamedTuple):
     points: Array
     residual: Array
     jacobian: Array
+    scale: float
+    distance: float
 
 
 def linearised(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Pairs | None:
@@ -125,15 +130,19 @@ def linearised(sets: PointSets, rotation: Array, translation: Array, scale: floa
     p, u = turned[j] - np.median(turned, 0), seen[j]
     across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
     jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
-    return Pairs(i, probability, u, p, (sets.bearings[sets.image.chosen[i]] - u) / scale, jacobian)
+    residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
+    distance = max(float(np.linalg.norm(rotation @ sets.middle + translation)), 1e-300)
+    return Pairs(i, probability, u, p, residual, jacobian, scale, distance)
 
 
 def _partners(sets: PointSets, seen: Array, scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Pairs (k,) of a chosen image point and a seen scene point (n, 3) near it, and the probability of each."""
     bearings = sets.bearings[sets.image.chosen]
-    count = min(NEIGHBOURS, len(seen))
-    distance, nearest = cKDTree(seen).query(bearings, count, distance_upper_bound=FARTHEST * scale)
-    distance, nearest = distance.reshape(len(bearings), -1), nearest.reshape(len(bearings), -1)
+    tree, counts = cKDTree(seen), range(1, min(NEIGHBOURS, len(seen)) + 1)
+    for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
+        distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=FARTHEST * scale)
+        if not np.isfinite(distance[:, -1]).any():
+            break
     density = np.exp(-0.5 * (distance / scale) ** 2) * (1 - OUTLIERS) / (len(seen) * 2 * math.pi * scale**2)
     probability = density / (density.sum(1, keepdims=True) + OUTLIERS / sets.image.solid_angle)
     i, nth = np.nonzero(np.isfinite(distance))
@@ -158,8 +167,8 @@ class Misfit(NamedTuple):
     shift: float
 
 
-def systematic_misfit(sets: PointSets, rotation: Array, translation: Array, scale: float, count: float) -> Misfit:
-    """What is significant in the residuals of a pose with `count` matches at `scale` radians.
+def systematic_misfit(pairs: Pairs | None, count: float) -> Misfit:
+    """What is significant in the residuals of a pose, `linearised`, with `count` matches.
 
     Beside the pose, the log of the focal length, or five strains of the scene, are fitted to the residuals, weighed
     with the probabilities of the partners. Of their principal directions, the pose eliminated, those count whose F
@@ -170,26 +179,21 @@ def systematic_misfit(sets: PointSets, rotation: Array, translation: Array, scal
     >>> points = rng.uniform(-1, 1, (40, 3))
     >>> seen = points + [0, 0, 5] + 1e-3 * rng.standard_normal((40, 3))
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> systematic_misfit(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4, 40.0)
+    >>> systematic_misfit(linearised(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
     Misfit(turn=0.0, shift=0.0)
     """
-    if 2 * count <= FITTED:
-        return Misfit(0.0, 0.0)
-    pairs = linearised(sets, rotation, translation, scale)
-    if pairs is None or 2 * pairs.probability.sum() <= FITTED:
+    if pairs is None or 2 * min(count, pairs.probability.sum()) <= FITTED:
         return Misfit(0.0, 0.0)
     free = 2 * min(count, float(pairs.probability.sum())) - FITTED
-    zoomed = pairs.seen * (1, 1, 0) / scale
+    zoomed = pairs.seen * (1, 1, 0) / pairs.scale
     zoomed -= (zoomed * pairs.seen).sum(1, keepdims=True) * pairs.seen
-    strained = (pairs.jacobian[:, None, :, 3:] @ (pairs.points @ STRAINS).transpose(1, 0, 2)[..., None])[..., 0]
-    columns = np.concatenate(
-        [pairs.jacobian, zoomed[..., None], strained.transpose(0, 2, 1), pairs.residual[..., None]], -1
-    )
+    strained = pairs.jacobian[:, :, 3:] @ (pairs.points @ STRAINS).transpose(1, 2, 0)
+    columns = np.concatenate([pairs.jacobian, zoomed[..., None], strained, pairs.residual[..., None]], -1)
     weighed = (np.sqrt(pairs.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
     products = weighed.T @ weighed
     moved = np.stack([_moved(products, slice(6, 7), free), _moved(products, slice(7, 7 + len(STRAINS)), free)])
     turn, shift = (float(np.linalg.norm(part, axis=-1).max()) for part in (moved[:, :3], moved[:, 3:]))
-    return Misfit(turn, shift / max(float(np.linalg.norm(rotation @ sets.middle + translation)), 1e-300))
+    return Misfit(turn, shift / pairs.distance)
 
 
 def _moved(products: Array, fitted: slice, free: float) -> Array:
