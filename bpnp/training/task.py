@@ -7,8 +7,11 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.plugins.precision import Precision
+from lightning.pytorch.utilities.enums import GradClipAlgorithmType
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
+from torch.optim import Adam, Optimizer
 from torchmetrics import MetricCollection
 
 from bpnp.layers.implicit import BackwardStats
@@ -17,14 +20,7 @@ from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.weights import AnyModule, TrainedNet, chosen, described, fitting_state, read_checkpoint
 from bpnp.precision import exact_products
-from bpnp.training.losses import (
-    Losses,
-    MatchingLoss,
-    correspondence_losses,
-    matching_losses,
-    own_losses,
-    pose_losses,
-)
+from bpnp.training.losses import Losses, MatchingLoss, correspondence_losses, matching_losses, own_losses, pose_losses
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
@@ -98,14 +94,15 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        own_pose = self.loss is not None and getattr(self.loss, "needs_pose", True)
-        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection" or own_pose
+        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection"
+        needs_pose |= self.loss is not None and getattr(self.loss, "needs_pose", True)
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
         with exact_products(self.device):
             losses = self.losses(prediction, batch)
+            figures = self._figures(losses, prediction, batch)
         loss = losses.total.mean()
-        self._log_train(loss=loss, skipped_steps=self.skipped[0].float(), **self._figures(losses, prediction, batch))
+        self._log_train(loss=loss, skipped_steps=self.skipped[0].float(), **figures)
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
@@ -142,7 +139,7 @@ class BlindPnPTask(LightningModule):
         for each in counts:
             each.reset()
 
-    def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
+    def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
         norm = torch.nn.utils.get_total_norm([p.grad for p in self.parameters() if p.grad is not None])
         broken = ~norm.isfinite()
@@ -157,9 +154,19 @@ class BlindPnPTask(LightningModule):
                 f"{self.global_step}; try a lower model.learning_rate or trainer.gradient_clip_val"
             )
 
+    def configure_gradient_clipping(
+        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
+    ) -> None:
+        """With bfloat16 as without: Lightning refuses a fused optimiser there, as if the gradients were scaled."""
+        if self.trainer.precision == "bf16-mixed":
+            kind = GradClipAlgorithmType(gradient_clip_algorithm or "norm")
+            Precision.clip_gradients(self.trainer.precision_plugin, optimizer, gradient_clip_val or 0.0, kind)
+        else:
+            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
+
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        parameters = [p for p in self.parameters() if p.requires_grad]
-        return torch.optim.Adam(parameters, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        trained = (p for p in self.parameters() if p.requires_grad)
+        return Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
@@ -202,8 +209,7 @@ class BlindPnPTask(LightningModule):
     def _figures(self, losses: Losses, prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         """What a training step logs beside its loss."""
         figures: dict[str, Tensor] = {}
-        with exact_products(self.device):
-            known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
+        known = correspondence_losses(prediction, batch, angle=self.correspondence_angle)
         if known is not None:
             figures["correspondence_loss"] = known.detach().mean()
         if self.loss is not None or self.matching_loss != "correspondence":

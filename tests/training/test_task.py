@@ -90,6 +90,24 @@ def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) ->
         torch.testing.assert_close(value, short.solver.get_parameter(name), rtol=0, atol=0, msg=name)
 
 
+@pytest.mark.parametrize("precision", ["32-true", "bf16-mixed"])
+@pytest.mark.parametrize("kind", ["norm", "value"])
+def test_gradients_are_clipped_in_every_precision(precision: str, kind: str, tmp_path: Path) -> None:
+    class Largest(Callback):
+        norms, values = list[float](), list[float]()
+
+        def on_before_zero_grad(self, trainer: Trainer, task: BlindPnPTask, optimizer: torch.optim.Optimizer) -> None:
+            gradients = [p.grad for p in task.parameters() if p.grad is not None]
+            if gradients:
+                self.norms.append(float(torch.nn.utils.get_total_norm(gradients)))
+                self.values.append(max(float(gradient.abs().max()) for gradient in gradients))
+
+    seen, clip = Largest(), {"gradient_clip_val": 1e-3, "gradient_clip_algorithm": kind}
+    fit(tmp_path, BlindPnPTask(small_net()), limit_train_batches=3, precision=precision, callbacks=[seen], **clip)
+    assert len(seen.norms) == 2
+    assert max(seen.norms if kind == "norm" else seen.values) == pytest.approx(1e-3, rel=1e-3)
+
+
 @pytest.mark.parametrize("kind", ["BPnPNet", "Matcher"])
 def test_gradients_that_a_layer_could_not_solve_for_are_logged_as_a_share_of_the_epoch(
     kind: str, tmp_path: Path
