@@ -2,7 +2,7 @@
 
 import copy
 from functools import cache, partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -56,16 +56,17 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
 
 def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> list[SearchResult]:
     """The poses of a module's prediction, scored."""
-    axes, batch = _given(net, members)
+    views, batch = _given(net, members)
     with torch.no_grad():
         poses = net(batch).poses
     if not poses:
         raise ValueError(f"expected a pose from the `solver` {type(net).__name__}, got a prediction without one")
     order = sorted(poses, key=lambda name: ESTIMATES.index(name) if name in ESTIMATES else len(ESTIMATES))
-    rotation = _host(torch.stack([poses[name].rotation for name in order], 1)) @ axes[:, None]
+    rotation = _host(torch.stack([poses[name].rotation for name in order], 1))
     translation = _host(torch.stack([poses[name].translation for name in order], 1))
     return [
-        score_poses(problem.sets, r, t, deadline) for problem, r, t in zip(members, rotation, translation, strict=True)
+        score_poses(problem.sets, *view.before(r, t), deadline)
+        for problem, view, r, t in zip(members, views, rotation, translation, strict=True)
     ]
 
 
@@ -83,13 +84,13 @@ def proposed(problem: Problem, seed: int, weights: str) -> tuple[Array, Array]:
     from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
 
     net = _packaged(weights)
-    axes, batch = _given(net, [problem])
+    (view,), batch = _given(net, [problem])
     with torch.no_grad():
         assignment = net.match(batch).assignment
     assert assignment is not None
     poses = _host(drawn_poses(assignment, batch.points2d, batch.points3d, triples=PROPOSED, seed=seed)[0])
     poses = poses[np.isfinite(poses).all((-2, -1))]
-    return poses[:, :, :3] @ axes[0], poses[:, :, 3]
+    return view.before(poses[:, :, :3], poses[:, :, 3])
 
 
 @cache
@@ -99,30 +100,57 @@ def _packaged(weights: str) -> "Matcher":
     return Matcher.from_pretrained(weights)
 
 
-def axes_for(net: nn.Module, problem: Problem) -> Array:
-    """Axes (3, 3), one a row, in which the network expects the 3D points: those given, or of the view of the prior.
+class View(NamedTuple):
+    """Coordinates R p + t of points p around a problem's origin, in which a network expects them."""
 
+    rotation: Array
+    translation: Array
+
+    def before(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
+        """Poses (s, 3, 3), (s, 3) of points in these coordinates as poses of the points around the origin."""
+        return rotation @ self.rotation, rotation @ self.translation + translation
+
+
+def view_for(net: nn.Module, problem: Problem) -> View:
+    """The coordinates in which the network expects the 3D points: those given, or of the view of the prior.
+
+    A view of an unknown place looks at the points from where they look as large as those of the image.
     Raises ValueError for a network of the frame "view" without a `PosePrior`.
     """
     if getattr(net, "frame", "any") == "any":
-        return np.eye(3)
-    if isinstance(problem.prior, PosePrior):
-        return np.asarray(problem.prior.rotation, np.float64)
-    raise ValueError(
-        "expected the axes of a view near the photo's for a network that was trained in them, got no `prior`; try "
-        "prior=PosePrior(rotation, translation, ...) with the pose of the view, or SceneMap.localize"
-    )
+        return View(np.eye(3), np.zeros(3))
+    if not isinstance(problem.prior, PosePrior):
+        raise ValueError(
+            "expected a view near the photo's for a network that was trained in the coordinates of one, got no "
+            "`prior`; try prior=PosePrior(rotation, translation, ...) with the pose of the view, or SceneMap.localize"
+        )
+    rotation = np.asarray(problem.prior.rotation, np.float64)
+    if problem.prior.translation is not None:
+        return View(rotation, np.asarray(problem.prior.translation) + rotation @ problem.origin)
+    turned, image = problem.local3d @ rotation.T, _seen(problem)
+    centre, middle = np.median(turned, 0), np.median(image, 0)
+    across = np.median(np.linalg.norm((turned - centre)[:, :2], axis=1))
+    depth = across / max(float(np.median(np.linalg.norm(image - middle, axis=1))), 1e-6)
+    return View(rotation, depth * np.append(middle, 1.0) - centre)
 
 
-def _given(net: nn.Module, members: list[Problem]) -> tuple[Array, Batch]:
-    """The axes (b, 3, 3) that the network expects, and the problems in them; without points that no image shows."""
-    axes = np.stack([axes_for(net, problem) for problem in members])
-    seen = [problem.points2d[problem.usable] for problem in members]
+def _seen(problem: Problem) -> Array:
+    """The 2D points that an image can show (m, 2)."""
+    points2d = problem.points2d[problem.usable]
+    return points2d[np.isfinite(points2d).all(-1)]
+
+
+def _given(net: nn.Module, members: list[Problem]) -> tuple[list[View], Batch]:
+    """The coordinates that the network expects, and the problems in them; without points that no image shows."""
+    views = [view_for(net, problem) for problem in members]
     batch = Batch.from_arrays(
-        [points[np.isfinite(points).all(-1)].astype(np.float32) for points in seen],
-        [(problem.local3d @ rows.T).astype(np.float32) for problem, rows in zip(members, axes, strict=True)],
+        [_seen(problem).astype(np.float32) for problem in members],
+        [
+            (problem.local3d @ view.rotation.T + view.translation).astype(np.float32)
+            for problem, view in zip(members, views, strict=True)
+        ],
     )
-    return axes, batch.to(device_of(net))
+    return views, batch.to(device_of(net))
 
 
 def _host(values: Tensor) -> Array:

@@ -15,7 +15,7 @@ from bpnp.search.many import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
-from bpnp.solving.networks import axes_for, device_of, evaluation_copy, pose_prior, predicted, proposals_for
+from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, view_for
 from bpnp.solving.problem import Problem
 from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
@@ -56,7 +56,7 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
     for problem in rest.values():
         for net in (options.solver, problem.prior):
             if isinstance(net, nn.Module):
-                axes_for(net, problem)  # before anything is solved
+                view_for(net, problem)  # before anything is solved
     if options.solver is None and not any(isinstance(problem.prior, nn.Module) for problem in rest.values()):
         return solutions | dict(_shared(rest, options))
     for i, result, seconds in (_searched if options.solver is None else _predicted)(rest, options):

@@ -50,13 +50,28 @@ def scene(clutter: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     )
 
 
-def test_a_network_for_views_gets_the_points_in_the_axes_of_the_view_and_its_pose_is_turned_back() -> None:
+@pytest.mark.parametrize("far", [0.0, 1e4])
+def test_a_network_for_views_gets_the_points_in_its_coordinates_and_its_pose_is_taken_back(far: float) -> None:
     image, points, rotation, translation = scene()
-    net = Expecting("view", rotation @ VIEW.T, translation).eval()
-    solution = solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
-    np.testing.assert_allclose(net.given[0], points @ VIEW.T, atol=1e-5)
+    shift = np.array([0.3, -0.2, 6.0])  # of the view; far: of the scene from its origin
+    turned, points = points @ VIEW.T, points + far
+    net = Expecting("view", rotation @ VIEW.T, translation - rotation @ VIEW.T @ shift).eval()
+    prior = PosePrior(VIEW, shift - VIEW @ np.full(3, far), 20.0, 2.0)
+    solution = solve(image, points, solver=net, prior=prior)
+    np.testing.assert_allclose(net.given[0], turned + shift, atol=1e-4)
     np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
-    np.testing.assert_allclose(solution.translation, translation, atol=1e-5)
+    np.testing.assert_allclose(solution.translation, translation - rotation @ np.full(3, far), atol=1e-5 * (1 + far))
+
+
+def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image_does() -> None:
+    image, points, rotation, translation = scene()
+    net = Expecting("view", np.eye(3), np.zeros(3)).eval()
+    solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
+    given = net.given[0].numpy()
+    np.testing.assert_allclose(given - given[0], (points - points[0]) @ VIEW.T, atol=1e-4)
+    seen = given[:, :2] / given[:, 2:]
+    np.testing.assert_allclose(np.median(seen, 0), np.median(image, 0), atol=0.05)
+    assert np.linalg.norm(seen.std(0)) == pytest.approx(np.linalg.norm(image.std(0)), rel=0.25)
 
 
 def test_a_network_for_any_axes_gets_the_points_as_they_are() -> None:
@@ -71,7 +86,7 @@ def test_a_network_for_any_axes_gets_the_points_as_they_are() -> None:
 def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
     planted = plant(1, 30)
     net = Matcher(channels=16, depth=1, heads=2, neighbours=3, frame="view").eval()
-    with pytest.raises(ValueError, match=r"axes of a view .* try prior=PosePrior"):
+    with pytest.raises(ValueError, match=r"expected a view near .* try prior=PosePrior"):
         solve(planted.points2d[0], planted.points3d[0], **{place: net})
 
 

@@ -52,8 +52,8 @@ WEIGHTS = {name: kind.weight for name, kind in KINDS.items()}
 class MapOptions:
     """How pairs of synthetic maps are drawn; see `SfmSceneDataModule`.
 
-    frame: of the map, "upright" for the third axis upwards and any heading, "view" for the camera axes of the first of
-    the photos whose map points are taken. tilt_deg: standard deviation of the upright frame's turn about each of its
+    frame: of the map, "upright" for the third axis upwards and any heading, "view" for the coordinates of the first of
+    the cameras whose map points are taken. tilt_deg: standard deviation of the upright frame's turn about each of its
     horizontal axes, as where the vertical is known roughly.
     """
 
@@ -150,11 +150,16 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
         return None
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
-    turn = cameras[0].rotation if options.frame == "view" else tilt @ heading
+    scale = _log_uniform(options.scale_range, rng)
+    turn, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)  # of the map's axes
+    if options.frame == "view":
+        turn, origin = cameras[0].rotation, scale * cameras[0].translation
     pick = rng.permutation(len(true2d))[:kept]
     chosen2d = np.concatenate([true2d[pick], rng.permutation(others2d)[:extra2d]])
     chosen3d = np.concatenate([true3d[pick], rng.permutation(others3d)[:extra3d]])
-    points3d, rotation, translation = _in_frame(mapped.points[chosen3d], photo, turn, options.scale_range, rng)
+    points3d = scale * mapped.points[chosen3d] @ turn.T + origin
+    rotation = photo.rotation @ turn.T
+    translation = scale * photo.translation - rotation @ origin
     return Pair(
         name, keypoints[chosen2d].astype(np.float32), points3d.astype(np.float32), kept, rotation, translation, focal
     )  # fmt: skip
@@ -224,13 +229,3 @@ def _uniform(value: Drawn, rng: np.random.Generator) -> float:
 def _log_uniform(value: Drawn, rng: np.random.Generator) -> float:
     low, high = bounds(value)
     return float(low * (high / low) ** rng.random()) if 0 < low < high else _uniform(value, rng)
-
-
-def _in_frame(
-    points: Array, camera: Camera, turn: Array, scale_range: tuple[float, float], rng: np.random.Generator
-) -> tuple[Array, Array, Array]:
-    """Points and pose in a frame turned by `turn` (3, 3), of any scale and an origin nearby."""
-    scale = _log_uniform(scale_range, rng)
-    origin = 20 * scale * rng.standard_normal(3)
-    rotation = camera.rotation @ turn.T
-    return scale * points @ turn.T + origin, rotation, scale * camera.translation - rotation @ origin

@@ -61,7 +61,7 @@ class SfmSceneDataModule(PairDataModule):
         views: lowest and highest number of photos whose map points are taken.
         kinds: weight of each kind of scene; none for all kinds, in the shares of `maps.WEIGHTS`.
         frame: of the map: any, turned by a random rotation; upright, the third axis upwards and any heading; view, the
-            camera axes of the first of the photos whose map points are taken.
+            coordinates of the first of the cameras whose map points are taken.
         tilt_deg: by how much an upright frame is off, about each of its horizontal axes, standard deviation in degrees.
         scale_range: lowest and highest number of scene units in a metre, drawn for each scene, uniformly in its
             logarithm.
