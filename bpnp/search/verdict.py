@@ -2,9 +2,9 @@
 
 The currency is the number of false alarms (`bpnp.search.evidence.false_alarms`): how many poses would fit as well if
 the image had nothing to do with the scene. "confident": fewer than `Evidence.false_alarms`; every different pose has at
-least 1 / `Evidence.lead` times as many, and the same one taken roughly no fewer; no search elsewhere is missing; and
-the matches fix the rotation. "ambiguous": better than chance, but one of the conditions is not met. "failed": no pose,
-or none better than chance.
+least 1 / `Evidence.lead` times as many, and explains clearly fewer of the image points (`evidence.rivals`); the same
+one taken roughly has no fewer; no search elsewhere is missing; and the matches fix the rotation. "ambiguous": better
+than chance, but one of the conditions is not met. "failed": no pose, or none better than chance.
 """
 
 import math
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.rivals import contested_by
 from bpnp.search.evidence.uncertainty import linearised, rotation_bound, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
@@ -168,18 +169,20 @@ def judged(
     alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
     chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
     count = float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
-    certain, off, bent = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches), math.inf, False
+    certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches)
+    off, bent, rival = math.inf, False, -1
     if certain:
         pairs = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(sets, pairs, count))
         misfit = systematic_misfit(pairs, count)
         bent = math.degrees(misfit.turn) > rule.other_deg or misfit.shift > rule.other_shift
-    if certain and off <= rule.loose_deg and not bent:
+        rival = contested_by(candidates, sets, rule)
+    if certain and off <= rule.loose_deg and not bent and rival < 0:
         return SearchResult(candidates, "confident", f"{chance}, and no different pose comes near", batches)
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches)
+    degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[other if rival < 0 else rival]))
     if ahead < rule.lead:
-        degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[other]))
         reason = f"{chance}, but a pose {degrees:.0f} deg away fits about as well ({_number(ahead)} times the number)"
     elif alarms > rule.false_alarms:
         reason = f"{chance}: too many to be sure"
@@ -190,6 +193,8 @@ def judged(
             f"{chance}, but with another focal length or other proportions of the scene they fit significantly better, "
             f"{math.degrees(misfit.turn):.0f} deg and {100 * misfit.shift:.0f} % of the distance away"
         )
+    elif rival >= 0:
+        reason = f"{chance}, but a pose {degrees:.0f} deg away explains so many other points that both may be chance"
     elif certain:
         reason = f"{chance}, but so few and near matches leave its rotation loose: it may be {off:.1f} deg off"
     else:

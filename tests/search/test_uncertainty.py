@@ -153,3 +153,13 @@ def test_points_seen_by_another_camera_are_not_confident(focal: float) -> None:
     camera = TURN.apply(POINTS) + MOVED
     pixels = camera[:, :2] / camera[:, 2:] * 500 * focal + (320, 240) + 0.3 * RNG.standard_normal((40, 2))
     assert solve(pixels, POINTS, CAMERA).verdict != "confident"
+
+
+def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
+    """Seven points leave 7 numbers to test a focal length with, 3 to test it beside five strains: repeated images."""
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        points = rng.standard_normal((7, 3))
+        camera = Rotation.random(rng=rng).apply(points) + (0, 0, 6)
+        pixels = camera[:, :2] / camera[:, 2:] * 600 + (320, 240) + 0.5 * rng.standard_normal((7, 2))
+        assert solve(pixels, points, CAMERA).verdict != "confident"

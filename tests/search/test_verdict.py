@@ -3,9 +3,12 @@
 import math
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 from planted import directions
+from scipy.spatial.transform import Rotation
 
+from bpnp import solve
 from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
 from bpnp.search.verdict import SearchResult, judged
@@ -62,3 +65,61 @@ def test_a_different_pose_that_fits_as_well_leaves_a_doubt() -> None:
     assert alone.verdict == "confident"
     assert both.verdict == "ambiguous"
     assert "90 deg away" in both.reason
+
+
+@pytest.mark.parametrize(("others", "verdict"), [(16, "ambiguous"), (2, "confident")])
+def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, verdict: str) -> None:
+    """20 image points of one pose and as many others of a different one: only if the signs are 20 to 2, chance is
+    less than exp(-18^2 / 2 / 22) = 1 / 1580 to have made the difference; of independent points 4 are enough."""
+    rng = np.random.default_rng(2)
+    points = rng.uniform(-1, 1, (60, 3))
+    turn = Rotation.from_euler("y", 50, degrees=True).as_matrix()
+    rays = np.concatenate([points[:20] + SHIFT, points[20 : 20 + others] @ turn.T + SHIFT])
+    sets = PointSets(directions(directions(rays) + 1e-3 * rng.standard_normal(rays.shape)), points)
+    found = verdict_on(sets, np.stack([np.eye(3), turn]), np.stack([SHIFT, SHIFT]), 1e-3, 0.5)
+    alarms = found.candidates.log10_false_alarms
+    assert alarms[0] < min(alarms[1] - 3, -5)
+    assert found.verdict == verdict
+    assert ("50 deg away explains" in found.reason) == (verdict == "ambiguous")
+
+
+def test_what_a_repeated_structure_confuses_is_compared_by_its_false_alarms() -> None:
+    """Of two equal rooms in a row the camera sees one, and seven points that only its own wall has."""
+    rng = np.random.default_rng(4)
+    room, wall = rng.uniform(-1, 1, (30, 3)), rng.uniform(-1, 1, (7, 3))
+    aside = np.array([3.0, 0, 0])
+    points = np.concatenate([room, room + aside, wall])
+    rays = directions(np.concatenate([room, wall]) + SHIFT)
+    found = verdict_on(PointSets(rays, points), np.stack([np.eye(3)] * 2), np.stack([SHIFT, SHIFT - aside]), 1e-4, 0.5)
+    assert found.candidates.log10_false_alarms[1] < -10
+    assert found.verdict == "confident"
+
+
+def lines(rng: np.random.Generator, dimensions: int) -> Array:
+    """Five straight lines of 15 evenly spaced points."""
+    steps = np.linspace(0, 1, 15)
+    return np.concatenate([
+        rng.uniform(-1, 1, dimensions) + np.outer(steps, rng.uniform(-1.5, 1.5, dimensions)) for _ in range(5)
+    ])  # fmt: skip
+
+
+def test_lines_that_have_nothing_in_common_are_not_called_confident() -> None:
+    """A pose lays two or three of them onto others, and all points of these agree."""
+    for pair in (15, 32, 35):
+        rng = np.random.default_rng([1, pair])
+        image = lines(rng, 2)
+        found = solve(0.4 * image, lines(rng, 3))
+        assert found.verdict != "confident", pair
+
+
+def test_curves_of_which_either_side_has_other_points_are_not_called_confident() -> None:
+    """Two turns of a helix: along it points agree by chance, and a screw takes one such pose to the next."""
+    for pair in (7, 26):
+        rng = np.random.default_rng([1, pair])
+        angles = rng.uniform(0, 4 * np.pi, (2, 100))
+        seen, scene = (np.column_stack([np.cos(a), np.sin(a), 0.15 * a - 0.9]) for a in angles)
+        rotation = Rotation.random(rng=rng).as_matrix()
+        camera = seen @ rotation.T + (0, 0, 5)
+        found = solve(camera[:, :2] / camera[:, 2:] + 1e-3 * rng.standard_normal((100, 2)), scene)
+        right = Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < np.radians(3)
+        assert found.verdict != "confident" or right, pair

@@ -86,9 +86,10 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
             seen = directions_of(sets, rotations[k], translations[k])
             if int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
                 continue
-            evidence, ladder = _log_evidence(sets, seen), sets.image.scales
-            ratio = np.ones(len(ladder)) if scales is None else ladder / np.clip(scales[k], ladder[0], ladder[-1])
-            own, rough = (ratio >= 1 / OWN) & (ratio <= OWN), ratio >= ROUGH
+            evidence, ratio = _log_evidence(sets, seen), np.ones(len(sets.image.scales))
+            if scales is not None:
+                ratio = _ratio(sets.image, float(scales[k]))
+            own, rough = _is_own(ratio), ratio >= ROUGH
             result.own[k] -= np.logaddexp.reduce(evidence[own]) / math.log(10)
             result.rough[k] -= np.logaddexp.reduce(evidence[rough], initial=-math.inf) / math.log(10)
     return result
@@ -114,12 +115,33 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
     return seen
 
 
+def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
+    """log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the share and the s within a
+    factor of two of the scale of its residuals, radians, at which their sum is largest."""
+    terms = _terms(sets, directions_of(sets, rotation, translation))
+    terms = terms[:, _is_own(_ratio(sets.image, scale))].reshape(len(terms), -1)
+    return np.asarray(terms[:, terms.sum(0).argmax()])
+
+
+def _ratio(image: ImageStatistics, scale: float) -> Array:
+    """(S,) of the scales of an image to that of residuals."""
+    return np.asarray(image.scales / np.clip(scale, image.scales[0], image.scales[-1]))
+
+
+def _is_own(ratio: Array) -> NDArray[np.bool_]:
+    return (ratio >= 1 / OWN) & (ratio <= OWN)
+
+
+def _terms(sets: PointSets, seen: Array) -> Array:
+    """log x_i / c_i (k, S, W), clumps weighted, of points seen in directions (n, 3)."""
+    return np.asarray(sets.image.weights @ point_evidence(sets, seen, sets.image.scales, SHARES))
+
+
 def _log_evidence(sets: PointSets, seen: Array) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
     points seen in directions (n, 3)."""
-    logs = point_evidence(sets, seen, sets.image.scales, SHARES)
-    terms = sets.image.weights @ logs
-    fixing = np.partition(terms * sets.image.together[:, :, None], len(logs) - FIXING, 0)[-FIXING:]
+    terms = _terms(sets, seen)
+    fixing = np.partition(terms * sets.image.together[:, :, None], len(terms) - FIXING, 0)[-FIXING:]
     evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
     return np.asarray(np.logaddexp.reduce(evidence, 1)) - math.log(evidence.size)
 

@@ -29,7 +29,7 @@ STRAINS = np.array(
     ],
     np.float64,
 )
-FITTED = 6 + len(STRAINS)  # numbers
+POSE = 6  # numbers that are fitted with every pose
 
 
 def rotation_bound(sets: PointSets, pairs: "Pairs | None", count: float) -> float:
@@ -182,9 +182,9 @@ def systematic_misfit(pairs: Pairs | None, count: float) -> Misfit:
     >>> systematic_misfit(linearised(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
     Misfit(turn=0.0, shift=0.0)
     """
-    if pairs is None or 2 * min(count, pairs.probability.sum()) <= FITTED:
+    if pairs is None:
         return Misfit(0.0, 0.0)
-    free = 2 * min(count, float(pairs.probability.sum())) - FITTED
+    free = 2 * min(count, float(pairs.probability.sum())) - POSE
     zoomed = pairs.seen * (1, 1, 0) / pairs.scale
     zoomed -= (zoomed * pairs.seen).sum(1, keepdims=True) * pairs.seen
     strained = pairs.jacobian[:, :, 3:] @ (pairs.points @ STRAINS).transpose(1, 2, 0)
@@ -199,15 +199,17 @@ def systematic_misfit(pairs: Pairs | None, count: float) -> Misfit:
 def _moved(products: Array, fitted: slice, free: float) -> Array:
     """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it.
 
-    products: of the columns with each other; the first six are the pose's, the last one holds the residuals.
+    products: of the columns with each other; the first six are the pose's, the last one holds the residuals. free:
+    numbers that were measured, less those of the pose.
     """
     pose = np.linalg.pinv(products[:6, :6], hermitian=True)
     across = pose @ products[:6, fitted]
     values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :6] @ across)
     known = values > 1e-9 * float(np.diag(products)[fitted].max())
-    if not known.any():
+    if not 0 < known.sum() < free:
         return np.zeros(6)
     values, directions = values[known], directions[:, known]
+    free -= len(values)
     step = (products[fitted, -1] - across.T @ products[:6, -1]) @ directions / values
     gain = step**2 * values
     rest = products[-1, -1] - float(products[-1, :6] @ pose @ products[:6, -1]) - float(gain.sum())
