@@ -50,7 +50,7 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
             continue
         other = _partners(sets, *(x[k] for x in (*poses, scales)))
         reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
-        same = (first.index == other.index) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
+        same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         if (same & first.near & other.near).sum() < SAME * other.near.sum():
             return k
     return -1
@@ -60,7 +60,7 @@ class _Partners(NamedTuple):
     """Of k image points: the scene point (k,) that a pose sees nearest, where it is in the camera's frame (k, 3), and
     whether it is near enough to be the partner."""
 
-    index: NDArray[np.int64]
+    points: NDArray[np.int64]
     places: Array
     near: NDArray[np.bool_]
 
@@ -69,5 +69,5 @@ def _partners(sets: PointSets, rotation: Array, translation: Array, scale: float
     seen = directions_of(sets, rotation, translation)
     ahead = np.flatnonzero(np.isfinite(seen[:, 0]))
     chord, nearest = cKDTree(seen[ahead]).query(sets.bearings[sets.image.chosen], distance_upper_bound=NEAR * scale)
-    index = np.r_[ahead, -1][nearest]
-    return _Partners(index, sets.points3d[index] @ rotation.T + translation, np.isfinite(chord))
+    points = np.r_[ahead, -1][nearest]
+    return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
