@@ -91,27 +91,38 @@ def drawn_poses(
     *,
     triples: int,
     seed: int,
+    aligned: bool = False,
 ) -> Float[Tensor, "b s 3 4"]:
-    """All poses of so many triples of pairs drawn in proportion to P, a quarter of those drawn; NaN in empty slots.
+    """All poses of the widest quarter of so many triples of pairs drawn in proportion to P; NaN in empty slots.
 
-    The arguments are those of `pose_hypotheses`, unpadded; P has mass.
+    The arguments are those of `pose_hypotheses`, unpadded; P has mass. aligned: whether the axes of the scene are about
+    those of the camera. Of the wider half of the triples those are solved, an eighth of all, whose triangles are most
+    alike: the cosine between the sides of one and those of the other seen along the third axis.
     """
-    drawn = weighted_draws(assignment.flatten(1), 3 * DRAWN * triples, seed)
+    drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]
     chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), torch.ones_like(drawn, dtype=torch.bool))
     pairs, centre, scale = normalised(chosen)
-    poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in pairs[:2]))
+    poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in pairs[:2]), aligned=aligned)
     rotation, translation = in_scene(poses, centre, scale)
     return torch.cat([rotation, translation.unsqueeze(-1)], -1)
 
 
-def _poses_of_widest(image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"]) -> Float[Tensor, "b s 3 4"]:
-    """Poses of the quarter of the triples whose triangles have the largest products of areas."""
+def _poses_of_widest(
+    image: Float[Tensor, "b k 3 2"], scene: Float[Tensor, "b k 3 3"], *, aligned: bool = False
+) -> Float[Tensor, "b s 3 4"]:
+    """Poses of the quarter of the triples whose triangles have the largest products of areas, or as `drawn_poses`."""
     (x, y), (along, across) = ((points[:, :, 1:] - points[:, :, :1]).unbind(2) for points in (image, scene))
     area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)
-    widest = (area2d * area3d).topk(image.shape[1] // DRAWN).indices
-    return poses_of_triples(bearings(take(image, widest)), take(scene, widest))
+    wide = area2d * area3d
+    chosen = wide.topk(image.shape[1] // DRAWN).indices
+    if aligned:
+        seen = torch.cat([along, across], -1)[..., [0, 1, 3, 4]]
+        alike = torch.cosine_similarity(torch.cat([x, y], -1), seen, dim=-1)
+        alike = alike.masked_fill(wide < wide.median(-1, keepdim=True).values, -1)
+        chosen = alike.topk(image.shape[1] // (2 * DRAWN)).indices
+    return poses_of_triples(bearings(take(image, chosen)), take(scene, chosen))
 
 
 def _variance(points: Float[Tensor, "b m 2"], real: Bool[Tensor, "b m"]) -> Float[Tensor, " b"]:

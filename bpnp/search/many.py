@@ -14,7 +14,7 @@ from bpnp.search.annealing import run_batch
 from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates
 from bpnp.search.few.search import is_few, search_few
-from bpnp.search.nearby import beside, cooled, drawn_around, is_near, likeliest, nearby_batch
+from bpnp.search.nearby import admitted, beside, cooled, drawn_around, is_near, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
@@ -69,8 +69,7 @@ def search_poses(
     def entered() -> Scene:
         return Scene(sets, seed, settings, deadline)
 
-    # With a prior more points are enumerated, whose noise may exceed what the enumeration allows: it may miss a pose.
-    crowd = not is_few(replace(sets, prior=None))
+    crowd = is_crowd(sets)
     if is_few(sets) and not deadline.passed():
         few, exhausted = _enumerated(sets, entered, settings, deadline)
         tell(0)
@@ -97,8 +96,31 @@ def search_poses(
     result = _beside_best(pool, result)
     if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
         return result
-    pool.merge(_proposed(pool.scene, proposals))
+    pool.merge(_proposed(pool, proposals))
     return pool.result()
+
+
+def is_crowd(sets: PointSets) -> bool:
+    """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
+    return not is_few(replace(sets, prior=None))
+
+
+def search_proposed(
+    sets: PointSets, proposals: Proposals, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER,
+    settings: SearchSettings = DEFAULT,
+) -> SearchResult:  # fmt: skip
+    """The pose of many points that starts at proposed poses alone, such as those that a network finds likely, lead to.
+
+    What `search_poses` does with proposals, without its own starts; the arguments are the same ones.
+    """
+    if degenerate(sets.bearings) or degenerate(sets.points3d):
+        return no_pose("no pose fits: too few points, or all on one line")
+    settings = settings if clutter is None else settings.expecting(clutter)
+    pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
+    pool.batches = 1
+    if (safe := _from_looks(pool, (), proposals)) is not None:
+        return safe
+    return _beside_best(pool, pool.result())
 
 
 def _enumerated(
@@ -167,7 +189,7 @@ def _looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | 
         yield (found := anywhere(pool.scene, rule))
         yield from _around_each(pool, pool.different([found]))
     if proposals is not None:
-        yield (found := _proposed(pool.scene, proposals))
+        yield (found := _proposed(pool, proposals))
         yield from _around_each(pool, pool.different([found]))
 
 
@@ -195,8 +217,9 @@ def _beside_best(pool: Pool, result: SearchResult) -> SearchResult:
     return result
 
 
-def _proposed(scene: Scene, proposals: Proposals) -> Candidates:
-    return likeliest(scene, Candidates.unscored(*scene.enter(*proposals())), scene.settings.nearby)
+def _proposed(pool: Pool, proposals: Proposals) -> Candidates:
+    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals())), pool.sets.prior)
+    return likeliest(pool.scene, poses, pool.scene.settings.proposed)
 
 
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:

@@ -29,9 +29,10 @@ from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby, Stages
-from bpnp.search.starts import PosePrior
+from bpnp.search.starts import PosePrior, Prior
 
 MOST_VOLUMES = 100.0  # of a prior against the widest that has as many starts as it needs; a map view's has 9
+ADMITTED = 3.5  # standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
 
@@ -99,6 +100,21 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
     vectors[0], shifts[0] = 0, 0
     return turned_about_middle(scene, mean, np.asarray(prior.translation, np.float32), vectors, shifts, hits=1)
+
+
+def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates:
+    """The poses that a `PosePrior` of the user admits, within `ADMITTED` standard deviations; all without."""
+    if not isinstance(prior, PosePrior):
+        return poses
+    mean = scene.enter_prior(prior)
+    assert isinstance(mean, PosePrior)
+    middle, rotation = scene.bulk3d.mean(0), np.asarray(mean.rotation)
+    cosine = (np.einsum("sij,ij->s", poses.rotation, rotation) - 1) / 2
+    off = np.square(np.degrees(np.arccos(np.clip(cosine, -1, 1))) / mean.rotation_sigma_deg)
+    if mean.translation is not None:
+        shift = poses.rotation @ middle + poses.translation - (rotation @ middle + np.asarray(mean.translation))
+        off = off + np.square(shift / mean.translation_sigma).sum(-1)
+    return poses[off <= ADMITTED**2]
 
 
 def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:

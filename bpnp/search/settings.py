@@ -166,7 +166,7 @@ class SearchSettings:
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
     around: batches from a guess of the pose before those from anywhere. kept: candidates, from batch to batch.
-    refined_directly: starts of `refine_poses` that need no clusters.
+    refined_directly: starts of `refine_poses` that need no clusters. proposed: rule of the starts of `search_proposed`.
     anywhere, beside: rules of the looks after batches without a pose that exceeds chance, since clusters hide the right
         one among many outliers: around the likeliest `beside_poses`, no two turned by less than `beside_deg`, until
         `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
@@ -207,6 +207,7 @@ class SearchSettings:
     least_outliers: float = 0.02
     finished: int = 3
     around: int = 4
+    proposed: Nearby = Nearby(kept=(2**13, 2**10))
     refined_directly: int = 8
     end_scale: float = 2.0
     kept: int = 8
@@ -243,8 +244,7 @@ class SearchSettings:
 
     def kept_by(self, stage: ClusterStage, starts: int) -> int:
         """How many poses of a batch of so many starts a stage hands on."""
-        share = math.sqrt(starts / self.starts)
-        return min(stage.kept, max(self.least_kept, math.ceil(share * stage.kept)))
+        return min(stage.kept, max(self.least_kept, math.ceil(math.sqrt(starts / self.starts) * stage.kept)))
 
 
 DEFAULT = SearchSettings()

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
 MOST_PAIRS = 2**22  # of a 2D and a 3D point: seconds of a matcher, whose time and memory grow with them
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
-PROPOSED = 20_000  # triples of an assignment; one pair in fifty is right, one triple in 10^5, but some nearly are
+DRAWN = 80_000  # triples of an assignment; one pair in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
 
 
@@ -74,23 +74,29 @@ def proposals_for(problem: Problem, seed: int) -> Proposals | None:
     """Whom a search in doubt asks for poses: the packaged matcher for views around a known pose, and without a prior
     that for scenes in any axes, unless the points are too many for it."""
     if isinstance(problem.prior, PosePrior):
-        return partial(proposed, problem, seed, VIEW_MATCHER)
+        return partial(_of_packaged, VIEW_MATCHER, problem, seed)
     too_many = len(problem.bearings) * len(problem.points3d) > MOST_PAIRS
-    return None if too_many or problem.prior is not None else partial(proposed, problem, seed, SCENE_MATCHER)
+    return None if too_many or problem.prior is not None else partial(_of_packaged, SCENE_MATCHER, problem, seed)
 
 
-def proposed(problem: Problem, seed: int, weights: str) -> tuple[Array, Array]:
-    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of a packaged matcher."""
+def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
+    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of a matcher."""
     from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
 
-    net = _packaged(weights)
     (view,), batch = _given(net, [problem])
     with torch.no_grad():
         assignment = net.match(batch).assignment
     assert assignment is not None
-    poses = _host(drawn_poses(assignment, batch.points2d, batch.points3d, triples=PROPOSED, seed=seed)[0])
+    drawn = drawn_poses(
+        assignment, batch.points2d, batch.points3d, triples=DRAWN, seed=seed, aligned=net.frame == "view"
+    )
+    poses = _host(drawn[0])
     poses = poses[np.isfinite(poses).all((-2, -1))]
     return view.before(poses[:, :, :3], poses[:, :, 3])
+
+
+def _of_packaged(weights: str, problem: Problem, seed: int) -> tuple[Array, Array]:
+    return proposed(_packaged(weights), problem, seed)
 
 
 @cache

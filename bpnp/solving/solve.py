@@ -50,7 +50,8 @@ def solve(
     solver: "search", which needs no training; "auto", the same, which asks a packaged matcher for poses to start from
         when it is in doubt: "matcher-maps" with a `PosePrior`, such as the pose of a map's view of the same place, and
         "matcher-sfm" without a prior, of up to four million pairs of points; a module from `Batch` to `Prediction`; or
-        a checkpoint of a BPnPNet or a Matcher.
+        a checkpoint of a BPnPNet or a Matcher. Of a Matcher and many points not its own poses count, but those that a
+        search finds from poses of triples of pairs drawn from its assignment, and from nowhere else.
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
         image (radians for bearings). By default three times the residuals' own scale.

@@ -11,11 +11,11 @@ import torch
 from torch import nn
 
 from bpnp.compilation import Deadline
-from bpnp.search.many import search_poses
+from bpnp.search.many import is_crowd, search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose
-from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, view_for
+from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for
 from bpnp.solving.problem import Problem
 from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
@@ -106,10 +106,27 @@ def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tup
 
 
 def _predicted(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
-    """Number, result and seconds of each problem, of a module, which on a GPU gets pairs of similar size together."""
+    """Number, result and seconds of each problem, of a module.
+
+    A matcher's assignment of many points proposes poses, from which the search goes on. Of other modules the poses
+    count; on a GPU they get pairs of similar size together.
+    """
+    from bpnp.models.matcher import Matcher  # the networks, where one is given
+
     assert options.solver is not None
     net = evaluation_copy(options.solver, options.device)
-    for group in [[i] for i in problems] if device_of(net).type == "cpu" else _groups(problems):
+    matcher = net if isinstance(net, Matcher) else None
+    others = {i: problem for i, problem in problems.items() if matcher is None or not is_crowd(problem.sets)}
+    for i, problem in problems.items():
+        if matcher is None or i in others:
+            continue
+        start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
+        result = search_proposed(
+            problem.sets, partial(proposed, matcher, problem, options.seed), clutter=options.clutter, seed=options.seed,
+            deadline=deadline, settings=options.settings,
+        )  # fmt: skip
+        yield i, result, time.perf_counter() - start
+    for group in [[i] for i in others] if device_of(net).type == "cpu" else _groups(others):
         start = time.perf_counter()
         found = predicted(net, [problems[i] for i in group], Deadline.after(options.time_limit))
         seconds = (time.perf_counter() - start) / len(group)

@@ -1,6 +1,7 @@
 """What a network is given, in which axes, and what a search makes of the poses that it proposes."""
 
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import torch
 from planted import plant
 from scipy.spatial.transform import Rotation
 
-from bpnp import GravityPrior, PosePrior, solve
+from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
 from bpnp.search.settings import DEFAULT
 from bpnp.solving import networks
@@ -90,25 +91,47 @@ def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> 
         solve(planted.points2d[0], planted.points3d[0], **{place: net})
 
 
-class Knowing(torch.nn.Module):
-    """A matcher that knows the true pairs, the first 40 of both sides."""
+class Knowing(Matcher):
+    """Gives `share` of its assignment to the true pairs, the first 40 of both sides, the rest evenly to all pairs."""
 
-    frame = "view"
+    def __init__(self, share: float = 1.0, frame: Literal["any", "view"] = "view") -> None:
+        super().__init__(channels=16, depth=1, heads=2, neighbours=3, frame=frame)
+        self.share = share
 
     def match(self, batch: Batch) -> Prediction:
-        assignment = torch.zeros(1, batch.points2d.shape[1], batch.points3d.shape[1])
-        assignment[0, range(40), range(40)] = 1 / 80
+        m, n = batch.points2d.shape[1], batch.points3d.shape[1]
+        assignment = torch.full((1, m, n), (1 - self.share) / (2 * m * n))
+        assignment[0, range(40), range(40)] += self.share / 80
         return Prediction(assignment)
 
+    def forward(self, batch: Batch) -> Prediction:
+        raise AssertionError("expected the assignment to be asked for, not poses")
 
-def test_poses_of_triples_of_a_right_assignment_are_right(monkeypatch: pytest.MonkeyPatch) -> None:
+
+def test_poses_of_triples_of_a_right_assignment_are_right() -> None:
     image, points, rotation, translation = scene(clutter=10)
-    monkeypatch.setattr(networks, "_packaged", lambda weights: Knowing())
     problem = problem_from(image, points, None, prior=PosePrior(VIEW, None, 20.0))
-    turns, shifts = proposed(problem, 0, "matcher-maps")
+    turns, shifts = proposed(Knowing(), problem, 0)
     off = np.abs(turns - rotation).max((1, 2)) + np.abs(shifts - translation).max(1)
     # Each triple that has different pairs has the true pose among up to four.
     assert (off < 1e-3).mean() > 0.25
+
+
+@pytest.mark.parametrize("frame", ["any", "view"])
+def test_a_matcher_solves_with_one_right_pair_in_twenty_alone_and_beside_a_pair_without_a_pose(
+    frame: Literal["any", "view"],
+) -> None:
+    image, points, rotation, translation = scene(clutter=60)
+    prior = PosePrior(VIEW, np.array([0.0, 0.0, 7.0]), 10.0, 0.5)
+    noise = np.random.default_rng(3).normal(size=points.shape)
+    one = {"solver": Knowing(0.05, frame).eval(), "prior": prior}
+    found, other = solve_many([image, image], [points, noise], **one)
+    np.testing.assert_allclose(found.rotation, rotation, atol=1e-4)
+    np.testing.assert_allclose(found.translation, translation, atol=1e-3)
+    assert (found.verdict, other.verdict != "confident") == ("confident", True)
+    alone = solve(image, points, **one)
+    np.testing.assert_array_equal(alone.rotation, found.rotation)
+    np.testing.assert_array_equal(alone.matches, found.matches)
 
 
 @pytest.mark.parametrize(
@@ -124,11 +147,11 @@ def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
 ) -> None:
     asked: list[tuple[int, str]] = []
 
-    def propose(problem, seed: int, weights: str) -> tuple[np.ndarray, np.ndarray]:
+    def propose(weights: str, problem, seed: int) -> tuple[np.ndarray, np.ndarray]:
         asked.append((seed, weights))
         return np.empty((0, 3, 3)), np.empty((0, 3))
 
-    monkeypatch.setattr(networks, "proposed", propose)
+    monkeypatch.setattr(networks, "_of_packaged", propose)
     if name is not None:
         image, points, *_ = scene()
         assert solve(image, points, prior=prior).verdict == "confident"
