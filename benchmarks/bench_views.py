@@ -6,7 +6,7 @@ with the names of the k views, or none); view-prior (the first view's pose as `P
 packaged matcher where the search is in doubt); rough-prior (4 degrees and 4 % of the distance off, 2 s);
 the packaged networks by themselves, in the axes that they expect; learned (around the pose of one); oracle (RANSAC on
 the true pairs). Photos are left out of their map.
-The searches are told the cones from which the points are seen, but localize and learned; --known: these, and the
+All are told the cones from which the points are seen, but localize and learned; --known: these, and the
 lengths of the tracks, or nothing. --elsewhere: each photo against the views of another scene; none may be confident.
 """
 
@@ -16,7 +16,7 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -40,9 +40,7 @@ KNOWN: set[str] = {"cones", "tracks"}  # what `solve`, `view-prior` and `rough-p
 Answer = tuple[Array, Array, str]  # rotation, translation, verdict
 
 
-def by_search(
-    pair: ViewPair, prior: PosePrior | None, seed: int, time_limit: float | None, *, asks: bool = False
-) -> Answer:
+def by_search(pair: ViewPair, prior: PosePrior | None, seed: int, time_limit: float | None, **options: Any) -> Answer:
     known: dict[str, Any] = {}
     if "cones" in KNOWN:
         known |= {"normals3d": pair.cones.axes, "cosines3d": pair.cones.cosines}
@@ -50,7 +48,7 @@ def by_search(
         known |= {"scores3d": pair.scores3d}
     camera = camera_from(np.diag([pair.focal, pair.focal, 1.0]))
     problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, prior=prior, **known)
-    found = solutions_of({0: problem}, Options(asks=asks, seed=seed, time_limit=time_limit))[0]
+    found = solutions_of({0: problem}, Options(seed=seed, time_limit=time_limit, **options))[0]
     return found.rotation, found.translation, found.verdict
 
 
@@ -95,11 +93,14 @@ def learned(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
 
 
 def by_network(weights: str, pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
-    del time_limit
-    net = TrainedNet.from_pretrained(weights)
+    net = trained(weights)
     prior = prior_of_view(pair) if getattr(net, "frame", "any") == "view" else None
-    found = solve(pair.points2d, pair.points3d, solver=net, prior=prior, seed=seed)
-    return found.rotation, found.translation, found.verdict
+    return by_search(pair, prior, seed, time_limit, solver=net)
+
+
+@cache
+def trained(weights: str) -> TrainedNet:
+    return TrainedNet.from_pretrained(weights).eval()
 
 
 def oracle(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
