@@ -21,6 +21,7 @@ from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction, SolveStats
 
+WIDEST = 4.0  # distance from the middle of a view's image over the focal length, 76 degrees
 FREQUENCIES = 8  # of the encoding of a coordinate, from a half turn per robust radius, times sqrt(2) each
 
 
@@ -39,9 +40,10 @@ class Matcher(TrainedNet):
         neighbours: nearest neighbours that a point is described by; 0 for none.
         principal: describe 3D points along the principal axes of their set, so that the scene's rotation does not
             matter; false for the axes that they are given in.
-        frame: axes in which the 3D points are expected: "any", or "view", those of a camera nearby, such as that of a
-            map's view of the same place, which looks along the third axis. `bpnp.solve` and `SceneMap.localize` turn
-            the points so, and the pose back.
+        frame: coordinates in which the 3D points are expected: "any", or "view", those of a camera nearby, such as that
+            of a map's view of the same place, which looks along the third axis. There a 3D point is also described by
+            its place in that camera's image, as a 2D point is. `bpnp.solve` and `SceneMap.localize` move the points
+            so, and the pose back.
         mu: entropy weight of the transport at the start of a training; it is learned.
         tolerance: L1 error of the marginals at which the transport stops.
         ransac, pnp, refinement: as in `BPnPNet`.
@@ -80,6 +82,10 @@ class Matcher(TrainedNet):
         self.enter3d = Pointwise(3 * (1 + 2 * FREQUENCIES), channels)
         self.around2d = Neighbourhood(2, channels, neighbours=neighbours) if neighbours else None
         self.around3d = Neighbourhood(3, channels, neighbours=neighbours) if neighbours else None
+        self.seen = None
+        if frame == "view":  # nothing of it at first, so that weights for any axes can go on so
+            self.seen = Pointwise(channels, channels, bias=False)
+            nn.init.zeros_(self.seen.weight)
         self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(channels)
         self.project = Pointwise(channels, channels)
@@ -128,20 +134,35 @@ class Matcher(TrainedNet):
         points3d = batch.points3d
         if self.principal:
             points3d = full_precision(torch.matmul)(points3d, principal_axes(points3d, batch.mask3d))
-        centre2d, radius2d = robust_frame(batch.points2d, batch.mask2d)
         centre3d, radius3d = robust_frame(points3d, batch.mask3d)
-        local2d, local3d = (batch.points2d - centre2d) / radius2d, (points3d - centre3d) / radius3d
-        where = torch.cat([centre2d, radius2d.log()], -1).expand(-1, local2d.shape[1], -1)
-        x2d, x3d = self.enter2d(torch.cat([encode(local2d), where], -1)), self.enter3d(encode(local3d))
-        if self.around2d is not None and self.around3d is not None:
-            x2d, x3d = x2d + self.around2d(local2d, batch.mask2d), x3d + self.around3d(local3d, batch.mask3d)
+        local3d = (points3d - centre3d) / radius3d
+        x2d, x3d = self._image_features(batch.points2d, batch.mask2d), self.enter3d(encode(local3d))
+        if self.around3d is not None:
+            x3d = x3d + self.around3d(local3d, batch.mask3d)
+        if self.seen is not None:
+            x3d = x3d + self.seen(self._image_features(image_of(batch.points3d), batch.mask3d))
         for block in self.blocks:
             x2d, x3d = block(x2d, x3d, batch.mask2d, batch.mask3d)
         return self.norm(x2d), self.norm(x3d)
 
+    def _image_features(self, points2d: Float[Tensor, "b k 2"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        """Of points of an image: by their place in a robust frame, the frame itself, and what lies around them."""
+        centre, radius = robust_frame(points2d, mask)
+        local = (points2d - centre) / radius
+        frame = torch.cat([centre, radius.log()], -1).expand(-1, local.shape[1], -1)
+        x = self.enter2d(torch.cat([encode(local), frame], -1))
+        return x if self.around2d is None else x + self.around2d(local, mask)
+
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
         return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
+
+
+def image_of(points3d: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:
+    """x/z, y/z of points in the coordinates of a camera; of those beside or behind it, at the edge of a wide image."""
+    plane = points3d[..., :2]
+    depth = torch.maximum(points3d[..., 2:], plane.norm(dim=-1, keepdim=True) / WIDEST)
+    return plane / depth.clamp_min(torch.finfo(depth.dtype).tiny)
 
 
 def encode(points: Float[Tensor, "b k d"]) -> Float[Tensor, "b k e"]:

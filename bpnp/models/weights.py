@@ -134,12 +134,18 @@ def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
 
-def fitting_state(content: Mapping[str, Any], solver: nn.Module) -> dict[str, Tensor]:
-    """`solver_state` of a checkpoint. Raises ValueError, naming what differs, unless class and shapes fit `solver`."""
-    saved, own, state = content.get("solver", {}), described(solver), solver_state(content)
+def fitting_state(content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False) -> dict[str, Tensor]:
+    """`solver_state` of a checkpoint. Raises ValueError, naming what differs, unless class and shapes fit `solver`.
+
+    grown: `solver` may have more weights than the checkpoint, if they are zero: parts that add nothing before training.
+    """
+    saved, own = content.get("solver", {}), described(solver)
+    state, weights = solver_state(content), solver.state_dict()
     if saved.get("class") != own["class"]:
         raise ValueError(f"expected a checkpoint of {own['class']}, got one of {saved.get('class', 'another program')}")
-    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, solver.state_dict()))
+    if grown:
+        state |= {key: value for key, value in weights.items() if key not in state and not value.any()}
+    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, weights))
     if shapes != own_shapes:
         told = ", ".join(differences(saved, own)) or "other weights"
         raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")

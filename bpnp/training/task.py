@@ -71,7 +71,7 @@ class BlindPnPTask(LightningModule):
         super().__init__()
         self.solver = chosen(solver, BPnPNet)
         if weights is not None:
-            self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver))
+            self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver, grown=True))
         self.loss = None if loss is None else chosen(loss, nn.Module)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         if matching_loss != "correspondence" and correspondence_angle is not None:

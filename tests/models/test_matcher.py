@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import Literal
 
 import pytest
 import torch
@@ -8,13 +9,17 @@ from torch import Tensor
 
 from bpnp import Batch
 from bpnp.models import Matcher
+from bpnp.models.matcher import image_of
 from bpnp.models.nets.attention import Attention, Neighbourhood
 from bpnp.training.losses import matching_likelihood_loss
 
 
-def small(seed: int = 0) -> Matcher:
+def small(seed: int = 0, frame: Literal["any", "view"] = "any") -> Matcher:
     torch.manual_seed(seed)
-    return Matcher(channels=16, depth=2, heads=2, neighbours=3).double().eval()
+    net = Matcher(channels=16, depth=2, heads=2, neighbours=3, frame=frame).double().eval()
+    if net.seen is not None:
+        torch.nn.init.normal_(net.seen.weight)  # zero until it is trained
+    return net
 
 
 def cluttered(*sizes: int) -> Batch:
@@ -36,8 +41,9 @@ def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
     torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
 
 
-def test_a_pair_depends_neither_on_its_batch_nor_on_padding() -> None:
-    net, batch = small(), cluttered(9, 21, 14)
+@pytest.mark.parametrize("frame", ["any", "view"])
+def test_a_pair_depends_neither_on_its_batch_nor_on_padding(frame: Literal["any", "view"]) -> None:
+    net, batch = small(frame=frame), cluttered(9, 21, 14)
     joint = net.match(batch).assignment
     for i, size in enumerate((9, 21, 14)):
         alone = net.match(cluttered(size)).assignment[0]
@@ -58,6 +64,20 @@ def test_unit_and_origin_of_the_scene_do_not_matter() -> None:
     net, batch = small(), cluttered(12)
     moved = replace(batch, points3d=40 * batch.points3d + torch.tensor([100.0, -7.0, 3.0]))
     torch.testing.assert_close(plan(net, moved), plan(net, batch), rtol=1e-6, atol=1e-12)
+
+
+def test_in_a_view_the_unit_of_the_scene_does_not_matter_but_where_the_view_is() -> None:
+    net, batch = small(frame="view"), cluttered(12)
+    seen = replace(batch, points3d=batch.points3d + torch.tensor([0.0, 0.0, 5.0]))
+    beside = replace(batch, points3d=batch.points3d + torch.tensor([2.0, 0.0, 5.0]))
+    torch.testing.assert_close(plan(net, replace(seen, points3d=40 * seen.points3d)), plan(net, seen))
+    assert (plan(net, beside) - plan(net, seen)).abs().max() > 1e-6
+
+
+def test_the_image_of_a_view_holds_what_is_before_it_and_the_rest_at_its_edge() -> None:
+    points = torch.tensor([[1.0, -2.0, 4.0], [30.0, 40.0, 1.0], [3.0, 4.0, -5.0], [0.0, 0.0, -1.0]])
+    expected = torch.tensor([[0.25, -0.5], [2.4, 3.2], [2.4, 3.2], [0.0, 0.0]])
+    torch.testing.assert_close(image_of(points[None])[0], expected)
 
 
 def test_each_side_hears_of_the_other() -> None:

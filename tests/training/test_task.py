@@ -212,6 +212,10 @@ def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Pa
     trainer.save_checkpoint(tmp_path / "small.ckpt", weights_only=True)
     other = BlindPnPTask(Matcher(channels=16, depth=1), weights=str(tmp_path / "small.ckpt"))
     assert all(torch.equal(a, b) for a, b in zip(small.parameters(), other.parameters(), strict=True))
+    # In a view's frame the net has a part more, which adds nothing at first.
+    view = BlindPnPTask(Matcher(channels=16, depth=1, frame="view"), weights=str(tmp_path / "small.ckpt"))
+    batch = Batch.from_arrays(torch.rand(1, 9, 2), torch.rand(1, 12, 3) + 1)
+    torch.testing.assert_close(view.solver.match(batch).assignment, small.solver.match(batch).assignment)
     with pytest.raises(ValueError, match="expected a checkpoint of the configured Matcher, got channels=16, depth=1"):
         BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
     with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
