@@ -49,6 +49,8 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
 def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:
     """How many pairs `one_to_one` has: a maximum matching, faster than one of least cost."""
     pairs, _ = _near(image, projected, radius, allowed)
+    if all(np.bincount(side).max(initial=0) <= 1 for side in pairs.T):
+        return len(pairs)  # no point has a choice
     graph = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 

@@ -146,6 +146,8 @@ def _shifts(scene: HashedPoints, around: Array, points: Array, turn: Array) -> l
     if np.array_equal(turn, np.eye(3)):
         shifts = shifts[np.linalg.norm(shifts, axis=-1) > 2 * scene.tolerance]
     shifts, _ = _lying_on(scene, turned[np.linspace(0, len(turned) - 1, FIRST).astype(int)], shifts)
+    if not len(shifts):
+        return []
     shifts, share = _lying_on(scene, turned, _apart(shifts[:CONFIRMED], scene.tolerance))
     return list(zip(share.tolist(), shifts, strict=True))
 

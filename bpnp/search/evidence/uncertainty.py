@@ -15,6 +15,7 @@ from bpnp.search.starts import GravityPrior, PosePrior
 Array = NDArray[np.float64]
 FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
 FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
+DENSE = 4096  # pairs of points up to which all distances are computed
 OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
 EXCEEDED = 1e-3  # probability that the rotation is farther off than its bound, to either side
 
@@ -97,8 +98,8 @@ class Pairs(NamedTuple):
     """k pairs of image and scene points that may be partners, and how they depend on a pose.
 
     image: (k,) places among the chosen image points. probability: (k,) of the pair. seen: (k, 3) direction in which the
-    pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from their median. residual: (k, 3) of
-    the image point, jacobian: (k, 3, 6) of `seen` by turn and shift of the points about that median; in scales.
+    pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from the middle of the scene.
+    residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle; in scales.
     scale: standard deviation of the residuals, radians. distance: of the middle of the scene from the camera.
     """
 
@@ -127,26 +128,33 @@ def linearised(sets: PointSets, rotation: Array, translation: Array, scale: floa
     i, j, probability = _partners(sets, seen, scale)
     if not len(i):
         return None
-    p, u = turned[j] - np.median(turned, 0), seen[j]
+    middle = rotation @ sets.middle
+    p, u = turned[j] - middle, seen[j]
     across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
     jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
     residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
-    distance = max(float(np.linalg.norm(rotation @ sets.middle + translation)), 1e-300)
+    distance = max(float(np.linalg.norm(middle + translation)), 1e-300)
     return Pairs(i, probability, u, p, residual, jacobian, scale, distance)
 
 
 def _partners(sets: PointSets, seen: Array, scale: float) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
     """Pairs (k,) of a chosen image point and a seen scene point (n, 3) near it, and the probability of each."""
-    bearings = sets.bearings[sets.image.chosen]
-    tree, counts = cKDTree(seen), range(1, min(NEIGHBOURS, len(seen)) + 1)
-    for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
-        distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=FARTHEST * scale)
-        if not np.isfinite(distance[:, -1]).any():
-            break
-    density = np.exp(-0.5 * (distance / scale) ** 2) * (1 - OUTLIERS) / (len(seen) * 2 * math.pi * scale**2)
-    probability = density / (density.sum(1, keepdims=True) + OUTLIERS / sets.image.solid_angle)
-    i, nth = np.nonzero(np.isfinite(distance))
-    return i, nearest[i, nth].astype(np.int64), probability[i, nth]
+    bearings, reach = sets.bearings[sets.image.chosen], FARTHEST * scale
+    if len(bearings) * len(seen) <= DENSE:
+        squared = ((bearings[:, None] - seen) ** 2).sum(-1)
+        i, j = np.nonzero(squared < reach**2)
+        squared = squared[i, j]
+    else:
+        tree, counts = cKDTree(seen), range(1, min(NEIGHBOURS, len(seen)) + 1)
+        for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
+            distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
+            if not np.isfinite(distance[:, -1]).any():
+                break
+        i, nth = np.nonzero(np.isfinite(distance))
+        j, squared = nearest[i, nth], distance[i, nth] ** 2
+    density = np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (len(seen) * 2 * math.pi * scale**2)
+    every = np.bincount(i, density, len(bearings)) + OUTLIERS / sets.image.solid_angle
+    return i, j.astype(np.int64), density / every[i]
 
 
 def _known(sets: PointSets) -> Array:
@@ -191,18 +199,19 @@ def systematic_misfit(pairs: Pairs | None, count: float) -> Misfit:
     columns = np.concatenate([pairs.jacobian, zoomed[..., None], strained, pairs.residual[..., None]], -1)
     weighed = (np.sqrt(pairs.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
     products = weighed.T @ weighed
-    moved = np.stack([_moved(products, slice(6, 7), free), _moved(products, slice(7, 7 + len(STRAINS)), free)])
+    pose = np.linalg.pinv(products[:6, :6], hermitian=True)
+    parts = slice(6, 7), slice(7, 7 + len(STRAINS))
+    moved = np.stack([_moved(products, pose, part, free) for part in parts])
     turn, shift = (float(np.linalg.norm(part, axis=-1).max()) for part in (moved[:, :3], moved[:, 3:]))
     return Misfit(turn, shift / pairs.distance)
 
 
-def _moved(products: Array, fitted: slice, free: float) -> Array:
+def _moved(products: Array, pose: Array, fitted: slice, free: float) -> Array:
     """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it.
 
-    products: of the columns with each other; the first six are the pose's, the last one holds the residuals. free:
-    numbers that were measured, less those of the pose.
+    products: of the columns with each other; the first six are the pose's, the last one holds the residuals. pose:
+    (6, 6), the inverse of those of the pose. free: numbers that were measured, less those of the pose.
     """
-    pose = np.linalg.pinv(products[:6, :6], hermitian=True)
     across = pose @ products[:6, fitted]
     values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :6] @ across)
     known = values > 1e-9 * float(np.diag(products)[fitted].max())

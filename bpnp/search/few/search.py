@@ -77,6 +77,6 @@ def _log_likelihood(sets: PointSets, rotation: Array, translation: Array, scale:
     camera = sets.points3d @ rotation.transpose(0, 2, 1) + translation[:, None]
     seen = camera / np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
     variance = (scale**2)[:, None, None]
-    exponent = (np.einsum("mk,cnk->cmn", sets.bearings, seen) - 1) / variance
+    exponent = (sets.bearings @ seen.transpose(0, 2, 1) - 1) / variance
     density = (np.exp(exponent) / (2 * math.pi * variance)).sum(-1) * (1 - outliers) / len(sets.points3d)
     return np.asarray(np.log(density + outliers / sets.image.solid_angle).mean(-1))
