@@ -1,7 +1,8 @@
 """Annealing of a few poses on all points: at a small scale a point sees only its neighbours, found in a grid.
 
-Bearings lie on the unit sphere, so a grid of cubes serves every field of view. An iteration costs O(m + n) times the
-neighbours within three scales, not O(m n). Arrays and offsets are those of `bpnp.search.kernels.dense`.
+Bearings are sorted by the cells of a grid across the view; in one of more than 180 degrees a cell holds directions of
+both hemispheres. An iteration costs O(m + n) times the neighbours within three scales, not O(m n). Arrays and offsets
+are those of `bpnp.search.kernels.dense`.
 """
 
 import math
@@ -18,13 +19,13 @@ REACH = 3.0  # scales; the kernel is below 0.012 beyond
 CAPACITY = 96  # neighbours kept of a point
 SWEEPS = 2
 LEAST_SEEN = 0.25  # of all weights: if fewer points face the camera, they count as so many
-CELLS = 64  # along the longest side of the grid
+CELLS = 64  # along the longer side of the grid
 
 
 class Grid(NamedTuple):
     """Bearings, sorted by cell: the fields of a `WeightedBearings`, and where the cells begin.
 
-    Cell (i, j, k) holds f[:, start[c]:start[c + 1]], c = (i * shape[1] + j) * shape[2] + k.
+    Cell (i, j), by x and y, holds f[:, start[c]:start[c + 1]], c = i * shape[1] + j.
     """
 
     f: NDArray[np.float32]
@@ -39,12 +40,12 @@ class Grid(NamedTuple):
 
 def build_grid(bearings: WeightedBearings, smallest: float) -> Grid:
     """A grid over bearings with cells of `smallest` or, where that would be too many, of 1/64 of the extent."""
-    offsets = bearings.f.T
+    offsets = bearings.f[:2].T
     low, extent = offsets.min(0), np.ptp(offsets, axis=0)
     cell = max(smallest, float(extent.max()) / CELLS)
     shape = np.floor(extent / cell).astype(np.int64) + 1
     place = np.floor((offsets - low) / cell).astype(np.int64)
-    key = (place[:, 0] * shape[1] + place[:, 1]) * shape[2] + place[:, 2]
+    key = place @ [shape[1], 1]
     order = np.argsort(key, kind="stable")
     start = np.searchsorted(key[order], np.arange(shape.prod() + 1))
     return Grid(
@@ -76,20 +77,17 @@ def neighbours(grid: Any, label: Any, x: Any, y: Any, z: Any, radius: Any, index
     count, bound = 0, radius * radius
     i0, i1 = cells_within(x - low[0], radius, cell, shape[0])
     j0, j1 = cells_within(y - low[1], radius, cell, shape[1])
-    k0, k1 = cells_within(z - low[2], radius, cell, shape[2])
-    if k1 < k0:
+    if j1 < j0:
         return 0
     for i in range(i0, i1 + 1):
-        for j in range(j0, j1 + 1):
-            row = (i * shape[1] + j) * shape[2]
-            for e in range(start[row + k0], start[row + k1 + 1]):
-                dx, dy, dz = f[0, e] - x, f[1, e] - y, f[2, e] - z
-                distance = dx * dx + dy * dy + dz * dz
-                partners = label < 0 or labels[e] < 0 or labels[e] == label
-                if distance < bound and partners and count < len(index):
-                    index[count] = e
-                    squared[count] = distance
-                    count += 1
+        for e in range(start[i * shape[1] + j0], start[i * shape[1] + j1 + 1]):
+            dx, dy, dz = f[0, e] - x, f[1, e] - y, f[2, e] - z
+            distance = dx * dx + dy * dy + dz * dz
+            partners = label < 0 or labels[e] < 0 or labels[e] == label
+            if distance < bound and partners and count < len(index):
+                index[count] = e
+                squared[count] = distance
+                count += 1
     return count
 
 

@@ -87,9 +87,10 @@ def lloyd(
     A centre that has lost all its points stays where it was, with the weight 0.
     """
     mass = np.ones(len(points)) if weights is None else weights
+    extended = np.column_stack([points, np.ones(len(points), points.dtype)])
     for i in range(iterations + 1):
         # |x - c|^2 without |x|^2: one product of matrices
-        nearest = ((centres * centres).sum(1) - 2 * (points @ centres.T)).argmin(1)
+        nearest = (extended @ np.column_stack([-2 * centres, (centres * centres).sum(1)]).T).argmin(1)
         members = np.bincount(nearest, mass, len(centres)).astype(np.float64)
         if i == iterations:
             break
