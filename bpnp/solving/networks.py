@@ -80,7 +80,10 @@ def proposals_for(problem: Problem, seed: int) -> Proposals | None:
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
-    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn from the assignment of a matcher."""
+    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn in proportion to the root of a matcher's assignment.
+
+    Drawn in proportion to the assignment itself they are too alike where it is wrong.
+    """
     from bpnp.robust.proposals import drawn_poses  # the networks, where one is asked
 
     (view,), batch = _given(net, [problem])
@@ -88,7 +91,7 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
         assignment = net.match(batch).assignment
     assert assignment is not None
     drawn = drawn_poses(
-        assignment, batch.points2d, batch.points3d, triples=DRAWN, seed=seed, aligned=net.frame == "view"
+        assignment.sqrt(), batch.points2d, batch.points3d, triples=DRAWN, seed=seed, aligned=net.frame == "view"
     )
     poses = _host(drawn[0])
     poses = poses[np.isfinite(poses).all((-2, -1))]
