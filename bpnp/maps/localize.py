@@ -51,8 +51,8 @@ def localize(
         whole map after the other, those first that together see most of it.
     scores: (m,) strength of the keypoints; the strongest are used first.
     prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
-    solver: as for `bpnp.solve`; a network that expects the axes of a view gets the points in those of the view that is
-        tried, or of the prior.
+    solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the view
+        that is tried, or of the prior.
     time_limit: seconds for all views together, after which no search begins; None for no limit.
 
     Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the pose
