@@ -85,33 +85,56 @@ def _flush(part: Any, total: Any) -> None:
 
 
 @compiled
+def _invert(values: Any, result: Any) -> None:
+    """1 / values into `result`, both (n,), which stays zero where a value is not positive."""
+    for j in range(len(values)):
+        if values[j] > 0:
+            result[j] = 1 / values[j]
+
+
+@compiled
 def _solve(
     start: int, stop: int, limit: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
     tolerance: Any, x: Any, mean: Any, solved: Any,
 ) -> None:  # fmt: skip
     """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
-    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations."""
+    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations. In loops, for
+    numpy's expressions of several arrays take seconds to compile."""
     for s in range(start, stop):
-        inverse = np.where(degree[s] > 0, 1 / degree[s], 0).astype(rhs.dtype)
-        unit = np.where(cols[s] > 0, 1 / cols[s], 0).astype(rhs.dtype)
-        before = np.where(rows[s] > 0, alpha[s] / rows[s], 0).astype(rhs.dtype)
-        r, p = rhs[s].copy(), inverse * rhs[s]
-        y, part, total = np.empty_like(rows[s]), np.empty_like(r), np.empty(len(r))
-        rz, target = (r * p).sum(), (unit * r * r).sum() * tolerance[s] ** 2
+        inverse, unit, before = np.zeros_like(rhs[s]), np.zeros_like(rhs[s]), np.zeros_like(rows[s])
+        _invert(degree[s], inverse)
+        _invert(cols[s], unit)
+        _invert(rows[s], before)
+        for i in range(len(before)):
+            before[i] *= alpha[s, i]
+        r, p, sp, weighed = rhs[s].copy(), np.empty_like(unit), np.empty_like(unit), np.empty_like(unit)
+        y, part, total = np.empty_like(before), np.empty_like(r), np.empty(len(r))
+        rz = target = 0.0
+        for j in range(len(r)):
+            p[j] = inverse[j] * r[j]
+            rz += r[j] * p[j]
+            target += unit[j] * r[j] * r[j] * tolerance[s] ** 2
         solved[s] = not rz > 0
         for _ in range(limit):
             if solved[s]:
                 break
-            _products(kernel[s], beta[s] * p, before, alpha[s], y, part, total)
-            sp = (cols[s] * p - beta[s] * total).astype(rhs.dtype)
-            curvature = (p * sp).sum()
+            for j in range(len(p)):
+                weighed[j] = beta[s, j] * p[j]
+            _products(kernel[s], weighed, before, alpha[s], y, part, total)
+            curvature = 0.0
+            for j in range(len(p)):
+                sp[j] = cols[s, j] * p[j] - beta[s, j] * total[j]
+                curvature += p[j] * sp[j]
             if not curvature > 0:
                 break
-            step = rz / curvature
-            x[s] += step * p
-            mean[s] += step * y
-            r -= step * sp
-            solved[s] = (unit * r * r).sum() <= target
-            z = inverse * r
-            previous, rz = rz, (r * z).sum()
-            p = z + (rz / previous) * p
+            step, previous, rz, residual = rz / curvature, rz, 0.0, 0.0
+            for i in range(len(y)):
+                mean[s, i] += step * y[i]
+            for j in range(len(p)):
+                x[s, j] += step * p[j]
+                r[j] -= step * sp[j]
+                residual += unit[j] * r[j] * r[j]
+                rz += inverse[j] * r[j] * r[j]
+            solved[s] = residual <= target
+            for j in range(len(p)):
+                p[j] = inverse[j] * r[j] + rz / previous * p[j]
