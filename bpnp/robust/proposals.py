@@ -116,12 +116,13 @@ def _poses_of_widest(
     area2d = (x[..., 0] * y[..., 1] - x[..., 1] * y[..., 0]).abs()
     area3d = torch.linalg.cross(along, across).norm(dim=-1)
     wide = area2d * area3d
-    chosen = wide.topk(image.shape[1] // DRAWN).indices
     if aligned:
         seen = torch.cat([along, across], -1)[..., [0, 1, 3, 4]]
         alike = torch.cosine_similarity(torch.cat([x, y], -1), seen, dim=-1)
         alike = alike.masked_fill(wide < wide.median(-1, keepdim=True).values, -1)
         chosen = alike.topk(image.shape[1] // (2 * DRAWN)).indices
+    else:
+        chosen = wide.topk(image.shape[1] // DRAWN).indices
     return poses_of_triples(bearings(take(image, chosen)), take(scene, chosen))
 
 

@@ -115,17 +115,19 @@ def _predicted(problems: Mapping[int, Problem], options: Options) -> Iterator[tu
 
     assert options.solver is not None
     net = evaluation_copy(options.solver, options.device)
-    matcher = net if isinstance(net, Matcher) else None
-    others = {i: problem for i, problem in problems.items() if matcher is None or not is_crowd(problem.sets)}
-    for i, problem in problems.items():
-        if matcher is None or i in others:
-            continue
-        start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
-        result = search_proposed(
-            problem.sets, partial(proposed, matcher, problem, options.seed), clutter=options.clutter, seed=options.seed,
-            deadline=deadline, settings=options.settings,
-        )  # fmt: skip
-        yield i, result, time.perf_counter() - start
+    others = dict(problems)
+    if isinstance(net, Matcher):
+        for i, problem in problems.items():
+            sets = problem.sets
+            if not is_crowd(sets):
+                continue
+            del others[i]
+            start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
+            result = search_proposed(
+                sets, partial(proposed, net, problem, options.seed), clutter=options.clutter, seed=options.seed,
+                deadline=deadline, settings=options.settings,
+            )  # fmt: skip
+            yield i, result, time.perf_counter() - start
     for group in [[i] for i in others] if device_of(net).type == "cpu" else _groups(others):
         start = time.perf_counter()
         found = predicted(net, [problems[i] for i in group], Deadline.after(options.time_limit))

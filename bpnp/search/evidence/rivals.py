@@ -38,10 +38,11 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
     """
     poses = candidates.rotation, candidates.translation
     others = np.flatnonzero(~sets.same_pose(*poses, FAR * rule.other_deg, FAR * rule.other_shift))
-    if not len(others) or len(sets.image.chosen) < 2 * math.log(10) * rule.lead:
+    least = 2 * math.log(10) * rule.lead
+    if not len(others) or len(sets.image.chosen) < least:
         return -1
     scales = np.maximum(candidates.scale, sets.image.scales[0])
-    least, best = 2 * math.log(10) * rule.lead, own_evidence(sets, *(x[0] for x in (*poses, scales)))
+    best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
     first = _partners(sets, *(x[0] for x in (*poses, scales)))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
