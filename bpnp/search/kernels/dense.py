@@ -22,7 +22,7 @@ from bpnp.search.kernels.weighted import visible_weights
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
 POWER = 256  # of the kernel: eight squarings
-LEAST = 0.85  # of the base: a kernel of 1e-18, whose square is not denormal; loops over such numbers are 2.5 times slower
+LEAST = 0.85  # of the base: a kernel of 1e-18, whose square is no denormal number, which are 2.5 times as slow
 
 
 @part
