@@ -20,6 +20,14 @@ from bpnp.geometry import is_finite
 _T = TypeVar("_T")
 
 
+def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
+    """Whether every point is known to be real, so that masks need not be applied.
+
+    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
+    """
+    return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
+
+
 class Tensors:
     """A dataclass of tensors, of dicts of them, and of such dataclasses."""
 

@@ -4,7 +4,7 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
@@ -13,6 +13,7 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets.features import ImageFeatures, SceneFeatures
+from bpnp.models.nets.pointwise import products
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
@@ -103,10 +104,9 @@ class _PairwiseDistance(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
         distance = a.new_empty(*a.shape[:2], b.shape[1])
-        for part, x, y in cached_parts(distance, a, b):
-            squared = torch.baddbmm(x.new_full((1, 1, 1), 2.0), x, y.mT, alpha=-2, out=part)
-            near = squared <= SQUARED_FLOOR
-            squared.sqrt_().masked_fill_(near, 0)
+        for part, x, y in cached_parts(distance, a, b, cache=0):
+            squared = nn.functional.threshold(products(x, -2 * y, 2.0), SQUARED_FLOOR, 0.0, inplace=True)
+            torch.sqrt(squared, out=part)
         ctx.save_for_backward(a, b, distance)
         return distance
 
@@ -115,8 +115,8 @@ class _PairwiseDistance(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, distance = ctx.saved_tensors
         parts = []
-        for d, g, x, y in cached_parts(distance, gradient, a, b):
-            weight = (g / d).masked_fill_(d == 0, 0).neg_()
-            parts.append((weight @ y, weight.mT @ x))
+        for d, g, x, y in cached_parts(distance, gradient, a, b, cache=0):
+            weight = torch.ops.aten.threshold_backward(g / d, d, 0)  # zero where the distance is
+            parts.append((products(weight, -y.mT), products(weight.mT, -x.mT)))
         to_a, to_b = map(torch.cat, zip(*parts, strict=True))
         return to_a, to_b

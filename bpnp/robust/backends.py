@@ -16,6 +16,7 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.robust.consensus import consensus
 from bpnp.robust.scoring import Pairs, residuals
 
+FEWEST = 100  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
@@ -39,7 +40,7 @@ def _each(
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
     """LO-RANSAC with progressive sampling."""
     options = {
-        "max_reproj_error": threshold, "max_iterations": max_iterations, "min_iterations": min(1000, max_iterations),
+        "max_reproj_error": threshold, "max_iterations": max_iterations, "min_iterations": min(FEWEST, max_iterations),
         "progressive_sampling": True, "seed": seed,
     }  # fmt: skip
     camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}

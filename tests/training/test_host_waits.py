@@ -49,7 +49,7 @@ READS = {
     "layers/transport.py:solve_plan": 2,  # which samples need float64
     "layers/transport.py:sweep": 1,
     "models/nets/normalisation.py:_of_real_points": 1,  # on the CPU only
-    "models/nets/pointwise.py:unpadded": 1,  # on the CPU only
+    "types.py:unpadded": 1,  # on the CPU only
 }
 ATEN = torch.ops.aten
 WAITING = {ATEN._local_scalar_dense, ATEN.nonzero, ATEN.masked_select, ATEN.equal}

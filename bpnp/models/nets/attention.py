@@ -5,8 +5,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from bpnp.models.nets.pointwise import Pointwise, unpadded
+from bpnp.models.nets.pointwise import Pointwise
 from bpnp.precision import HALF
+from bpnp.types import unpadded
 
 MOST_PRODUCTS = 1 << 22  # of a head, 2048 points a side: beyond, memory for the gradient matters more than time
 

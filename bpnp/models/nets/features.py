@@ -7,7 +7,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.models.nets.normalisation import MaskedBatchNorm, centred
-from bpnp.models.nets.pointwise import Pointwise, pointwise_norm, unpadded
+from bpnp.models.nets.pointwise import Pointwise, pointwise_norm
+from bpnp.types import unpadded
 
 
 class ResidualBlock(nn.Module):

@@ -11,14 +11,6 @@ from torch.nn.grad import conv2d_weight
 CONTEXT_EPS = 1e-3  # as in the released code
 
 
-def unpadded(mask: Bool[Tensor, "b k"]) -> bool:
-    """Whether every point is known to be real, so that masks need not be applied.
-
-    False for a mask on a GPU, whose values the host would have to wait for, and in a graph that is to serve any mask.
-    """
-    return mask.is_cpu and not torch.compiler.is_compiling() and bool(mask.all())
-
-
 def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Tensor | None) -> Float[Tensor, "b k d"]:
     """x W^T + b.
 
@@ -31,10 +23,18 @@ def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Ten
     return out.squeeze(2).mT.reshape(*x.shape[:2], len(weight))
 
 
+def products(x: Float[Tensor, "b m c"], y: Float[Tensor, "b n c"], offset: float = 0.0) -> Float[Tensor, "b m n"]:
+    """x_i . y_j + offset in each sample; of a single one by the kernels of `pointwise`."""
+    if len(x) == 1:
+        return pointwise(x, y[0], y.new_full(y.shape[1:2], offset))
+    return torch.baddbmm(y.new_full((1, 1, 1), offset), x, y.mT)
+
+
 def _images(x: Float[Tensor, "b k c"]) -> Float[Tensor, "i c 1 p"]:
     """The points as images of one row. With one thread torch gives oneDNN no batch of fewer than 16 images."""
     b, k, c = x.shape
-    return x.reshape(16 if b < 16 and b * k % 16 == 0 else b, -1, c).mT.unsqueeze(2)
+    count = b if b >= 16 else next((count for count in range(16, 64) if b * k % count == 0), b)
+    return x.reshape(count, -1, c).mT.unsqueeze(2)
 
 
 class Pointwise(nn.Linear):
