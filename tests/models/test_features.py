@@ -1,6 +1,6 @@
 """Nets of padded point sets against plain ones in torch, and frames of sets against planted axes."""
 
-from collections.abc import Callable
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -41,7 +41,7 @@ def randomise(module: nn.Module) -> nn.Module:
     """Batch norms as after some training: no statistic or factor at its neutral start."""
     for norm in module.modules():
         if isinstance(norm, nn.BatchNorm1d):
-            nn.init.uniform_(norm.weight, 0.5, 2)
+            nn.init.normal_(norm.weight)
             nn.init.normal_(norm.bias)
             nn.init.normal_(norm.running_mean)
             nn.init.uniform_(norm.running_var, 0.5, 2)
@@ -147,23 +147,32 @@ def test_batch_norm_has_torchs_gradients() -> None:
     torch.testing.assert_close(a.grad[mask], b.grad)
 
 
-def test_the_input_transform_is_pointnets() -> None:
-    net = randomise(InputTransform()).eval()
+@pytest.mark.parametrize("training", [True, False])
+def test_the_input_transform_is_pointnets(training: bool) -> None:
+    net = randomise(InputTransform()).double().train(training)
+    plain = deepcopy(net)
     single, padded, mask = sets(3)
-    moved = net(padded, mask)
+    weights = torch.randn(*mask.shape, 3, dtype=torch.float64)
 
-    def norm(i: int) -> Callable[[Tensor], Tensor]:
-        n = net.norms[i]
-        return lambda z: F.batch_norm(z, n.running_mean, n.running_var, n.weight, n.bias)
+    def norm(k: int, z: Tensor) -> Tensor:
+        return F.relu(nn.BatchNorm1d.forward(plain.norms[k], z))
 
-    for i, x in enumerate(single):
-        z = x
-        for k in range(3):
-            z = F.relu(norm(k)(F.linear(z, net.linears[k].weight, net.linears[k].bias)))
-        z = z.max(0, keepdim=True).values
-        for k in (3, 4):
-            z = F.relu(norm(k)(net.linears[k](z)))
-        torch.testing.assert_close(moved[i, : len(x)], x @ (torch.eye(3) + net.out(z).view(3, 3)))
+    z = torch.cat(single).double()
+    for k in range(3):
+        z = norm(k, F.linear(z, plain.linears[k].weight, plain.linears[k].bias))
+    z = torch.stack([part.max(0).values for part in z.split(SIZES)])
+    for k in (3, 4):
+        z = norm(k, plain.linears[k](z))
+    transforms = torch.eye(3) + plain.out(z).view(-1, 3, 3)
+    expected = torch.cat([x.double() @ transform for x, transform in zip(single, transforms, strict=True)])
+    moved = net(padded.double(), mask)[mask]
+    torch.testing.assert_close(moved, expected)
+    for result in (moved, expected):
+        (result * weights[mask]).sum().backward()
+    for ours, theirs in zip(net.parameters(), plain.parameters(), strict=True):
+        torch.testing.assert_close(ours.grad, theirs.grad)
+    for ours, theirs in zip(net.buffers(), plain.buffers(), strict=True):
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_normalised_scenes_forget_their_unit_and_origin() -> None:

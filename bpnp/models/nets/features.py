@@ -1,12 +1,10 @@
 """Point features (paper section 3.3, after Yi et al. 2018) and PointNet's input transform; padding changes nothing."""
 
-import math
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.models.nets.normalisation import MaskedBatchNorm, centred
+from bpnp.models.nets.normalisation import MaskedBatchNorm, centred, highest_normed
 from bpnp.models.nets.pointwise import Pointwise, pointwise_norm
 from bpnp.types import unpadded
 
@@ -136,10 +134,7 @@ class InputTransform(nn.Module):
         z, seen = points, None if unpadded(mask) else mask
         for linear, norm in zip(self.linears[:2], self.norms[:2], strict=True):
             z = torch.relu(norm(linear(z), seen))
-        z = self.norms[2](self.linears[2](z), seen)
-        z = z if seen is None else z.masked_fill(~seen.unsqueeze(-1), -math.inf)
-        # The pooling is a maximum whose gradient is written in one pass, to the first of equal values.
-        z = torch.relu(nn.functional.adaptive_max_pool2d(z.mT.unsqueeze(2), 1).flatten(1))
+        z = torch.relu(highest_normed(z, self.linears[2], self.norms[2], seen))  # type: ignore[arg-type]
         for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
             z = torch.relu(norm(linear(z)))
         transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))

@@ -1,11 +1,14 @@
 """Statistics of padded sets, which see no padded point: means, batch norm, and frames of sets with much clutter."""
 
+from collections.abc import Callable
+
 import torch
 import torch.distributed as dist
 import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from bpnp.models.nets.pointwise import pointwise
 from bpnp.precision import full_precision
 
 ROUNDS = 20  # of reweighting, towards the point with the smallest sum of distances
@@ -35,9 +38,10 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         if not self.training or (x.is_cpu and not dist.is_initialized() and not torch.compiler.is_compiling()):
             return self._of_real_points(x, mask)
         weight = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
-        mean, variance = self._statistics(x, weight)
-        scale = torch.rsqrt(variance + self.eps) * self.weight
-        return torch.addcmul(self.bias - mean * scale, x, scale)
+        axes = tuple(range(x.ndim - 1))
+        total = (x * weight).sum(axes)
+        scale, shift = self.factors(weight.sum().reshape(1), total, lambda mean: (((x - mean) * weight) ** 2).sum(axes))
+        return torch.addcmul(shift, x, scale)
 
     def _of_real_points(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> Tensor:
         """torch's own batch norm, several times quicker; in training it sees the real points only."""
@@ -51,13 +55,23 @@ class MaskedBatchNorm(nn.BatchNorm1d):
         )
         return out.view_as(x) if real is None else torch.zeros_like(x).masked_scatter(real.unsqueeze(-1), out)
 
-    def _statistics(self, x: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-        axes = tuple(range(x.ndim - 1))
-        count, total = weight.sum().reshape(1), (x * weight).sum(axes)
+    def factors(
+        self, count: Tensor, total: Float[Tensor, " c"], scatter: Callable[[Tensor], Tensor]
+    ) -> tuple[Float[Tensor, " c"], Float[Tensor, " c"]]:
+        """Factor and summand of the norm; in training from the values' number, sum, and sum of squares about a mean."""
+        mean, variance = self.running_mean, self.running_var
+        if self.training:
+            mean, variance = self._statistics(count, total, scatter)
+        scale = torch.rsqrt(variance + self.eps) * self.weight
+        return scale, self.bias - mean * scale
+
+    def _statistics(
+        self, count: Tensor, total: Tensor, scatter_about: Callable[[Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
         if dist.is_initialized():
             count, total = collectives.all_reduce(count), collectives.all_reduce(total)
         mean = total / count
-        scatter = (((x - mean) * weight) ** 2).sum(axes)
+        scatter = scatter_about(mean)
         if dist.is_initialized():
             scatter = collectives.all_reduce(scatter)
         enough = count > 1
@@ -67,6 +81,37 @@ class MaskedBatchNorm(nn.BatchNorm1d):
             self.running_var.lerp_((scatter / (count - 1).clamp_min(1)).to(self.running_var.dtype), rate)
             self.num_batches_tracked += 1
         return torch.where(enough, mean, self.running_mean), torch.where(enough, scatter / count, self.running_var)
+
+
+def highest_normed(
+    x: Float[Tensor, "b k c"], linear: nn.Linear, norm: MaskedBatchNorm, mask: Bool[Tensor, "b k"] | None
+) -> Float[Tensor, "b d"]:
+    """Largest value of norm(linear(x)) over the real points of each set, per channel; mask None: nothing is padded.
+
+    Only the largest values are kept for the gradient, no values of d channels of each point: z = W x + b has the mean
+    W s + b and the variance diag(W C W^T), s and C the mean and the covariance of x. z is largest where the norm is, or
+    smallest if the norm's factor is negative.
+    """
+    weight, bias = linear.weight, linear.bias
+    with torch.autocast(x.device.type, enabled=False):
+        x = x.to(weight.dtype)
+        with torch.no_grad():
+            z = pointwise(x, torch.where(norm.weight < 0, -1, 1).unsqueeze(-1) * weight, None)
+            z = z if mask is None else z.masked_fill(~mask.unsqueeze(-1), -torch.inf)
+            place = nn.functional.adaptive_max_pool2d_with_indices(z.mT.unsqueeze(2), 1)[1].flatten(1)
+        points, real = x.flatten(0, 1), 1 if mask is None else mask.view(-1, 1)
+        first = x.shape[1] * torch.arange(len(x), device=x.device).unsqueeze(-1)
+        highest = (nn.functional.embedding(place + first, points) * weight).sum(2) + bias
+        count = x.new_full((1,), len(points)) if mask is None else mask.sum().to(x.dtype).reshape(1)
+        centre = (points * real).sum(0) / count
+        mean = weight @ centre + bias
+
+        def scatter(about: Tensor) -> Tensor:
+            around = (points - centre) * real
+            return ((weight @ (around.mT @ around)) * weight).sum(1) + count * (mean - about) ** 2
+
+        scale, shift = norm.factors(count, count * mean, scatter)
+        return torch.addcmul(shift, highest, scale)
 
 
 def robust_frame(
