@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.compilation import in_time
 from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import dense_scratch, descend
-from bpnp.search.kernels.grid import build_grid, descend_sparse, sparse_scratch
+from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene
 from bpnp.search.settings import ClusterStage, Stages
 from bpnp.search.starts import Array
@@ -59,13 +59,13 @@ def anneal_on_points(
     outliers = scene.settings.outliers if outliers is None else outliers
     rounds = max(4, math.ceil(math.log(scene.smallest_scale / first_scale) / math.log(fine.cooling)))
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
-    image, points = scene.sides(bearings)
-    grid, outlier = build_grid(image, float(scales[-1])), scene.outlier_density(outliers)
-    sides, rotation, translation = (tuple(grid), tuple(points)), starts.rotation.copy(), starts.translation.copy()
+    tiles, points = scene.tiles(bearings)
+    tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
+    sides, rotation, translation = (tuple(tiles), tuple(points)), starts.rotation.copy(), starts.translation.copy()
     result = np.empty((len(starts), 3), np.float32)
 
     def anneal(i: int, j: int) -> None:
-        scratch = sparse_scratch(len(grid.a), len(points.b))
+        scratch = sparse_scratch(tiles, len(points.b))
         descend_sparse(*sides, rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())

@@ -10,6 +10,7 @@ from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
+from bpnp.search.kernels.tiles import Tiles, build_tiles
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Nearby, SearchSettings
@@ -35,6 +36,7 @@ class Scene:
         bearings, points3d = sets.bearings, sets.points3d
         self.settings, self.deadline = settings, deadline
         self.rasters: dict[tuple[Nearby, float], Raster] = {}
+        self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)
         bulk = points3d[in_bulk]
@@ -90,6 +92,14 @@ class Scene:
     def sides(self, bearings: int | None = None, points: int | None = None) -> tuple[WeightedBearings, WeightedPoints]:
         """All points of both sides, or so many of them."""
         return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
+
+    def tiles(self, bearings: int | None = None) -> tuple[Tiles, WeightedPoints]:
+        """All points, and all bearings or so many of them in tiles; both are kept."""
+        count = len(self.offsets) if bearings is None else min(bearings, len(self.offsets))
+        if count not in self._tiles:
+            image, points = self.sides(count)
+            self._tiles[count] = build_tiles(image), points
+        return self._tiles[count]
 
 
 def degenerate(points: NDArray[np.float64]) -> bool:

@@ -10,7 +10,8 @@ from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
 from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
-from bpnp.search.kernels.grid import CAPACITY, REACH, assign_sparse, build_grid, descend_sparse, sparse_scratch
+from bpnp.search.kernels.sparse import assign_sparse, descend_sparse, sparse_scratch
+from bpnp.search.kernels.tiles import REACH, Tiles, build_tiles
 from bpnp.search.kernels.vectors import turn
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 
@@ -57,8 +58,8 @@ class View:
             ),
         )
 
-    def grid(self, smallest: float) -> tuple:
-        return tuple(build_grid(WeightedBearings(*self.sides()[0]), smallest))
+    def tiles(self, largest: float) -> Tiles:
+        return build_tiles(WeightedBearings(*self.sides()[0])).with_margin(largest)
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
@@ -81,22 +82,20 @@ def test_the_assignment_on_clusters_is_the_product_form(entry: Any, spread: floa
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
-def test_the_likelihood_on_the_grid_is_the_mixture_and_close_to_that_on_clusters(entry: Any, spread: float) -> None:
+def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(entry: Any, spread: float) -> None:
     view, scale, outlier = View(spread), 0.05 * spread, 0.002
-    grid, (bearings, points), one = view.grid(0.01 * spread), view.sides(), np.ones(60, np.float32)
-    index, kernel = np.empty((60, CAPACITY), np.int32), np.empty((60, CAPACITY), np.float32)
-    row, column, q = np.empty(60, np.float32), np.empty(60, np.float32), np.empty((4, 60), np.float32)
+    tiles, (bearings, points), one = view.tiles(scale), view.sides(), np.ones(60, np.float32)
+    u, pairs, *sums, column, q = sparse_scratch(tiles, 60)[:6]
     likelihood, matched = entry(assign_sparse)(
-        grid, points, one, *view.pose(), np.float32(scale), np.float32(outlier), index, kernel,
-        np.empty(60, np.int32), row, column, q,
-    )  # fmt: skip
+        tuple(tiles), points, one, *view.pose(), np.float32(scale), np.float32(outlier), u, pairs, *sums, column, q
+    )
     squared = cdist(view.bearings, view.directions(), "sqeuclidean")
     k = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
     dense = entry(assign)(
         bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier),
-        np.empty((60, 60), np.float32), row, column, q,
+        np.empty((60, 60), np.float32), column, column.copy(), q,
     )  # fmt: skip
     assert dense == pytest.approx(likelihood, abs=0.1)
 
@@ -144,7 +143,9 @@ def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: floa
     score, result = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
     bearings, points = view.sides()
     descend(bearings, points, *poses[0], scales, np.float32(0.5), score, dense_scratch(60, 60))
-    descend_sparse(view.grid(0.02), points, *poses[1], scales, np.float32(0.5), 3, result, sparse_scratch(60, 60))
+    tiles = view.tiles(0.1)
+    scratch = sparse_scratch(tiles, 60)
+    descend_sparse(tuple(tiles), points, *poses[1], scales, np.float32(0.5), 3, result, scratch)
     for values in (score, result[:, 0]):
         assert values[1] == -math.inf
         assert np.isfinite(values[[0, 2]]).all()

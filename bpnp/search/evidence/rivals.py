@@ -15,6 +15,7 @@ from bpnp.search.settings import Evidence
 Array = NDArray[np.float64]
 NEAR = 3.0  # scales of the residuals within which an image point has a partner, and two partners are in one place
 FAR = 5.0  # times as far as a different pose: nearer ones slide along the same lines and surfaces
+OWN = 0.5  # of the points that the first pose alone explains: a pose that explains so many alone is no repetition of it
 SAME = 0.5  # share of a pose's partners in the places of those of another from which both say the same of the scene
 
 
@@ -32,7 +33,8 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
     does not. Where even equal signs of all d_i would be no less likely, there are too few points to tell.
 
     A pose that sees half of its partners where the first one sees its own is compared by its false alarms alone: it is
-    that pose, its mirror image, or repeats it in a repeated structure.
+    that pose, its mirror image, or repeats it in a repeated structure. Not so if it also explains points that the first
+    one does not, half as many as it leaves unexplained: both then slide along a curve.
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
@@ -52,7 +54,9 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
         other = _partners(sets, *(x[k] for x in (*poses, scales)))
         reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
-        if (same & first.near & other.near).sum() < SAME * other.near.sum():
+        own, others_own = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
+        apart = others_own >= OWN * own and own + others_own >= least
+        if apart or (same & first.near & other.near).sum() < SAME * other.near.sum():
             return k
     return -1
 

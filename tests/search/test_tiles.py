@@ -1,0 +1,47 @@
+"""Pairs of bearings in tiles and points near them, against all distances."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from bpnp.search.kernels.sparse import sparse_scratch
+from bpnp.search.kernels.tiles import REACH, add_moments, add_to_bearings, add_to_points, build_tiles, meet, sort_points
+from bpnp.search.kernels.weighted import WeightedBearings
+
+
+def offsets(rng: np.random.Generator, count: int, spread: float) -> np.ndarray:
+    f = rng.normal(size=(count, 3)) * [spread, 0.5 * spread, 0] + [0, 0, 1]
+    return np.ascontiguousarray((f / np.linalg.norm(f, axis=1, keepdims=True) - [0, 0, 1]).T, np.float32)
+
+
+@pytest.mark.parametrize("count", [1, 16, 203])
+@pytest.mark.parametrize("labelled", [False, True])
+def test_pairs_are_all_that_are_within_reach(entry: Any, count: int, labelled: bool) -> None:
+    rng, spread, scale, n = np.random.default_rng(count), 0.2, np.float32(0.01), 150
+    f, u = offsets(rng, count, spread), offsets(rng, n, 1.2 * spread)
+    labels2d, labels3d = (rng.integers(-1, 2 if labelled else 0, size=k).astype(np.int32) for k in (count, n))
+    a = rng.uniform(0.5, 2, count).astype(np.float32)
+    tiles = build_tiles(WeightedBearings(f, a, a, labels2d)).with_margin(float(scale))
+    _, (cells, start, order, met, point, kernel, end), sums, row, column, q, *_ = sparse_scratch(tiles, n)
+    entry(sort_points)(tuple(tiles), u, cells, start, order)
+    entry(meet)(tuple(tiles), labels3d, u, scale, start, order, met, point, kernel, end)
+
+    squared = cdist(f.T, u.T, "sqeuclidean")
+    fits = (labels2d[:, None] == labels3d) | (labels2d[:, None] < 0) | (labels3d < 0)
+    expected = np.where((squared < (REACH * scale) ** 2) & fits, np.exp(-squared / (2 * scale**2)), 0)
+    values = rng.uniform(0.5, 1, n).astype(np.float32)
+    entry(add_to_bearings)(values, point, kernel, end, sums)
+    by_place = {
+        tuple(at): total for at, total in zip(tiles.f.transpose(0, 2, 1).reshape(-1, 3), sums.ravel(), strict=True)
+    }
+    found = np.array([by_place[tuple(at)] for at in f.T])
+    np.testing.assert_allclose(found, expected @ values, rtol=2e-3, atol=1e-4)
+    row[:] = tiles.a
+    entry(add_to_points)(row, point, kernel, end, column)
+    np.testing.assert_allclose(column, a @ expected, rtol=2e-3, atol=1e-4)
+    entry(add_moments)(tiles.f, u, row, values, point, kernel, end, q)
+    weight = a[:, None] * expected * values
+    residual = np.einsum("ij,ijc->cj", weight, f.T[:, None] - u.T)
+    np.testing.assert_allclose(q, [*residual, weight.sum(0)], rtol=2e-3, atol=1e-4)
