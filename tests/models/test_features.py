@@ -198,10 +198,12 @@ def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: 
     )
 
 
+@pytest.mark.parametrize("padded", [True, False])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype) -> None:
+def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype, padded: bool) -> None:
     block = PointFeatures(3, channels=16, depth=3)
     _, points, mask = sets(3, garbage=1.0)
+    mask = mask if padded else torch.ones_like(mask)
     weights = torch.randn(*mask.shape, 16, dtype=torch.float64)
 
     def gradients(dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:

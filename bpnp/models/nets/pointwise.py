@@ -8,6 +8,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn.grad import conv2d_weight
 
+from bpnp.models.nets.context_norm import norm_gradient, normalise
+
 CONTEXT_EPS = 1e-3  # as in the released code
 
 
@@ -68,6 +70,8 @@ def pointwise_norm(
 class _PointwiseNorm(torch.autograd.Function):
     """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic.
 
+    In a training on the CPU the norm is a compiled loop where nothing is padded.
+
     dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std for the gradient g of y.
     """
 
@@ -75,7 +79,12 @@ class _PointwiseNorm(torch.autograd.Function):
     def forward(
         ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None
     ) -> Tensor:  # fmt: skip
+        ctx.rectified = skip is not None
         z = pointwise(x, weight, bias)
+        if mask is None and z.is_cpu and z.dtype == torch.float32 and any(ctx.needs_input_grad):
+            scale, result = normalise(z, skip, CONTEXT_EPS)
+            ctx.save_for_backward(x, weight, z, scale, None, None)
+            return result
         y = z if z.dtype == torch.float64 else z.float()
         real = None if mask is None else mask.unsqueeze(-1).to(y.dtype)
         count = y.new_full((1, 1, 1), y.shape[1]) if real is None else real.sum(1, keepdim=True)
@@ -85,22 +94,24 @@ class _PointwiseNorm(torch.autograd.Function):
         scale = torch.rsqrt(variance + CONTEXT_EPS)
         y = y.mul_(scale).to(x.dtype)
         ctx.save_for_backward(x, weight, y, scale, count, real)
-        ctx.rectified = skip is not None
         return y if skip is None else torch.relu(y).add_(skip)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, y, scale, count, real = ctx.saved_tensors
-        g = gradient.to(y.dtype)
-        g = torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g
-        g = g if real is None else g * real
-        wide = y.to(scale.dtype)
-        dz = g * wide
-        along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
-        mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
-        torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
-        dz = (dz if real is None else dz.mul_(real)).to(x.dtype)
+        if count is None:
+            dz = norm_gradient(gradient, y, scale, rectified=ctx.rectified)
+        else:
+            g = gradient.to(y.dtype)
+            g = torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g
+            g = g if real is None else g * real
+            wide = y.to(scale.dtype)
+            dz = g * wide
+            along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
+            mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
+            torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
+            dz = (dz if real is None else dz.mul_(real)).to(x.dtype)
         to_x, to_weight = ctx.needs_input_grad[:2]
         dx = pointwise(dz, weight.mT, None) if to_x else None
         dw = _weight_gradient(x, dz) if to_weight else None
