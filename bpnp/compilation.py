@@ -14,7 +14,10 @@ from typing import Any
 
 import numba
 import torch
+from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import event
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
 
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
@@ -27,12 +30,15 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     names another one); where neither can, each process compiles again. So it is after a change of the function's file,
     or of another one with functions that this file calls, which numba does not look at. A function is compiled without
     the wrappers that a type checker puts around it when it is imported.
-    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. The wrapper
-    for Python is another tenth, which `no_cpython_wrapper` leaves out of a function that only compiled ones call (a
-    call from Python ends the process). Counting references is a fifth, which `_nrt=False` leaves out of one that
-    allocates nothing.
+    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. Counting
+    references is a fifth, which `_nrt=False` leaves out of a function that allocates nothing. One that only compiled
+    ones call has no wrapper for Python (`no_cpython_wrapper`; a call from there ends the process), and is optimised and
+    kept with its callers alone, which saves another fifth.
     """
     options |= {"nogil": True, "no_cfunc_wrapper": True}
+    part = "no_cpython_wrapper" in options
+    if part:
+        options["pipeline_class"] = _PartCompiler
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -40,15 +46,39 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             *(_FILES[known] for known in function.__globals__.values() if isinstance(known, Dispatcher))
         )
         try:
-            dispatcher: Any = numba.njit(function, cache=True, **options)
-            stats = [os.stat(file) for file in sorted(files)]
-            dispatcher._cache._cache_file._source_stamp = [(stat.st_mtime, stat.st_size) for stat in stats]
+            dispatcher: Any = numba.njit(function, cache=not part, **options)
+            if not part:
+                stats = [os.stat(file) for file in sorted(files)]
+                dispatcher._cache._cache_file._source_stamp = [(stat.st_mtime, stat.st_size) for stat in stats]
         except RuntimeError:  # numba finds no folder for its cache
             dispatcher = numba.njit(function, **options)
         _FILES[dispatcher] = files
         return dispatcher
 
     return compiled
+
+
+class _PartCode(JITCodeLibrary):
+    """The code of a function that is linked into those that call it, as numba translated it."""
+
+    def _optimize_final_module(self) -> None:
+        """Leave it to the callers."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class _PartCompiler(Compiler):
+    """Compiles a function that only compiled ones call, without machine code of its own."""
+
+    def __init__(self, typing: Any, target: Any, _: Any, *rest: Any) -> None:
+        super().__init__(typing, target, _PartCode(target.codegen(), "part"), *rest)
+        self.state.targetctx.get_executable = _without_machine_code
+
+
+def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
+    """What stands for the function among numba's; `Compiler` gives each compilation a copy of the target."""
+    return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
 
 
 class _Compilation(event.Listener):

@@ -20,7 +20,7 @@ FACTOR = """
 from bpnp.compilation import compiler
 
 
-@compiler()
+@compiler(no_cpython_wrapper=True)
 def factor():
     return 2
 """

@@ -15,7 +15,9 @@ from bpnp.compilation import compiler, in_threads
 from bpnp.layers.plan import SHORT_SUM, Plan
 
 # Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
-compiled = compiler(fastmath={"reassoc", "contract", "arcp", "nsz"}, error_model="numpy")
+FAST = {"reassoc", "contract", "arcp", "nsz"}
+compiled = compiler(fastmath=FAST, error_model="numpy", _nrt=False)
+part = compiler(fastmath=FAST, error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by `_solve`
 SHORT_COLUMN = 256  # rows that are added up in the precision of the data
 
 
@@ -38,32 +40,37 @@ def conjugate_gradients(
     x, mean = rhs.new_zeros(rhs.shape), rhs.new_zeros(rows.shape)
     solved = torch.zeros(len(rhs), dtype=torch.bool)
     arrays = [value.detach().contiguous().numpy() for value in (*inputs, x, mean, solved)]
-    in_threads(lambda first, last: _solve(first, last, limit, *arrays), len(rhs))
+    (_, m, n), dtype = plan.kernel.shape, arrays[0].dtype
+
+    def work(first: int, last: int) -> None:
+        _solve(first, last, limit, *arrays, (*np.empty((2, m), dtype), *np.empty((7, n), dtype), np.empty(n)))
+
+    in_threads(work, len(rhs))
     return x, mean, solved
 
 
-@compiled
-def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, part: Any, total: Any) -> None:
+@part
+def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, short: Any, total: Any) -> None:
     """y = before . (K x) and total = K^T (after . y).
 
-    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; part (n,) is scratch memory. Sums of
+    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; short (n,) is scratch memory. Sums of
     thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are made in the
     data's precision and added up in float64.
     """
     total[:] = 0
-    part[:] = 0
+    short[:] = 0
     for i in range(len(kernel)):
         row = kernel[i]
         y[i] = before[i] * _dot(row, x)
         mean = after[i] * y[i]
-        for j in range(len(part)):
-            part[j] += mean * row[j]
+        for j in range(len(short)):
+            short[j] += mean * row[j]
         if i % SHORT_COLUMN == SHORT_COLUMN - 1:
-            _flush(part, total)
-    _flush(part, total)
+            _flush(short, total)
+    _flush(short, total)
 
 
-@compiled
+@part
 def _dot(row: Any, x: Any) -> float:
     """row . x, both (n,). The loop is over slices: an index that might be negative is not made a vector instruction."""
     total = 0.0
@@ -76,41 +83,39 @@ def _dot(row: Any, x: Any) -> float:
     return total
 
 
-@compiled
-def _flush(part: Any, total: Any) -> None:
-    """Add `part` (n,) to `total` (n,), and set it to zero."""
-    for j in range(len(part)):
-        total[j] += part[j]
-        part[j] = 0
+@part
+def _flush(short: Any, total: Any) -> None:
+    """Add `short` (n,) to `total` (n,), and set it to zero."""
+    for j in range(len(short)):
+        total[j] += short[j]
+        short[j] = 0
 
 
-@compiled
+@part
 def _invert(values: Any, result: Any) -> None:
-    """1 / values into `result`, both (n,), which stays zero where a value is not positive."""
+    """1 / values into `result`, both (n,); zero where a value is not positive."""
     for j in range(len(values)):
-        if values[j] > 0:
-            result[j] = 1 / values[j]
+        result[j] = 1 / values[j] if values[j] > 0 else 0
 
 
 @compiled
 def _solve(
     start: int, stop: int, limit: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
-    tolerance: Any, x: Any, mean: Any, solved: Any,
+    tolerance: Any, x: Any, mean: Any, solved: Any, scratch: Any,
 ) -> None:  # fmt: skip
     """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
-    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations. In loops, for
-    numpy's expressions of several arrays take seconds to compile."""
+    -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations.
+    scratch: overwritten. In loops, for numpy's expressions of several arrays take seconds to compile."""
+    before, y, inverse, unit, r, p, sp, weighed, short, total = scratch
     for s in range(start, stop):
-        inverse, unit, before = np.zeros_like(rhs[s]), np.zeros_like(rhs[s]), np.zeros_like(rows[s])
         _invert(degree[s], inverse)
         _invert(cols[s], unit)
         _invert(rows[s], before)
         for i in range(len(before)):
             before[i] *= alpha[s, i]
-        r, p, sp, weighed = rhs[s].copy(), np.empty_like(unit), np.empty_like(unit), np.empty_like(unit)
-        y, part, total = np.empty_like(before), np.empty_like(r), np.empty(len(r))
         rz = target = 0.0
         for j in range(len(r)):
+            r[j] = rhs[s, j]
             p[j] = inverse[j] * r[j]
             rz += r[j] * p[j]
             target += unit[j] * r[j] * r[j] * tolerance[s] ** 2
@@ -120,7 +125,7 @@ def _solve(
                 break
             for j in range(len(p)):
                 weighed[j] = beta[s, j] * p[j]
-            _products(kernel[s], weighed, before, alpha[s], y, part, total)
+            _products(kernel[s], weighed, before, alpha[s], y, short, total)
             curvature = 0.0
             for j in range(len(p)):
                 sp[j] = cols[s, j] * p[j] - beta[s, j] * total[j]

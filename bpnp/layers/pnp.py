@@ -2,7 +2,6 @@
 
 from typing import Literal
 
-import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -60,6 +59,8 @@ def weighted_pnp(
     >>> bool(stats.converged), (t - torch.tensor([0, 0, 4])).abs().max().item() < 1e-5
     (True, True)
     """
+    import roma  # as in `bpnp.geometry.retract`
+
     if method not in ("newton", "lbfgs"):
         raise ValueError(f"expected `method` 'newton' or 'lbfgs', got {method!r}")
     q = aggregate(assignment, bearings).double()

@@ -2,7 +2,6 @@
 
 from functools import partial
 
-import roma
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -69,6 +68,8 @@ def lbfgs(
     One sample at a time, so that no pose depends on its neighbours' line searches. The pose is an angle-axis vector
     and a translation; the weight of a sample is sum_j |sum_i P_ij f_i|.
     """
+    import roma  # as in `bpnp.geometry.retract`
+
     rotations, translations, iterations = [], [], []
     for p, f, x, r0, t0 in zip(assignment, bearings, points3d, rotation, translation, strict=True):
         pose = torch.cat([roma.rotmat_to_rotvec(r0), t0]).requires_grad_()
@@ -89,6 +90,8 @@ def lbfgs(
 
 def _evaluate(pose: Tensor, assignment: Tensor, bearings: Tensor, points: Tensor) -> Tensor:
     """Value of Eq. 7 at an angle-axis vector and translation; its gradient is left in `pose.grad`."""
+    import roma  # as above
+
     pose.grad = None
     with torch.enable_grad():
         rotation, translation = roma.rotvec_to_rotmat(pose[None, :3]), pose[None, 3:]

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from bpnp.search.kernels.vectors import F, compiled, rotated
+from bpnp.search.kernels.vectors import F, compiled, part, rotated
 from bpnp.search.kernels.weighted import visible_weights
 
 
@@ -21,7 +21,7 @@ class Raster(NamedTuple):
     per_cell: np.float32
 
 
-@compiled
+@part
 def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
     """Column and row, as fractions, of the raster where the point p[:, j] is seen from the pose (3, 3), (3,)."""
     x, y, z = rotated(turn, p[0, j], p[1, j], p[2, j])
