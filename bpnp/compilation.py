@@ -5,9 +5,11 @@ import inspect
 import logging
 import math
 import os
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ContextDecorator
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -19,6 +21,7 @@ from numba.core import event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from threadpoolctl import ThreadpoolController
 
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
 
@@ -137,6 +140,36 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
 def _pool(process: int) -> ThreadPoolExecutor:
     """The threads of a process; a fork inherits none of its parent's, so each has its own."""
     return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
+
+
+class _OneBlasThread(ContextDecorator):
+    """numpy's and scipy's products on one thread meanwhile, then on as many as before, whoever of several ends last.
+
+    Those of a search are small: threads that wait for the next one would take several times as long as the search.
+    """
+
+    lock, users = threading.Lock(), 0
+    limit: Any = None
+
+    def __enter__(self) -> None:
+        with self.lock:
+            if not self.users:
+                self.limit = _blas().limit(limits=1)
+            self.users += 1
+
+    def __exit__(self, *exception: object) -> None:
+        with self.lock:
+            self.users -= 1
+            if not self.users:
+                self.limit.restore_original_limits()
+
+
+@lru_cache(1)
+def _blas() -> ThreadpoolController:
+    return ThreadpoolController().select(user_api="blas")
+
+
+one_blas_thread = _OneBlasThread()
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating[Any]]
+AT_ONCE = 16  # poses that are compared with all others in one product
 
 
 def turned_by(one: Array, other: Array) -> float:
@@ -23,8 +24,10 @@ def same_pose(
     Of several poses i (k,): (k, c).
     """
     flat = rotation.reshape(-1, 9)
-    turned = flat[i] @ flat.T < 1 + 2 * math.cos(math.radians(degrees))
-    return ~turned & (np.linalg.norm(translation - translation[i][..., None, :], axis=-1) <= shift)
+    alike = flat[i] @ flat.T >= 1 + 2 * math.cos(math.radians(degrees))
+    if shift == math.inf:
+        return np.asarray(alike)
+    return alike & (np.linalg.norm(translation - translation[i][..., None, :], axis=-1) <= shift)
 
 
 def distinct(
@@ -33,10 +36,13 @@ def distinct(
     """The best `count` poses of which no two are closer than both limits, best first; NaN and -inf are left out."""
     kept: list[int] = []
     free = np.isfinite(score)
-    for i in np.argsort(-np.where(free, score, -np.inf), kind="stable").tolist():
-        if len(kept) == count:
-            break
-        if free[i]:
-            kept.append(i)
-            free &= ~same_pose(rotation, translation, i, degrees, shift)
+    order = np.argsort(-np.where(free, score, -np.inf), kind="stable")
+    for first in range(0, len(order), AT_ONCE):
+        several = order[first : first + AT_ONCE]
+        for i, same in zip(several.tolist(), same_pose(rotation, translation, several, degrees, shift), strict=True):
+            if len(kept) == count:
+                return np.array(kept, dtype=np.int64)
+            if free[i]:
+                kept.append(i)
+                free &= ~same
     return np.array(kept, dtype=np.int64)

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import bpnp.compilation
-from bpnp.compilation import in_threads
+from bpnp.compilation import in_threads, one_blas_thread
 
 FACTOR = """
 from bpnp.compilation import compiler
@@ -181,3 +182,18 @@ def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, t
         printed, logged = process.communicate(timeout=120)
         assert (process.returncode, printed) == (0, "8 10\n"), logged
     assert doubled(package, cache) == ("8 10\n", "")
+
+
+def test_blas_has_one_thread_until_the_last_of_several_users_ends() -> None:
+    def of_blas() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    with threadpool_limits(3, "blas"):
+        one_blas_thread.__enter__()
+        with one_blas_thread:
+            assert of_blas() == {1}
+        with pytest.raises(ValueError, match="bad"):
+            one_blas_thread(int)("bad")
+        assert of_blas() == {1}
+        one_blas_thread.__exit__()
+        assert of_blas() == {3}

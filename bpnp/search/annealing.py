@@ -81,25 +81,27 @@ def anneal_on_points(
 def shaken(scene: Scene, poses: Candidates) -> Candidates:
     """Starts around the best poses; those of a batch that end there are no evidence for it, hence no hits."""
     shaking = scene.settings.shaking
-    rotation, translation = (
-        np.repeat(x[: shaking.poses], shaking.copies, 0) for x in (poses.rotation, poses.translation)
-    )
-    vectors, shifts = scene.rng.standard_normal((2, len(rotation), 3), np.float32)
-    shifts *= np.float32(shaking.translation * scene.spread) * np.linalg.norm(translation, axis=-1, keepdims=True)
+    rotation, translation = (x[: shaking.poses] for x in (poses.rotation, poses.translation))
+    vectors, shifts = scene.rng.standard_normal((2, len(rotation) * shaking.copies, 3), np.float32)
+    length = np.repeat(np.linalg.norm(translation, axis=-1), shaking.copies)
+    shifts *= np.float32(shaking.translation * scene.spread) * length[:, None]
     return turned_about_middle(scene, rotation, translation, math.radians(shaking.rotation_deg) * vectors, shifts)
 
 
 def turned_about_middle(
     scene: Scene, rotation: Array, translation: Array, vectors: Array, shifts: Array, *, hits: int = 0
 ) -> Candidates:
-    """Poses turned by rotation vectors (s, 3) about the middle of the points, and shifted by (s, 3).
+    """Copies of poses (k, 3, 3), (k, 3), s in all, turned by rotation vectors (s, 3) about the middle of the points and
+    shifted by (s, 3).
 
     There an error of the rotation moves the camera, not what it looks at.
     """
-    middle = scene.bulk3d.mean(0)
-    turned = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32) @ rotation
-    shifted = rotation @ middle + translation + shifts - turned @ middle
-    return Candidates.unscored(turned, shifted.astype(np.float32), hits=hits)
+    middle, copies = scene.bulk3d.mean(0), len(vectors) // max(len(rotation), 1)
+    turns = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
+    turned = (turns.reshape(len(rotation), 3 * copies, 3) @ rotation).reshape(-1, 3)
+    seen = np.repeat(rotation @ middle + translation, copies, 0)
+    shifted = seen + shifts - (turned @ middle).reshape(-1, 3)
+    return Candidates.unscored(turned.reshape(-1, 3, 3), shifted.astype(np.float32), hits=hits)
 
 
 def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Candidates:

@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import NEVER, Deadline
+from bpnp.compilation import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
 from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates
@@ -27,6 +27,7 @@ Progress = Callable[[int, float], None]  # batches so far, seconds
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
 
+@one_blas_thread
 def search_poses(
     sets: PointSets,
     *,
@@ -105,6 +106,7 @@ def is_crowd(sets: PointSets) -> bool:
     return not is_few(replace(sets, prior=None))
 
 
+@one_blas_thread
 def search_proposed(
     sets: PointSets, proposals: Proposals, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,

@@ -20,7 +20,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from bpnp.compilation import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
@@ -33,6 +32,7 @@ from bpnp.search.starts import PosePrior, Prior
 
 MOST_VOLUMES = 100.0  # of a prior against the widest that has as many starts as it needs; a map view's has 9
 ADMITTED = 3.5  # standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it
+WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
 
@@ -95,11 +95,11 @@ def _volume(scene: Scene, prior: PosePrior, rule: Nearby) -> float:
 
 def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
     """Poses drawn from the prior, the first one its mean."""
-    mean = np.asarray(prior.rotation, np.float32)
+    mean = np.asarray(prior.rotation, np.float32)[None], np.asarray(prior.translation, np.float32)[None]
     vectors = math.radians(prior.rotation_sigma_deg) * scene.rng.standard_normal((count, 3), np.float32)
     shifts = np.float32(prior.translation_sigma) * scene.rng.standard_normal((count, 3), np.float32)
     vectors[0], shifts[0] = 0, 0
-    return turned_about_middle(scene, mean, np.asarray(prior.translation, np.float32), vectors, shifts, hits=1)
+    return turned_about_middle(scene, *mean, vectors, shifts, hits=1)
 
 
 def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates:
@@ -119,12 +119,11 @@ def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates
 
 def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
     """Each pose and copies of it whose points fall about `scale`, in spreads of the bearings, beside its own."""
-    rotation, translation = (np.repeat(x, copies, 0) for x in (poses.rotation, poses.translation))
-    vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, len(rotation), 3), np.float32)
-    depth = np.linalg.norm(rotation @ scene.bulk3d.mean(0) + translation, axis=-1, keepdims=True)
-    shifts *= depth * np.array([scene.spread, scene.spread, 1], np.float32)
+    vectors, shifts = np.float32(scale) * scene.rng.standard_normal((2, copies * len(poses), 3), np.float32)
+    depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
+    shifts *= np.repeat(depth, copies)[:, None] * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
-    return turned_about_middle(scene, rotation, translation, vectors, shifts, hits=1)
+    return turned_about_middle(scene, poses.rotation, poses.translation, vectors, shifts, hits=1)
 
 
 def looked_up(
@@ -158,12 +157,13 @@ def _drawn_raster(scene: Scene, rule: Nearby, scale: float) -> Raster:
     per_cell = cells / (2 * half)
     place = np.minimum(((at + half) * per_cell).astype(np.int64), cells - 1)
     place = place[:, 1] * cells + place[:, 0]
-    counts = np.bincount(place, scene.image.weights, cells**2).reshape(cells, cells).astype(np.float64)
+    counts = np.bincount(place, scene.image.weights, cells**2).reshape(cells, cells).astype(np.float32)
     wide = rule.background * scale * per_cell
     near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
     inside = around > INSIDE * around.max()
     gain = np.log(rule.outliers + (1 - rule.outliers) * near / np.where(inside, around, 1))
-    mean = _smoothed(np.where(inside, gain, 0.0), wide) / np.maximum(_smoothed(inside.astype(float), wide), 1e-6)
+    seen = inside.astype(np.float32)
+    mean = _smoothed(seen * gain, wide) / np.maximum(_smoothed(seen, wide), 1e-6)
     return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
@@ -185,5 +185,13 @@ def _distance(scene: Scene, prior: PosePrior) -> float:
     return max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)
 
 
-def _smoothed(values: NDArray[np.float64], cells: float) -> NDArray[np.float64]:
-    return np.asarray(gaussian_filter(values, cells, mode="constant"))
+def _smoothed(values: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
+    """Values (g, g), 0 around them, after a Gaussian filter with a standard deviation of so many cells.
+
+    In two steps of half the variance, the first one to a coarser grid, as products of matrices: sums at a spacing of
+    0.6 standard deviations are exact to 3e-6, and cost a fifth of a wide filter.
+    """
+    step = 0.6 * cells
+    away = (np.arange(len(values))[:, None] - np.arange(-3 * cells, len(values) + 3 * cells, step)) / cells
+    kernel = np.where(np.abs(away) < WIDE, math.sqrt(step / math.pi) / cells * np.exp(-(away**2)), 0).astype(np.float32)
+    return np.asarray(kernel @ (kernel.T @ values @ kernel) @ kernel.T)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.compilation import NEVER, Deadline
+from bpnp.compilation import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_further, anneal_on_clusters, anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.kernels.sides import FORWARD
@@ -16,6 +16,7 @@ from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult, judged, no_pose
 
 
+@one_blas_thread
 def refine_poses(
     sets: PointSets,
     rotation: NDArray[np.float64],
@@ -50,6 +51,7 @@ def refine_poses(
     return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
 
 
+@one_blas_thread
 def score_poses(
     sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline,
     scale: float | None = None,
