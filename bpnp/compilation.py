@@ -21,6 +21,8 @@ from numba.core import event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from numba.core.typed_passes import InlineOverloads, NopythonRewrites
+from numba.core.untyped_passes import InlineClosureLikes
 from threadpoolctl import ThreadpoolController
 
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
@@ -36,7 +38,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. Counting
     references is a fifth, which `_nrt=False` leaves out of a function that allocates nothing. One that only compiled
     ones call has no wrapper for Python (`no_cpython_wrapper`; a call from there ends the process), and is optimised and
-    kept with its callers alone, which saves another fifth.
+    kept with its callers alone, which saves another quarter.
     """
     options |= {"nogil": True, "no_cfunc_wrapper": True}
     part = "no_cpython_wrapper" in options
@@ -77,6 +79,14 @@ class _PartCompiler(Compiler):
     def __init__(self, typing: Any, target: Any, _: Any, *rest: Any) -> None:
         super().__init__(typing, target, _PartCode(target.codegen(), "part"), *rest)
         self.state.targetctx.get_executable = _without_machine_code
+
+    def define_pipelines(self) -> Any:
+        """Without the passes for closures, inlined functions and expressions of arrays, which these functions lack."""
+        (pipeline,) = super().define_pipelines()
+        unused = InlineClosureLikes, InlineOverloads, NopythonRewrites
+        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
+        pipeline.finalize()
+        return [pipeline]
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:

@@ -197,3 +197,28 @@ def test_blas_has_one_thread_until_the_last_of_several_users_ends() -> None:
         assert of_blas() == {1}
         one_blas_thread.__exit__()
         assert of_blas() == {3}
+
+
+SIGNATURES = """
+import sys
+import numpy as np
+from numba.core.dispatcher import Dispatcher
+from bpnp import solve
+for n in (10, 100):
+    points = np.random.default_rng(0).normal(size=(n, 3))
+    seen = points + (0, 0, 6)
+    labels, image = np.arange(n) % 3, seen[:, :2] / seen[:, 2:]
+    solve(image, points)
+    solve(image.astype(np.float32), np.asfortranarray(points), labels2d=labels, labels3d=labels.astype(np.int32))
+    solve(image, points, normals3d=-seen / np.linalg.norm(seen, axis=1, keepdims=True))
+loops = {loop for name in list(sys.modules) if name.startswith("bpnp.") for loop in vars(sys.modules[name]).values()
+         if isinstance(loop, Dispatcher) and not loop.targetoptions.get("no_cpython_wrapper")}
+print(*sorted(f"{loop.py_func.__name__}:{len(loop.signatures)}" for loop in loops if loop.signatures))
+"""
+
+
+def test_whatever_the_arrays_of_a_pair_each_loop_is_compiled_once() -> None:
+    done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, check=True)
+    names, counts = zip(*(entry.split(":") for entry in done.stdout.split()), strict=True)
+    assert {"descend", "descend_sparse", "sweep", "vary"} <= set(names)
+    assert set(counts) == {"1"}
