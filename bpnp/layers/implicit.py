@@ -131,11 +131,13 @@ def entropic_plan(
     return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, solve_adjoint)
 
 
-def projected(plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor) -> Float[Tensor, "b m n"]:
-    """P.(V - a1^T - 1b^T)."""
+def projected(
+    plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor, factor: float | Tensor = 1.0
+) -> Float[Tensor, "b m n"]:
+    """factor P.(V - a1^T - 1b^T)."""
     result = torch.empty_like(plan)
     for out, p, v, x, y in cached_parts(result, plan, gradient, a, b):
-        torch.sub(v, x.unsqueeze(-1), out=out).sub_(y.unsqueeze(-2)).mul_(p)
+        torch.sub(v, x.unsqueeze(-1), out=out).sub_(y.unsqueeze(-2)).mul_(p).mul_(factor)
     return result
 
 
@@ -153,6 +155,6 @@ class _EntropicPlan(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         plan, mu = ctx.saved_tensors
         a, b = ctx.solve_adjoint(plan, gradient)
-        to_cost = projected(plan, gradient, a, b).div_(-mu)
+        to_cost = projected(plan, gradient, a, b, -1 / mu)
         to_mu = torch.special.xlogy(to_cost, plan).sum() if ctx.needs_input_grad[2] else None
         return None, to_cost, to_mu, a, b, None

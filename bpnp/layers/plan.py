@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 SHORT_SUM = 2048  # terms of a sum that are added up in float32
-CACHE = 2**24  # bytes of plans that are worked on together on a CPU: later products then read them from its cache
+CACHE = 2**23  # bytes of plans that are worked on together on a CPU: later products then read them from its cache
 CACHED = 128  # rows whose squares are made at a time: they stay in the cache of a core
 LOST = 100.0  # a difference of so many units of rounding has no digits
 
