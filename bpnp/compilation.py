@@ -33,8 +33,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
     names another one); where neither can, each process compiles again. So it is after a change of the function's file,
-    or of another one with functions that this file calls, which numba does not look at. A function is compiled without
-    the wrappers that a type checker puts around it when it is imported.
+    or of this one, or of another with functions that its file calls, which numba does not look at. A function is
+    compiled without the wrappers that a type checker puts around it when it is imported.
     options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. Counting
     references is a fifth, which `_nrt=False` leaves out of a function that allocates nothing. One that only compiled
     ones call has no wrapper for Python (`no_cpython_wrapper`; a call from there ends the process), and is optimised and
@@ -47,7 +47,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
-        files = {inspect.getfile(function)}.union(
+        files = {__file__, inspect.getfile(function)}.union(
             *(_FILES[known] for known in function.__globals__.values() if isinstance(known, Dispatcher))
         )
         try:

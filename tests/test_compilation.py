@@ -161,6 +161,9 @@ def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path,
     assert doubled(package, cache)[0] == "8 10\n"
     (package / "bpnp" / "factor.py").write_text(FACTOR.replace("2", "30"))
     assert doubled(package, cache)[0] == "120 150\n"
+    with (package / "bpnp" / "compilation.py").open("a") as source:
+        source.write("# compiles in another way\n")
+    assert doubled(package, cache)[1].count("compiling") == 1
 
 
 def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> None:
