@@ -1,7 +1,7 @@
 """Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU: `bpnp.layers.laplacian` in one pass.
 
-A row of the plan is used for both products of a step while it is in the cache, so that a step reads the plan once where
-torch reads it twice. Samples are divided among torch's threads; each stops by itself.
+Four rows of the plan at a time are used for both products of a step while they are in the cache, so that a step reads
+the plan once where torch reads it twice. Samples are divided among torch's threads; each stops by itself.
 """
 
 from typing import Any
@@ -43,44 +43,55 @@ def conjugate_gradients(
     (_, m, n), dtype = plan.kernel.shape, arrays[0].dtype
 
     def work(first: int, last: int) -> None:
-        _solve(first, last, limit, *arrays, (*np.empty((2, m), dtype), *np.empty((7, n), dtype), np.empty(n)))
+        vectors = *np.empty((2, m), dtype), *np.empty((7, n), dtype)
+        _solve(first, last, limit, *arrays, (*vectors, np.empty(n), np.empty(4, dtype)))
 
     in_threads(work, len(rhs))
     return x, mean, solved
 
 
 @part
-def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, short: Any, total: Any) -> None:
+def _products(kernel: Any, x: Any, before: Any, after: Any, y: Any, short: Any, total: Any, four: Any) -> None:
     """y = before . (K x) and total = K^T (after . y).
 
-    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; short (n,) is scratch memory. Sums of
-    thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are made in the
-    data's precision and added up in float64.
+    kernel (m, n), x (n,), before, after (m,) -> y (m,), total (n,) in float64; short (n,) and four (4,) are scratch
+    memory. Sums of thousands of terms in float32 lose the digits in which the Laplacian's terms differ: short sums are
+    made in the data's precision and added up in float64.
     """
     total[:] = 0
     short[:] = 0
-    for i in range(len(kernel)):
-        row = kernel[i]
-        y[i] = before[i] * _dot(row, x)
-        mean = after[i] * y[i]
+    last = len(kernel) - 1
+    for i in range(0, len(kernel), 4):
+        a, b, c, d = kernel[i], kernel[min(i + 1, last)], kernel[min(i + 2, last)], kernel[min(i + 3, last)]
+        sums = _dots(a, b, c, d, x)
+        four[:] = 0
+        for k in range(min(4, len(kernel) - i)):
+            y[i + k] = before[i + k] * sums[k]
+            four[k] = after[i + k] * y[i + k]
+        ya, yb, yc, yd = four[0], four[1], four[2], four[3]
         for j in range(len(short)):
-            short[j] += mean * row[j]
-        if i % SHORT_COLUMN == SHORT_COLUMN - 1:
+            short[j] += ya * a[j] + yb * b[j] + yc * c[j] + yd * d[j]
+        if i % SHORT_COLUMN == SHORT_COLUMN - 4:
             _flush(short, total)
     _flush(short, total)
 
 
 @part
-def _dot(row: Any, x: Any) -> float:
-    """row . x, both (n,). The loop is over slices: an index that might be negative is not made a vector instruction."""
-    total = 0.0
+def _dots(a: Any, b: Any, c: Any, d: Any, x: Any) -> tuple[float, float, float, float]:
+    """Products of four rows with x, all (n,). The loop is over slices: an index that might be negative is not made a
+    vector instruction."""
+    sums = 0.0, 0.0, 0.0, 0.0
     for start in range(0, len(x), SHORT_SUM):
-        some, factors = row[start : start + SHORT_SUM], x[start : start + SHORT_SUM]
-        short = x.dtype.type(0)
-        for j in range(len(some)):
-            short += some[j] * factors[j]
-        total += short
-    return total
+        stop = start + SHORT_SUM
+        ra, rb, rc, rd, factors = a[start:stop], b[start:stop], c[start:stop], d[start:stop], x[start:stop]
+        sa = sb = sc = sd = x.dtype.type(0)
+        for j in range(len(factors)):
+            sa += ra[j] * factors[j]
+            sb += rb[j] * factors[j]
+            sc += rc[j] * factors[j]
+            sd += rd[j] * factors[j]
+        sums = sums[0] + sa, sums[1] + sb, sums[2] + sc, sums[3] + sd
+    return sums
 
 
 @part
@@ -106,7 +117,7 @@ def _solve(
     """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
     -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations.
     scratch: overwritten. In loops, for numpy's expressions of several arrays take seconds to compile."""
-    before, y, inverse, unit, r, p, sp, weighed, short, total = scratch
+    before, y, inverse, unit, r, p, sp, weighed, short, total, four = scratch
     for s in range(start, stop):
         _invert(degree[s], inverse)
         _invert(cols[s], unit)
@@ -125,7 +136,7 @@ def _solve(
                 break
             for j in range(len(p)):
                 weighed[j] = beta[s, j] * p[j]
-            _products(kernel[s], weighed, before, alpha[s], y, short, total)
+            _products(kernel[s], weighed, before, alpha[s], y, short, total, four)
             curvature = 0.0
             for j in range(len(p)):
                 sp[j] = cols[s, j] * p[j] - beta[s, j] * total[j]

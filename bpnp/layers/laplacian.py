@@ -35,11 +35,11 @@ def solve_laplacian(
     rhs: Float[Tensor, "b n"],
     tolerance: Float[Tensor, " b"],
 ) -> Solution:
-    """Conjugate gradients, preconditioned by the diagonal of S; in float64, what stalls is factorised.
+    """Conjugate gradients, preconditioned by `degree`; in float64, what stalls is factorised.
 
-    rows, cols: sums of P, zero at padded points. degree: the diagonal of S. tolerance: of the residual per unit of
-    mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side: in the preconditioner's own norm columns
-    with weak links would outweigh all others.
+    rows, cols: sums of P, zero at padded points. degree: the diagonal of S or near it. tolerance: of the residual per
+    unit of mass, sqrt(sum r_j^2 / cols_j), relative to that of the right-hand side: in the preconditioner's own norm
+    columns with weak links would outweigh all others.
     """
     solve = compiled.conjugate_gradients if compiled.applies_to(rhs) else conjugate_gradients
     x, mean, solved = solve(plan, rows, cols, degree, rhs, tolerance, ITERATIONS)

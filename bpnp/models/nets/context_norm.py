@@ -15,7 +15,7 @@ from bpnp.compilation import compiler, in_threads
 
 # NaN and infinity keep their meaning, as in `bpnp.layers.compiled`.
 OPTIONS = {"fastmath": {"reassoc", "contract", "arcp", "nsz"}, "error_model": "numpy"}
-compiled, inner = compiler(**OPTIONS), compiler(**OPTIONS, no_cpython_wrapper=True, _nrt=False)
+compiled, part = compiler(**OPTIONS), compiler(**OPTIONS, no_cpython_wrapper=True, _nrt=False)
 AT_ONCE = 8  # points: a loop over the channels of one would be short
 
 
@@ -46,16 +46,16 @@ def _normalise(start: int, stop: int, eps: float, z: Any, scale: Any, skip: Any,
     """Sets start to stop of z, skip, result (b, k, c), scale (b, 1, c); an empty skip leaves the result as it is."""
     k, c = z.shape[1:]
     size, wide = k * c, AT_ONCE * c
-    total, part = np.zeros(c), np.zeros(wide, z.dtype)
-    mean, factor = np.empty_like(part), np.empty_like(part)
+    total, short = np.zeros(c), np.zeros(wide, z.dtype)
+    mean, factor = np.empty_like(short), np.empty_like(short)
     for s in range(start, stop):
         x = z[s].reshape(size)
         for i in range(0, size, wide):
-            _add(x[i : i + wide], part)
-        _fold(part, total, 1 / k, mean)
+            _add(x[i : i + wide], short)
+        _fold(short, total, 1 / k, mean)
         for i in range(0, size, wide):
-            _add_squares(x[i : i + wide], mean, part)
-        _fold(part, total, 1 / max(k - 1, 1), factor)
+            _add_squares(x[i : i + wide], mean, short)
+        _fold(short, total, 1 / max(k - 1, 1), factor)
         for j in range(wide):
             factor[j] = 1 / np.sqrt(factor[j] + eps)
         scale[s, 0] = factor[:c]
@@ -72,14 +72,14 @@ def _gradient(start: int, stop: int, floor: float, incoming: Any, y: Any, scale:
     """Sets start to stop of incoming, y, result (b, k, c), scale (b, 1, c). What comes in counts where y > floor."""
     k, c = y.shape[1:]
     size, wide = k * c, AT_ONCE * c
-    total, part, along = np.zeros(c), np.zeros(wide, y.dtype), np.zeros(wide, y.dtype)
-    mean, slope, factor = np.empty_like(part), np.empty_like(part), np.empty_like(part)
+    total, short, along = np.zeros(c), np.zeros(wide, y.dtype), np.zeros(wide, y.dtype)
+    mean, slope, factor = np.empty_like(short), np.empty_like(short), np.empty_like(short)
     floor = y.dtype.type(floor)
     for s in range(start, stop):
         g, x, out = incoming[s].reshape(size), y[s].reshape(size), result[s].reshape(size)
         for i in range(0, size, wide):
-            _add_products(g[i : i + wide], x[i : i + wide], floor, part, along)
-        _fold(part, total, 1 / k, mean)
+            _add_products(g[i : i + wide], x[i : i + wide], floor, short, along)
+        _fold(short, total, 1 / k, mean)
         _fold(along, total, 1 / max(k - 1, 1), slope)
         for j in range(wide):
             factor[j] = scale[s, 0, j % c]
@@ -87,56 +87,56 @@ def _gradient(start: int, stop: int, floor: float, incoming: Any, y: Any, scale:
             _pull_back(g[i : i + wide], x[i : i + wide], floor, mean, slope, factor, out[i : i + wide])
 
 
-@inner
-def _fold(part: Any, total: Any, weight: float, repeated: Any) -> None:
-    """The sums of each channel (c,) in `part` (a multiple of c,), times a weight, once for each point in `repeated`.
+@part
+def _fold(short: Any, total: Any, weight: float, repeated: Any) -> None:
+    """The sums of each channel (c,) in `short` (a multiple of c,), times a weight, once for each point in `repeated`.
 
-    part, total: zero afterwards.
+    short, total: zero afterwards.
     """
     c = len(total)
-    for j in range(len(part)):
-        total[j % c] += part[j]
-        part[j] = 0
-    for j in range(len(part)):
+    for j in range(len(short)):
+        total[j % c] += short[j]
+        short[j] = 0
+    for j in range(len(short)):
         repeated[j] = weight * total[j % c]
     total[:] = 0
 
 
-@inner
-def _add(x: Any, part: Any) -> None:
+@part
+def _add(x: Any, short: Any) -> None:
     for j in range(len(x)):
-        part[j] += x[j]
+        short[j] += x[j]
 
 
-@inner
-def _add_squares(x: Any, mean: Any, part: Any) -> None:
+@part
+def _add_squares(x: Any, mean: Any, short: Any) -> None:
     for j in range(len(x)):
-        part[j] += (x[j] - mean[j]) ** 2
+        short[j] += (x[j] - mean[j]) ** 2
 
 
-@inner
+@part
 def _scale(x: Any, mean: Any, factor: Any) -> None:
     for j in range(len(x)):
         x[j] = (x[j] - mean[j]) * factor[j]
 
 
-@inner
+@part
 def _rectify(x: Any, added: Any, out: Any) -> None:
     zero = x.dtype.type(0)
     for j in range(len(x)):
         out[j] = added[j] + max(x[j], zero)
 
 
-@inner
-def _add_products(g: Any, y: Any, floor: float, part: Any, along: Any) -> None:
+@part
+def _add_products(g: Any, y: Any, floor: float, short: Any, along: Any) -> None:
     zero = y.dtype.type(0)
     for j in range(len(g)):
         passed = g[j] if y[j] > floor else zero
-        part[j] += passed
+        short[j] += passed
         along[j] += passed * y[j]
 
 
-@inner
+@part
 def _pull_back(g: Any, y: Any, floor: float, mean: Any, slope: Any, factor: Any, out: Any) -> None:
     zero = y.dtype.type(0)
     for j in range(len(g)):
