@@ -111,6 +111,15 @@ def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: A
 
 
 @part
+def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
+    """The first rows of u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
+    for j in range(p.shape[1]):
+        x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
+        x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
+        u[0, j], u[1, j], u[2, j] = x, y, z
+
+
+@part
 def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
            kernel: Any, base: Any, row: Any, q: Any) -> Any:  # fmt: skip
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
@@ -128,10 +137,7 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
     for i in range(m):
         row[i] = outlier * total_b * odds2d[i]
         base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
-    for j in range(n):
-        x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
-        x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
-        q[0, j], q[1, j], q[2, j] = x, y, z
+    directions(p, rotation, translation, q)
     for j in range(n):
         x, y, z = q[0, j], q[1, j], q[2, j]
         shift = F(-0.5) * sharp * (x * x + y * y + z * z)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.search.kernels.dense import move
+from bpnp.search.kernels.dense import directions, move
 from bpnp.search.kernels.tiles import (
     LANES,
     MOST_TILES,
@@ -20,20 +20,11 @@ from bpnp.search.kernels.tiles import (
     meet,
     sort_points,
 )
-from bpnp.search.kernels.vectors import F, compiled, direction, part, rotated, sum_of
+from bpnp.search.kernels.vectors import F, compiled, part, sum_of
 from bpnp.search.kernels.weighted import visible_weights
 
 SWEEPS = 2
 LEAST_SEEN = 0.25  # of all weights: if fewer points face the camera, they count as so many
-
-
-@part
-def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
-    """u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
-    for j in range(p.shape[1]):
-        x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
-        x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
-        u[0, j], u[1, j], u[2, j] = x, y, z
 
 
 @part
