@@ -15,6 +15,7 @@ from bpnp.search.settings import Evidence
 Array = NDArray[np.float64]
 NEAR = 3.0  # scales of the residuals within which an image point has a partner, and two partners are in one place
 FAR = 5.0  # times as far as a different pose: nearer ones slide along the same lines and surfaces
+MOST = 13.0  # nats of evidence of an image point: what 100 scene points leave to one that is met to the finest scale
 OWN = 0.5  # of the points that the first pose alone explains: a pose that explains so many alone is no repetition of it
 SAME = 0.5  # share of a pose's partners in the places of those of another from which both say the same of the scene
 
@@ -44,10 +45,12 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
     if not len(others) or len(sets.image.chosen) < least:
         return -1
     scales = np.maximum(candidates.scale, sets.image.scales[0])
-    best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
-    # A lead that would be no chance if all gaps were as large as the largest evidence of a point needs no second look.
-    decisive = math.sqrt(least * len(best)) * float(best.max()) / math.log(10)
+    # A lead that would be no chance if all gaps were as large as they can be needs no second look.
+    decisive = MOST * math.sqrt(least * len(sets.image.chosen)) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
+    if not len(others):
+        return -1
+    best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
         squared = float((gap**2).sum())
