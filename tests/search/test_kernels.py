@@ -43,7 +43,7 @@ class View:
     def sides(self, a: np.ndarray | None = None, b: np.ndarray | None = None) -> tuple[tuple, tuple]:
         """Both sides with these weights, 1 by default, any labels, and points that are seen from everywhere."""
         one, free = np.ones(60, np.float32), np.full(60, -1, np.int32)
-        points, everything = self.points.T.astype(np.float32).copy(), np.repeat([[0], [60], [0], [0]], 60, 1)
+        points, everything = self.points.T.astype(np.float32).copy(), np.array([[0, 60, 0, 60]], np.uintp)
         return (
             tuple(WeightedBearings(self.offsets, one if a is None else a, one, free)),
             tuple(
@@ -52,7 +52,7 @@ class View:
                     one if b is None else b,
                     one,
                     free,
-                    everything.astype(np.uintp),
+                    everything,
                     np.empty((6, 0), np.float32),
                 )
             ),
@@ -66,10 +66,9 @@ class View:
 @pytest.mark.parametrize("relative", [0.3, 0.05])
 def test_the_assignment_on_clusters_is_the_product_form(entry: Any, spread: float, relative: float) -> None:
     view, scale, outlier = View(spread), relative * spread, 0.07
-    q = np.empty((4, 60), np.float32)
-    kernel, scratch = np.empty((60, 60), np.float32), np.empty((2, 60), np.float32)
+    *scratch, q, _, _ = dense_scratch(60, 60)
     likelihood = entry(assign)(
-        *view.sides(view.a, view.b), view.b, *view.pose(), np.float32(scale), np.float32(outlier), kernel, *scratch, q
+        *view.sides(view.a, view.b), view.b, *view.pose(), np.float32(scale), np.float32(outlier), *scratch, q
     )  # fmt: skip
     a, b, u = view.a.astype(float), view.b.astype(float), view.directions()
     k = np.maximum(1 - cdist(view.bearings, u, "sqeuclidean") / (2 * scale**2 * POWER), 0) ** POWER
@@ -94,9 +93,8 @@ def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(en
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
     dense = entry(assign)(
-        bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier),
-        np.empty((60, 60), np.float32), column, column.copy(), q,
-    )  # fmt: skip
+        bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier), *dense_scratch(60, 60)[:-2]
+    )
     assert dense == pytest.approx(likelihood, abs=0.1)
 
 

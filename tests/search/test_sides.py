@@ -138,12 +138,12 @@ def test_clusters_keep_labels_weights_and_the_sides_of_a_thin_wall() -> None:
     for label in range(-1, 3):
         total = scores[labels == label].sum()
         assert seen.b[seen.label == label].sum() == pytest.approx(total, rel=0.15)  # of a sample
-    # Partners are the bearings of a point's label, those of any label, and all for a point of any label.
-    for j, label in enumerate(seen.label):
-        first, last = seen.partners[::2, j], seen.partners[1::2, j]
-        mine = np.concatenate([np.arange(a, b) for a, b in zip(first, last, strict=True)])
-        fits = (image.label == label) | (image.label < 0) | (label < 0)
-        np.testing.assert_array_equal(mine, np.flatnonzero(fits))
+    # The blocks are the pairs of one label and those of which one is free, each of them once.
+    fitting = np.zeros((len(image.label), len(seen.label)), int)
+    for first, last, start, stop in seen.blocks:
+        fitting[first:last, start:stop] += 1
+    one, other = image.label[:, None], seen.label
+    np.testing.assert_array_equal(fitting, (one == other) | (one < 0) | (other < 0))
 
 
 def test_a_point_of_another_label_neither_matches_nor_pulls() -> None:

@@ -112,7 +112,7 @@ def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: A
 
 @part
 def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
-    """The first rows of u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
+    """u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
     for j in range(p.shape[1]):
         x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
         x, y, z, _ = direction(x + translation[0], y + translation[1], z + translation[2])
@@ -121,30 +121,34 @@ def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
 
 @part
 def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
-           kernel: Any, base: Any, row: Any, q: Any) -> Any:  # fmt: skip
+           kernel: Any, base: Any, row: Any, u: Any, column: Any, q: Any) -> Any:  # fmt: skip
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
 
     The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2: within 3 % of exp(z) where it exceeds 0.02, and without a
-    call. bearings, points: a `WeightedBearings` and a `WeightedPoints` as tuples, the bearings in the order of their
-    labels. weight (n,): of the points under this pose. scale: s, radians. outlier: o of `Scene.outlier_density`.
-    kernel (n, m), base (m,), row (m,): scratch.
+    call. bearings, points: a `WeightedBearings` and a `WeightedPoints` as tuples, both in the order of their labels.
+    weight (n,): of the points under this pose. scale: s, radians. outlier: o of `Scene.outlier_density`. kernel (n, m),
+    base (m,), row (m,), u (3, n), column (n,): scratch.
     """
     f, a, odds2d = bearings[0], bearings[1], bearings[2]
-    p, odds3d, partners = points[0], points[2], points[4]
+    p, odds3d, blocks = points[0], points[2], points[4]
     m, n = f.shape[1], p.shape[1]
     total_a, total_b = sum_of(a), sum_of(weight) + F(1e-20)
     sharp = F(1) / (scale * scale * F(POWER))
     for i in range(m):
         row[i] = outlier * total_b * odds2d[i]
         base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
-    directions(p, rotation, translation, q)
+    directions(p, rotation, translation, u)
     for j in range(n):
-        x, y, z = q[0, j], q[1, j], q[2, j]
-        shift = F(-0.5) * sharp * (x * x + y * y + z * z)
-        x, y, z = sharp * x, sharp * y, sharp * z
-        column, b, line = F(0), weight[j], kernel[j]
-        for block in range(2):
-            for i in range(partners[2 * block, j], partners[2 * block + 1, j]):
+        column[j] = outlier * total_a * odds3d[j]
+        q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
+    for k in range(len(blocks)):
+        first, last = blocks[k, 0], blocks[k, 1]
+        for j in range(blocks[k, 2], blocks[k, 3]):
+            x, y, z = u[0, j], u[1, j], u[2, j]
+            shift = F(-0.5) * sharp * (x * x + y * y + z * z)
+            x, y, z = sharp * x, sharp * y, sharp * z
+            total, b, line = F(0), weight[j], kernel[j]
+            for i in range(first, last):
                 v = max(base[i] + shift + f[0, i] * x + f[1, i] * y + f[2, i] * z, F(LEAST))
                 v = v * v
                 v = v * v
@@ -155,27 +159,28 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
                 v = v * v
                 v = v * v
                 line[i] = v
-                column += a[i] * v
+                total += a[i] * v
                 row[i] += b * v
-        q[3, j] = column
+            column[j] += total
     likelihood = F(0)
     for i in range(m):
         likelihood += a[i] * math.log(row[i] / (total_b * scale * scale))
         row[i] = a[i] / row[i]
-    for j in range(n):
-        b, line = weight[j] / (q[3, j] + outlier * total_a * odds3d[j]), kernel[j]
-        q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
-        for block in range(2):
-            for i in range(partners[2 * block, j], partners[2 * block + 1, j]):
+    for k in range(len(blocks)):
+        first, last = blocks[k, 0], blocks[k, 1]
+        for j in range(blocks[k, 2], blocks[k, 3]):
+            b, line = weight[j] / column[j], kernel[j]
+            q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
+            for i in range(first, last):
                 v = line[i] * line[i] * row[i]
                 q0 += v * f[0, i]
                 q1 += v * f[1, i]
                 q2 += v * f[2, i]
                 q3 += v
-        q[0, j] = (q0 - q3 * q[0, j]) * b
-        q[1, j] = (q1 - q3 * q[1, j]) * b
-        q[2, j] = (q2 - q3 * q[2, j]) * b
-        q[3, j] = q3 * b
+            q[0, j] += (q0 - q3 * u[0, j]) * b
+            q[1, j] += (q1 - q3 * u[1, j]) * b
+            q[2, j] += (q2 - q3 * u[2, j]) * b
+            q[3, j] += q3 * b
     return likelihood / total_a
 
 
@@ -188,14 +193,14 @@ def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales:
     not fix. bearings, points: as for `assign`. outlier: o / s^2 of `Scene.outlier_density`. scratch: `dense_scratch`.
     """
     p = points[0]
-    kernel, base, row, q, weight, system = scratch
+    kernel, base, row, u, column, q, weight, system = scratch
     for k in range(len(rotation)):
         for step in range(len(scales)):
             scale = scales[step]
             visible_weights(points, rotation[k], translation[k], weight)
             score[k] = assign(
                 bearings, points, weight, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base,
-                row, q,
+                row, u, column, q,
             )  # fmt: skip
             fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), system)
             if not (fixed and math.isfinite(score[k])):
@@ -205,4 +210,4 @@ def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales:
 
 def dense_scratch(m: int, n: int) -> tuple[NDArray[np.float32], ...]:
     """What `descend` overwrites, for m bearings and n points."""
-    return tuple(np.empty(shape, F) for shape in ((n, m), m, m, (4, n), n, (8, 6)))
+    return tuple(np.empty(shape, F) for shape in ((n, m), m, m, (3, n), n, (4, n), n, (8, 6)))

@@ -101,22 +101,28 @@ def lloyd(
 
 
 def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[WeightedBearings, WeightedPoints]:
-    """Both sides as the compiled loops read them; on clusters the bearings have to be in the order of their labels."""
-    m, any_label = len(bearings.labels), int(np.searchsorted(bearings.labels, 0))
-    first, last = (np.searchsorted(bearings.labels, points.labels, side) for side in ("left", "right"))
-    free = points.labels < 0
-    partners = np.stack([
-        np.zeros(len(free), np.int64), np.where(free, m, any_label), np.where(free, 0, first), np.where(free, 0, last)
-    ])  # fmt: skip
+    """Both sides as the compiled loops read them; clusters of either side have to be in the order of their labels."""
     return (
         WeightedBearings(
             np.ascontiguousarray(bearings.points.T), bearings.weights, _fitting(bearings, points), bearings.labels
         ),
         WeightedPoints(
             np.ascontiguousarray(points.points.T), points.weights, _fitting(points, bearings), points.labels,
-            partners.astype(np.uintp), _cones(points, facing),
+            _blocks(bearings.labels, points.labels), _cones(points, facing),
         ),
     )  # fmt: skip
+
+
+def _blocks(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArray[np.uintp]:
+    """(k, 4) as `WeightedPoints` has them, of labels in ascending order."""
+    blocks, free = [], int(np.searchsorted(labels2d, 0))
+    for label in np.unique(labels3d):
+        own = np.searchsorted(labels3d, (label, label + 1))
+        if label < 0:
+            blocks.append((0, len(labels2d), *own))
+        else:
+            blocks += [(0, free, *own), (*np.searchsorted(labels2d, (label, label + 1)), *own)]
+    return np.array(blocks, np.uintp)
 
 
 def _fitting(side: Side, other: Side) -> Array:

@@ -33,7 +33,8 @@ class WeightedBearings(NamedTuple):
 class WeightedPoints(NamedTuple):
     """p: (3, n). b: (n,) weights. odds: (n,) share of the bearings that can be its partner. label: (n,), -1 fits any.
 
-    partners: (4, n) the bearings between partners[0] and [1], and those between [2] and [3], are of its label.
+    blocks: (k, 4) of bearings and points in the order of their labels, those from blocks[:, 0] to [:, 1] and from
+    [:, 2] to [:, 3] fit.
     cones: (6, n), v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the
     camera's centre; (6, 0) if all points are seen from everywhere.
     """
@@ -42,7 +43,7 @@ class WeightedPoints(NamedTuple):
     b: Array
     odds: Array
     label: NDArray[np.int32]
-    partners: NDArray[np.uintp]
+    blocks: NDArray[np.uintp]
     cones: Array
 
 
