@@ -39,7 +39,7 @@ def top_pairs(
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
     count = torch.minimum((pairs_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
     scores = assignment.detach()
-    if not (unpadded(real2d) and unpadded(real3d)):
+    if not all(mask is None or unpadded(mask) for mask in (mask2d, mask3d)):
         scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
     k = min(max(1, int(pairs_factor * min(m, n))), m * n)
     flat = scores.flatten(1).topk(k, dim=-1).indices

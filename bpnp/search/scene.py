@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.kernels.raster import Raster
-from bpnp.search.kernels.sides import FORWARD, kernel_sides, side_of, with_partners
+from bpnp.search.kernels.sides import FORWARD, blocks_of, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.tiles import Tiles, build_tiles
 from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 from bpnp.search.point_sets import PointSets
@@ -82,12 +82,13 @@ class Scene:
         return turn, translation.astype(np.float64) * self.size @ self.frame - turn @ self.centre
 
     def clusters(self, count: int) -> tuple[WeightedBearings, WeightedPoints]:
-        """Both sides in about `count` clusters each."""
+        """Both sides in about `count` clusters each, in the order of their labels."""
         image = self.image.clustered(count, self.settings, self.rng)
         f = image.points.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
         unit = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
         seen = self.seen.clustered(count, self.settings, self.rng)
-        return kernel_sides(image._replace(points=unit), seen, self.settings.facing)
+        bearings, points = kernel_sides(image._replace(points=unit), seen, self.settings.facing)
+        return bearings, points._replace(blocks=blocks_of(image.labels, seen.labels))
 
     def sides(self, bearings: int | None = None, points: int | None = None) -> tuple[WeightedBearings, WeightedPoints]:
         """All points of both sides, or so many of them."""

@@ -51,12 +51,13 @@ def contested_by(candidates: Candidates, sets: PointSets, rule: Evidence) -> int
     if not len(others):
         return -1
     best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
+    first = _partners(sets, *(x[0] for x in (*poses, scales)))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
         squared = float((gap**2).sum())
         if max(float(gap.sum()), 0.0) ** 2 >= least * squared or float(np.abs(gap).sum()) ** 2 < least * squared:
             continue
-        first, other = (_partners(sets, *(x[i] for x in (*poses, scales))) for i in (0, k))
+        other = _partners(sets, *(x[k] for x in (*poses, scales)))
         reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         own, others_own = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())

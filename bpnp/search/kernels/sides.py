@@ -101,19 +101,19 @@ def lloyd(
 
 
 def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[WeightedBearings, WeightedPoints]:
-    """Both sides as the compiled loops read them; clusters of either side have to be in the order of their labels."""
+    """Both sides as the compiled loops read them, before there are blocks (`blocks_of`)."""
     return (
         WeightedBearings(
             np.ascontiguousarray(bearings.points.T), bearings.weights, _fitting(bearings, points), bearings.labels
         ),
         WeightedPoints(
             np.ascontiguousarray(points.points.T), points.weights, _fitting(points, bearings), points.labels,
-            _blocks(bearings.labels, points.labels), _cones(points, facing),
+            np.empty((0, 4), np.uintp), _cones(points, facing),
         ),
     )  # fmt: skip
 
 
-def _blocks(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArray[np.uintp]:
+def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArray[np.uintp]:
     """(k, 4) as `WeightedPoints` has them, of labels in ascending order."""
     blocks, free = [], int(np.searchsorted(labels2d, 0))
     for label in np.unique(labels3d):

@@ -40,9 +40,8 @@ class Tiles(NamedTuple):
 
     def with_margin(self, scale: float) -> "Tiles":
         """With a grid over the bearings and as much around them as a kernel of this scale reaches, radians."""
-        low, high = (edge(self.box[:, side], 0) for edge, side in ((np.min, np.s_[:2]), (np.max, np.s_[2:])))
         margin = F(REACH * scale)
-        low, high = low - margin, high + margin
+        low, high = self.box[:, :2].min(0) - margin, self.box[:, 2:].max(0) + margin
         cell = F((high - low).max() / CELLS)
         return self._replace(low=low, cell=cell, shape=np.floor((high - low) / cell).astype(np.int32) + 1)
 

@@ -33,8 +33,8 @@ class WeightedBearings(NamedTuple):
 class WeightedPoints(NamedTuple):
     """p: (3, n). b: (n,) weights. odds: (n,) share of the bearings that can be its partner. label: (n,), -1 fits any.
 
-    blocks: (k, 4) of bearings and points in the order of their labels, those from blocks[:, 0] to [:, 1] and from
-    [:, 2] to [:, 3] fit.
+    blocks: (k, 4) of clusters, which are in the order of their labels: the bearings from blocks[:, 0] to [:, 1] fit the
+    points from [:, 2] to [:, 3].
     cones: (6, n), v_j = min(max((cones[:3, j] . C + cones[3, j]) / |C - p_j| + cones[4, j], cones[5, j]), 1), C the
     camera's centre; (6, 0) if all points are seen from everywhere.
     """
