@@ -12,7 +12,8 @@ from bpnp.types import unpadded
 class ResidualBlock(nn.Module):
     """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm, optionally followed by a batch norm.
 
-    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product.
+    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product. Where x itself is
+    a linear map of the points' coordinates, its narrow matrix is a factor too.
     """
 
     def __init__(self, channels: int, *, batch_norm: bool) -> None:
@@ -23,20 +24,28 @@ class ResidualBlock(nn.Module):
         self.norm_b = MaskedBatchNorm(channels) if batch_norm else None
         self.norm_c = MaskedBatchNorm(channels) if batch_norm else None
 
-    def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
-        """mask: None where nothing is padded."""
-        z = pointwise_norm(x, *self._first_map(), mask)
+    def forward(
+        self,
+        x: Float[Tensor, "b k c"],
+        mask: Bool[Tensor, "b k"] | None,
+        entered: tuple[Float[Tensor, "b k d"], nn.Linear] | None = None,
+    ) -> Float[Tensor, "b k c"]:
+        """mask: None where nothing is padded. entered: coordinates that x is a linear map of, and the map."""
+        z = pointwise_norm(x if entered is None else entered[0], *self._first_map(entered), mask)
         c = self.linear_c
         if self.norm_b is None or self.norm_c is None:
             return pointwise_norm(z, c.weight, c.bias, mask, skip=x)
         z = pointwise_norm(self.norm_b(z, mask), c.weight, c.bias, mask)
         return x + torch.relu(self.norm_c(z, mask))
 
-    def _first_map(self) -> tuple[Tensor, Tensor]:
+    def _first_map(self, entered: tuple[Tensor, nn.Linear] | None) -> tuple[Tensor, Tensor]:
         """Weight and bias; under autocast, their product keeps its digits."""
-        a, b = self.linear_a, self.linear_b
-        with torch.autocast(a.weight.device.type, enabled=False):
-            return b.weight @ a.weight, torch.addmv(b.bias, b.weight, a.bias)
+        weight: Tensor = self.linear_b.weight
+        bias: Tensor = self.linear_b.bias
+        with torch.autocast(weight.device.type, enabled=False):
+            for inner in (self.linear_a,) if entered is None else (self.linear_a, entered[1]):
+                weight, bias = weight @ inner.weight, torch.addmv(bias, weight, inner.bias)
+        return weight, bias
 
 
 class PointFeatures(nn.Module):
@@ -62,8 +71,8 @@ class PointFeatures(nn.Module):
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         z, seen = self.enter(points), None if unpadded(mask) else mask
-        for block in self.blocks:
-            z = block(z, seen)
+        for k, block in enumerate(self.blocks):
+            z = block(z, seen, None if k else (points, self.enter))
         return nn.functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
 
 

@@ -8,7 +8,7 @@ import torch.distributed.nn.functional as collectives
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.models.nets.pointwise import pointwise
+from bpnp.models.nets.pointwise import gram, pointwise
 from bpnp.precision import full_precision
 
 ROUNDS = 20  # of reweighting, towards the point with the smallest sum of distances
@@ -99,16 +99,17 @@ def highest_normed(
             z = pointwise(x, torch.where(norm.weight < 0, -1, 1).unsqueeze(-1) * weight, None)
             z = z if mask is None else z.masked_fill(~mask.unsqueeze(-1), -torch.inf)
             place = nn.functional.adaptive_max_pool2d_with_indices(z.mT.unsqueeze(2), 1)[1].flatten(1)
-        points, real = x.flatten(0, 1), 1 if mask is None else mask.view(-1, 1)
+        points = x.flatten(0, 1)
         first = x.shape[1] * torch.arange(len(x), device=x.device).unsqueeze(-1)
         highest = (nn.functional.embedding(place + first, points) * weight).sum(2) + bias
         count = x.new_full((1,), len(points)) if mask is None else mask.sum().to(x.dtype).reshape(1)
-        centre = (points * real).sum(0) / count
+        seen = x if mask is None else x * mask.unsqueeze(-1)
+        centre = seen.sum((0, 1)) / count
         mean = weight @ centre + bias
 
         def scatter(about: Tensor) -> Tensor:
-            around = (points - centre) * real
-            return ((weight @ (around.mT @ around)) * weight).sum(1) + count * (mean - about) ** 2
+            around = x - centre if mask is None else seen - centre * mask.unsqueeze(-1)
+            return ((weight @ gram(around)) * weight).sum(1) + count * (mean - about) ** 2
 
         scale, shift = norm.factors(count, count * mean, scatter)
         return torch.addcmul(shift, highest, scale)

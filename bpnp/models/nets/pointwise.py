@@ -118,6 +118,23 @@ class _PointwiseNorm(torch.autograd.Function):
         return dx, dw, torch.zeros_like(dz[0, 0]), None, gradient if ctx.rectified else None
 
 
+class _Gram(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor) -> Tensor:
+        ctx.save_for_backward(x)
+        return _weight_gradient(x, x)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (x,) = ctx.saved_tensors
+        return pointwise(x, gradient + gradient.mT, None)
+
+
+def gram(x: Float[Tensor, "b k c"]) -> Float[Tensor, "c c"]:
+    """sum of x x^T over all points, by the kernels of `pointwise`; one product for its gradient."""
+    return _Gram.apply(x)
+
+
 def _weight_gradient(x: Float[Tensor, "b k c"], dz: Float[Tensor, "b k d"]) -> Float[Tensor, "d c"]:
     """sum of dz x^T over all points, by the kernels of `pointwise`."""
     if not x.is_cpu or x.dtype == torch.float64:
