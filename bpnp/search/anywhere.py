@@ -2,20 +2,21 @@
 
 A point with a cone is seen by cameras within it. So a start takes a point, a direction within its cone, a distance and
 a roll: four numbers instead of the six of a pose. The other two say where the camera looks, and all of them are tried
-at once: the score of `bpnp.search.nearby`, as a function of the shift of the points in the image, is the correlation of
-a histogram of their places with the raster of the view, by fast Fourier transforms.
+at once: the score of `bpnp.search.nearby`, as a function of the shift of the points in the image, is a sum of copies of
+the view's raster, each shifted to the place of a point.
 """
 
+import math
 from dataclasses import replace
 
 import numpy as np
-import scipy.fft
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.compilation import in_time
 from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.raster import Raster, count_places
+from bpnp.search.kernels.raster import Raster, add_shifted
+from bpnp.search.kernels.tiles import LANES
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.nearby import narrowed, raster_of
 from bpnp.search.scene import Scene
@@ -23,7 +24,7 @@ from bpnp.search.settings import Nearby
 from bpnp.search.starts import Array
 
 LOG_DEPTH = 0.7  # of the weak-perspective distance: half to twice of it
-AT_ONCE = 256  # histograms in memory; of 64 x 64 cells 4 MB
+AT_ONCE = 64  # scores of so many poses in memory; for 64 x 64 shifts 1 MB
 
 
 def anywhere(scene: Scene, rule: Nearby) -> Candidates:
@@ -64,23 +65,16 @@ def drawn_in_cones(scene: Scene, count: int) -> Candidates:
 
 
 def best_shifts(poses: Candidates, raster: Raster, points: WeightedPoints) -> tuple[Array, Array]:
-    """The largest score (s,) of each pose over all shifts of its points in the raster, and that shift (s, 2).
-
-    The histogram is twice as wide as the raster; points beyond it are left out, and shifts by more than the raster's
-    width meet its other side again.
-    """
-    cells = scipy.fft.next_fast_len(2 * len(raster.values), real=True)
-    period = cells / raster.per_cell
-    counts = np.zeros((len(poses), cells, cells), np.float32)
-    weight = np.empty_like(points.b)
-    count_places(
-        counts, np.float32(period / 2), raster.per_cell, tuple(points), poses.rotation, poses.translation, weight
-    )
-    spectrum = np.conj(scipy.fft.rfft2(counts)) * scipy.fft.rfft2(raster.values, (cells, cells))
-    scores = scipy.fft.irfft2(spectrum, (cells, cells)).reshape(len(poses), -1)
+    """The largest score (s,) of each pose over all shifts of its points by up to half of the raster, and that shift
+    (s, 2), whole cells."""
+    count = LANES * math.ceil(len(raster.values) / LANES)
+    padded = np.pad(raster.values, ((0, 0), (count, count)))
+    half = np.float32(raster.half + count / 2 / raster.per_cell)
+    scores, weight = np.zeros((len(poses), count, count), np.float32), np.empty_like(points.b)
+    add_shifted(scores, padded, half, raster.per_cell, tuple(points), poses.rotation, poses.translation, weight)
+    scores = scores.reshape(len(poses), -1)
     best = scores.argmax(1)
-    cell = np.stack([best % cells, best // cells], -1)
-    shift = (cell / raster.per_cell - raster.half + period) % period - period / 2
+    shift = (np.stack([best % count, best // count], -1) - count // 2) / raster.per_cell
     return scores[np.arange(len(poses)), best], shift.astype(np.float32)
 
 

@@ -133,8 +133,8 @@ def looked_up(
     side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
-        weight = np.empty_like(points.b)
-        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight)
+        weight, cell = np.empty_like(points.b), np.empty(len(points.b), np.int32)
+        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight, cell)
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
@@ -161,6 +161,7 @@ def _drawn_raster(scene: Scene, rule: Nearby, scale: float) -> Raster:
     wide = rule.background * scale * per_cell
     near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
     inside = around > INSIDE * around.max()
+    inside[[0, -1]] = inside[:, [0, -1]] = False
     gain = np.log(rule.outliers + (1 - rule.outliers) * near / np.where(inside, around, 1))
     seen = inside.astype(np.float32)
     mean = _smoothed(seen * gain, wide) / np.maximum(_smoothed(seen, wide), 1e-6)

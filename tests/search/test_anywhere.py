@@ -52,6 +52,23 @@ def test_a_camera_that_looks_beside_the_scene_is_aimed_at_it() -> None:
     assert shifted(aimed, -shift).rotation[0] == pytest.approx(aside.rotation[0], abs=1e-2)
 
 
+def test_the_best_shift_is_that_of_the_largest_sum_of_the_raster_over_all() -> None:
+    bearings, points, *pose = view_with_outliers(np.random.default_rng(2), 100, 100)
+    scene = Scene(PointSets(bearings, points), 0, DEFAULT)
+    raster = raster_of(scene, replace(DEFAULT.nearby, cells=1.0), 0.1)
+    turn, moved = scene.enter(*pose)
+    beside = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.1, 0], [0.3, 0, 1]]).as_matrix().astype(np.float32)
+    scores, shifts = best_shifts(Candidates.unscored(beside @ turn, beside @ moved), raster, scene.sides()[1])
+    padded = np.pad(raster.values, 100)
+    for score, shift, turned in zip(scores, shifts, beside, strict=True):
+        u = directions((scene.points3d @ turn.T + moved) @ turned.T)
+        at = np.floor((2 * u[:, :2] / (1 + u[:, 2:]) + raster.half) * raster.per_cell).astype(int) + 100
+        steps = np.arange(-len(raster.values) // 2, len(raster.values) // 2)
+        sums = {(c, r): padded[at[:, 1] + r, at[:, 0] + c].sum() for c in steps for r in steps}
+        assert score == pytest.approx(max(sums.values()), abs=1e-3)
+        assert score == pytest.approx(sums[tuple(np.rint(shift * raster.per_cell))], abs=1e-3)
+
+
 def test_starts_see_a_point_within_its_cone_and_the_middle_in_front() -> None:
     sets, *_ = seen_in_cones(1, true=60, outliers=60)
     scene = Scene(sets, 0, DEFAULT)

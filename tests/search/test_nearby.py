@@ -117,7 +117,8 @@ def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
 
     poses = drawn_around(scene, PosePrior(*right, 0.0, 0.0), 2)
     score, weight = np.empty(2, np.float32), np.empty(len(points), np.float32)
-    add_up(*raster, tuple(scene.sides()[1]), poses.rotation, poses.translation, score, weight)
+    cell = np.empty(len(points), np.int32)
+    add_up(*raster, tuple(scene.sides()[1]), poses.rotation, poses.translation, score, weight, cell)
     np.testing.assert_allclose(score, expected, rtol=2e-2)
 
 

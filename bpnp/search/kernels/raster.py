@@ -1,4 +1,5 @@
-"""Poses scored by looking up where each point falls in a raster of the view: one addition a point; or these places.
+"""Poses scored by looking up where each point falls in a raster of the view: one addition a point; or for all shifts
+of the points at once, one row of the raster a point and row.
 
 Arrays are float32 and coordinate-major. A direction u has the coordinates 2 (u_x, u_y) / (1 + u_z) in the raster, the
 stereographic projection around (0, 0, 1), which keeps small shapes and covers every field of view.
@@ -32,34 +33,45 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 @compiled
 def add_up(raster: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, score: Any,
-           weight: Any) -> None:  # fmt: skip
+           weight: Any, cell: Any) -> None:  # fmt: skip
     """score (S,): the sum of the points' weights times the raster's values where pose k sees them, 0 outside it.
 
     points: a `WeightedPoints` as a tuple, whose labels are ignored.
-    raster (g, g), rows are y. Its first cell begins at -half in both coordinates; per_cell cells a unit.
-    rotation (S, 3, 3), translation (S, 3). weight (n,): overwritten.
+    raster (g, g), rows are y; its outermost cells are 0. The first one begins at -half in both coordinates; per_cell
+    cells a unit. rotation (S, 3, 3), translation (S, 3). weight (n,), cell (n,) int32: overwritten.
     """
-    cells, visible = raster.shape[0], points[1]
+    cells, values = np.int32(len(raster)), raster.reshape(-1)
+    last = F(cells - 1)
     for k in range(len(rotation)):
-        if points[5].shape[1]:
-            visible_weights(points, rotation[k], translation[k], weight)
-            visible = weight
-        total = F(0)
-        for j in range(len(visible)):
+        visible_weights(points, rotation[k], translation[k], weight)
+        for j in range(len(cell)):  # in a loop of its own, without a branch: several points at once
             column, row = place(half, per_cell, points[0], j, rotation[k], translation[k])
-            if column >= 0 and row >= 0 and column < cells and row < cells:
-                total += visible[j] * raster[int(row), int(column)]
+            column = column if column > F(0) else F(0)  # NaN too
+            row = row if row > F(0) else F(0)
+            cell[j] = np.int32(min(row, last)) * cells + np.int32(min(column, last))
+        total = F(0)
+        for j in range(len(cell)):
+            total += weight[j] * values[np.uintp(cell[j])]
         score[k] = total
 
 
 @compiled
-def count_places(counts: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any,
-                 weight: Any) -> None:  # fmt: skip
-    """counts (S, g, g): the points' weights are added to the cells where pose k sees them; the rest as in `add_up`."""
-    cells = counts.shape[1]
-    for k in range(len(rotation)):
-        visible_weights(points, rotation[k], translation[k], weight)
+def add_shifted(scores: Any, padded: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any,
+                weight: Any) -> None:  # fmt: skip
+    """scores (S, k, k): to [s, r, c] what `add_up` gives pose s if its points move by r - k/2 rows, c - k/2 columns.
+
+    padded (g, g + 2 k): the raster, k columns of 0 on each side. half: that of k more cells. The rest as in `add_up`.
+    """
+    shifts, rows, across = scores.shape[1], len(padded), padded.shape[1]
+    values, last = padded.reshape(-1), F(rows + shifts)
+    for s in range(len(rotation)):
+        visible_weights(points, rotation[s], translation[s], weight)
+        sums = scores[s].reshape(-1)
         for j in range(len(weight)):
-            column, row = place(half, per_cell, points[0], j, rotation[k], translation[k])
-            if column >= 0 and row >= 0 and column < cells and row < cells:
-                counts[k, int(row), int(column)] += weight[j]
+            column, row = place(half, per_cell, points[0], j, rotation[s], translation[s])
+            if column >= 0 and row >= 0 and column < last and row < last:
+                b, above = weight[j], int(row) - shifts
+                for r in range(max(0, -above), min(shifts, rows - above)):
+                    first, value = np.uintp(r * shifts), np.uintp((above + r) * across + int(column))
+                    for c in range(np.uintp(shifts)):
+                        sums[first + c] += b * values[value + c]
