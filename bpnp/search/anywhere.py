@@ -72,10 +72,10 @@ def best_shifts(poses: Candidates, raster: Raster, points: WeightedPoints) -> tu
     half = np.float32(raster.half + count / 2 / raster.per_cell)
     scores, weight = np.zeros((len(poses), count, count), np.float32), np.empty_like(points.b)
     add_shifted(scores, padded, half, raster.per_cell, tuple(points), poses.rotation, poses.translation, weight)
-    scores = scores.reshape(len(poses), -1)
-    best = scores.argmax(1)
+    flat = scores.reshape(len(poses), -1)
+    best = flat.argmax(1)
     shift = (np.stack([best % count, best // count], -1) - count // 2) / raster.per_cell
-    return scores[np.arange(len(poses)), best], shift.astype(np.float32)
+    return flat[np.arange(len(poses)), best], shift.astype(np.float32)
 
 
 def shifted(poses: Candidates, shift: Array) -> Candidates:
