@@ -1,6 +1,7 @@
 """The stages of the search: starts annealed on coarse clusters, the best on finer ones, few on all points."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,41 +12,51 @@ from bpnp.compilation import in_time
 from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
-from bpnp.search.scene import Scene
-from bpnp.search.settings import ClusterStage, Stages
+from bpnp.search.scene import Scene, Sides
+from bpnp.search.settings import Stages
 from bpnp.search.starts import Array
 
 
 def run_batch(scene: Scene, poses: Candidates, coarse: Stages, best: Candidates) -> Candidates:
     """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    starts = len(poses)
-    for stage in coarse:
-        poses = anneal_on_clusters(scene, poses, stage, scene.settings.kept_by(stage, starts))
-    return anneal_further(scene, Candidates.concatenated([poses, shaken(scene, best)]), starts)
+    starts, middle = len(poses), scene.settings.middle
+    sides = scene.clusters([stage.clusters for stage in (*coarse, *middle)])
+    poses = anneal_on_clusters(scene, poses, coarse, sides[: len(coarse)], starts)
+    poses = Candidates.concatenated([poses, shaken(scene, best)])
+    poses = anneal_on_clusters(scene, poses, middle, sides[len(coarse) :], starts)
+    return anneal_on_points(scene, poses, middle[-1].last_scale * scene.spread)
 
 
-def anneal_further(scene: Scene, poses: Candidates, starts: int) -> Candidates:
-    """From coarse poses of a batch of so many starts through the finer clusters to all points."""
-    settings = scene.settings
-    for stage in settings.middle:
-        poses = anneal_on_clusters(scene, poses, stage, settings.kept_by(stage, starts))
-    return anneal_on_points(scene, poses, settings.middle[-1].last_scale * scene.spread)
+def anneal_on_clusters(
+    scene: Scene, poses: Candidates, stages: Stages, sides: Sequence[Sides], starts: int
+) -> Candidates:
+    """Poses of a batch of so many starts after stages on clusters of their own, best first, of different rotations."""
+    outlier = scene.outlier_density(scene.settings.outliers)
+    for stage, clusters in zip(stages, sides, strict=True):
+        kept = scene.settings.kept_by(stage, starts)
+        scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
+        for part in np.split(scales, stage.halvings):
+            if part[0] != scales[0]:
+                half = np.argsort(-poses.score, kind="stable")[: max(len(poses) // 2, 2 * kept)]
+                poses = poses[np.sort(half)]
+            poses = _annealed(scene, poses, clusters, part, outlier)
+        poses = best_distinct(poses, scene, kept, degrees=stage.apart_deg, shift=math.inf)
+    return poses
 
 
-def anneal_on_clusters(scene: Scene, starts: Candidates, stage: ClusterStage, kept: int) -> Candidates:
-    """The `kept` likeliest poses that `starts` reach on the clusters, best first, of different rotations."""
-    bearings, points = scene.clusters(stage.clusters)
-    sides, outlier = (tuple(bearings), tuple(points)), scene.outlier_density(scene.settings.outliers)
-    scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
+def _annealed(scene: Scene, starts: Candidates, sides: Sides, scales: Array, outlier: np.float32) -> Candidates:
+    """The poses for which there was time, after a step at each of the scales (k,), radians."""
+    bearings, points = sides
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
         scratch = dense_scratch(len(bearings.a), len(points.b))
-        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
+        descend(
+            tuple(bearings), tuple(points), rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch
+        )  # fmt: skip
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
-    ends = replace(starts, rotation=rotation, translation=translation, score=score)[:done]
-    return best_distinct(ends, scene, kept, degrees=stage.apart_deg, shift=math.inf)
+    return replace(starts, rotation=rotation, translation=translation, score=score)[:done]
 
 
 def anneal_on_points(

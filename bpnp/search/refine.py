@@ -7,12 +7,12 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.compilation import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_further, anneal_on_clusters, anneal_on_points, finish, shaken
+from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings, Stages
 from bpnp.search.verdict import SearchResult, judged, no_pose
 
 
@@ -40,15 +40,20 @@ def refine_poses(
         return no_pose("no start, or points that fix no pose")
     crowd = len(starts)
     if crowd > settings.refined_directly:
-        for stage in (*settings.coarse, *settings.middle):
-            starts = anneal_on_clusters(scene, starts, stage, stage.kept)
+        starts = _on_clusters(scene, starts, (*settings.coarse, *settings.middle))
     around = Candidates.concatenated([starts, shaken(scene, starts)])
-    clustered = anneal_further(scene, around, settings.starts)
+    first_scale = settings.middle[-1].last_scale * scene.spread
+    clustered = anneal_on_points(scene, _on_clusters(scene, around, settings.middle), first_scale)
     # A start that is right already needs no clusters, which would only shake it.
-    direct = anneal_on_points(scene, starts, settings.middle[-1].last_scale * scene.spread)
+    direct = anneal_on_points(scene, starts, first_scale)
     poses = finish(scene, merged([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
     return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
+
+
+def _on_clusters(scene: Scene, poses: Candidates, stages: Stages) -> Candidates:
+    sides = scene.clusters([stage.clusters for stage in stages])
+    return anneal_on_clusters(scene, poses, stages, sides, scene.settings.starts)
 
 
 @one_blas_thread

@@ -1,6 +1,7 @@
 """A pair of point sets as the search sees it: normalised, shuffled, and summed up in weighted clusters."""
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,7 @@ from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Nearby, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
+Sides = tuple[WeightedBearings, WeightedPoints]
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
@@ -81,16 +83,20 @@ class Scene:
         turn = self.frame.T @ Rotation.from_matrix(rotation.astype(np.float64)).as_matrix()
         return turn, translation.astype(np.float64) * self.size @ self.frame - turn @ self.centre
 
-    def clusters(self, count: int) -> tuple[WeightedBearings, WeightedPoints]:
-        """Both sides in about `count` clusters each, in the order of their labels."""
-        image = self.image.clustered(count, self.settings, self.rng)
-        f = image.points.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
-        unit = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
-        seen = self.seen.clustered(count, self.settings, self.rng)
-        bearings, points = kernel_sides(image._replace(points=unit), seen, self.settings.facing)
-        return bearings, points._replace(blocks=blocks_of(image.labels, seen.labels))
+    def clusters(self, counts: Sequence[int]) -> list[Sides]:
+        """Both sides in about so many clusters each, in the order of their labels: those of a count are clusters of
+        those of the next larger one."""
+        sides, image, seen = {}, self.image, self.seen
+        for count in sorted(set(counts), reverse=True):
+            image = image.clustered(count, self.settings, self.rng)
+            f = image.points.astype(np.float64) + FORWARD  # a mean of unit vectors is shorter
+            unit = (f / np.linalg.norm(f, axis=-1, keepdims=True) - FORWARD).astype(np.float32)
+            seen = seen.clustered(count, self.settings, self.rng)
+            bearings, points = kernel_sides(image._replace(points=unit), seen, self.settings.facing)
+            sides[count] = bearings, points._replace(blocks=blocks_of(image.labels, seen.labels))
+        return [sides[count] for count in counts]
 
-    def sides(self, bearings: int | None = None, points: int | None = None) -> tuple[WeightedBearings, WeightedPoints]:
+    def sides(self, bearings: int | None = None, points: int | None = None) -> Sides:
         """All points of both sides, or so many of them."""
         return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
 

@@ -23,6 +23,7 @@ class ClusterStage:
     clusters: of each side, at most; one iteration costs their number squared.
     first_scale, last_scale: in spreads of the bearings. iterations: from one to the other, a Gauss-Newton step each.
     kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
+    halvings: iterations after which the likelier half goes on; after fewer than 6 it lacks right poses in clutter.
     """
 
     clusters: int
@@ -31,6 +32,7 @@ class ClusterStage:
     iterations: int
     kept: int
     apart_deg: float
+    halvings: tuple[int, ...] = ()
 
 
 Stages = tuple[ClusterStage, ...]
@@ -78,9 +80,9 @@ class Nearby:
         the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
         factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
     copies: of a pose at each step. points_again: 3D points that are looked up there. halved: half of the poses go on
-        each time, the best copy of each, so that those of some do not crowd out the others.
-    annealed: on all points from the last scale. outliers: share without a partner, at least. cells: of the raster, a
-        scale; most_cells: a side. background: scales of the density that is chance. starts_a_check: of the clock.
+        each time, the best copy of each, so that some do not crowd out the others. annealed: on all points at the end.
+    outliers: share without a partner, at least. background: scales of the density that is chance.
+    cells: of the raster, a scale; most_cells: a side. starts_a_check: of the clock.
     """
 
     starts: int = 2**17
@@ -172,8 +174,7 @@ class SearchSettings:
         `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
-    sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
-    starts_a_check: starts that are annealed on clusters between two looks at the clock, if time is limited.
+    sampled: points a cluster that centres are computed from in lloyd_iterations. starts_a_check: on clusters, of time.
     """
 
     max_batches: int = 32
@@ -181,7 +182,7 @@ class SearchSettings:
     first_starts: int = 48
     least_kept: int = 3
     recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
-    coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0),)
+    coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0, halvings=(6, 8)),)
     middle: Stages = (
         ClusterStage(128, 0.1, 0.065, iterations=7, kept=24, apart_deg=1.0),
         ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
@@ -230,8 +231,7 @@ class SearchSettings:
     def expecting(self, clutter: float) -> "SearchSettings":
         """These settings where the share of the points without a partner is known. Raises ValueError outside [0, 1).
 
-        It is expected in all stages and the only one tried at the end, and a pose that matches the share `well_matched`
-        of the other points leaves a better one little to explain.
+        It is expected in all stages, the only one tried at the end, and `well_matched` is a share of the other points.
         """
         if not 0 <= clutter < 1:
             raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")

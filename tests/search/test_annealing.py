@@ -2,6 +2,7 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from planted import plant
 from bpnp.compilation import Deadline
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
+from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.sides import lloyd
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
@@ -29,6 +31,40 @@ def starts(scene: Scene, count: int) -> Candidates:
     return Candidates.unscored(
         *draw_poses(scene.spread, scene.bulk3d, count, DEFAULT.recipes[0], None, scene.rng), hits=1
     )
+
+
+def coarse(scene: Scene, begin: Candidates) -> Candidates:
+    """The ends of starts after the coarse stage."""
+    sides = scene.clusters([stage.clusters for stage in DEFAULT.coarse])
+    return anneal_on_clusters(scene, begin, DEFAULT.coarse, sides, DEFAULT.starts)
+
+
+def test_halving_keeps_the_likeliest_ends_and_anneals_fewer(scene: Scene, monkeypatch) -> None:
+    (stage,), sides = DEFAULT.coarse, scene.clusters([DEFAULT.coarse[0].clusters])
+    begin, steps = starts(scene, 1200), []
+
+    def counted(*arguments) -> None:
+        steps.append(len(arguments[2]) * len(arguments[4]))
+        descend(*arguments)
+
+    monkeypatch.setattr("bpnp.search.annealing.descend", counted)
+    ends = [
+        anneal_on_clusters(scene, begin, (replace(stage, halvings=halvings),), sides, DEFAULT.starts)
+        for halvings in ((), stage.halvings)
+    ]
+    assert steps[0] == 1200 * stage.iterations
+    assert sum(steps[1:]) < 0.8 * steps[0]
+    np.testing.assert_array_equal(ends[1].rotation[:10], ends[0].rotation[:10])
+    np.testing.assert_array_equal(ends[1].score[:10], ends[0].score[:10])
+
+
+def test_clusters_of_each_count_have_the_weight_of_all_points(scene: Scene) -> None:
+    few, many = scene.clusters([8, 64])
+    for smaller, larger in zip(few, many, strict=True):
+        assert len(smaller[1]) == 8
+        assert len(larger[1]) == 64
+        assert smaller[1].sum() == pytest.approx(300)
+        assert larger[1].sum() == pytest.approx(300)
 
 
 def test_a_deadline_is_so_many_seconds_from_now() -> None:
@@ -55,8 +91,8 @@ def test_every_stage_ends_soon_after_the_deadline_with_its_first_poses(scene: Sc
         function = getattr(__import__("bpnp.search.annealing", fromlist=[kernel]), kernel)
         monkeypatch.setattr(f"bpnp.search.annealing.{kernel}", counted(name, function))
     scene.deadline = PASSED
-    found = anneal_on_clusters(scene, starts(scene, 500), DEFAULT.coarse[0], 48)
-    assert annealed["clusters"] == DEFAULT.starts_a_check
+    found = coarse(scene, starts(scene, 500))
+    assert annealed["clusters"] == DEFAULT.starts_a_check * (1 + len(DEFAULT.coarse[0].halvings))
     assert len(found) > 0
     fine = anneal_on_points(scene, found[:5], 0.04 * scene.spread, every=True)
     assert 1 <= annealed["points"] < 5
@@ -71,7 +107,7 @@ def test_a_limit_that_is_not_reached_changes_nothing(scene: Scene) -> None:
     ends = []
     for scene.deadline in (Deadline(), Deadline.after(1e6)):
         scene.rng = np.random.default_rng(5)  # of the clusters
-        ends.append(anneal_on_clusters(scene, begin, DEFAULT.coarse[0], 48))
+        ends.append(coarse(scene, begin))
     np.testing.assert_array_equal(ends[0].rotation, ends[1].rotation)
     np.testing.assert_array_equal(ends[0].score, ends[1].score)
 

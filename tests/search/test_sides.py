@@ -27,7 +27,7 @@ def rays(image: Array) -> Array:
     return np.asarray(directions(homogeneous))
 
 
-def wall(seed: int, side: int = 250, seen: int = 120, background: int = 120) -> tuple[PointSets, Array]:
+def wall(seed: int, side: int = 250, seen: int = 120, background: int = 200) -> tuple[PointSets, Array]:
     """A wall with normals and other points on either face, of which the camera sees one; its rotation."""
     rng = np.random.default_rng(seed)
     rotation, facing = Rotation.random(rng=rng).as_matrix(), np.repeat([-1.0, 1.0], side)
@@ -131,7 +131,7 @@ def test_clusters_keep_labels_weights_and_the_sides_of_a_thin_wall() -> None:
     sets = PointSets(
         rays(rng.uniform(-0.3, 0.3, (500, 2))), points, normals, rng.integers(-1, 3, 500), labels, None, None, scores
     )
-    image, seen = Scene(sets, 0, DEFAULT).clusters(64)
+    ((image, seen),) = Scene(sets, 0, DEFAULT).clusters([64])
     assert max(len(image.label), len(seen.label)) <= 68
     slope = 1 / (2 * DEFAULT.facing.softness)
     assert (np.abs(seen.cones[2]) > 0.99 * slope).mean() > 0.9  # hardly a cluster has points of both faces
