@@ -1,10 +1,10 @@
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 import torch
 from torch import Tensor
 
-from bpnp.layers import laplacian
+from bpnp.layers import compiled, laplacian
 from bpnp.layers.compiled import conjugate_gradients
 from bpnp.layers.laplacian import solve_multipliers
 from bpnp.layers.plan import Plan
@@ -53,6 +53,22 @@ def test_solves_the_laplacian(shape: tuple[int, int, int], threads: int) -> None
     assert solved.all()
     torch.testing.assert_close((system @ x.unsqueeze(-1)).squeeze(-1), rhs, atol=1e-12, rtol=1e-9)
     torch.testing.assert_close(mean, (p @ x.unsqueeze(-1)).squeeze(-1) / p.sum(-1), atol=1e-9, rtol=1e-9)
+
+
+@pytest.mark.parametrize("sums", [laplacian.first_sums, compiled.first_sums])
+@pytest.mark.parametrize("shape", [(5, 300, 20), (2, 3, 2100)])
+def test_the_first_sums_are_those_of_the_formed_matrices(
+    sums: Callable[[Tensor, Tensor], tuple[Tensor, ...]], shape: tuple[int, int, int], threads: int
+) -> None:
+    p, v = plan(*shape), noise(*shape)
+    rows, cols, mean, rhs, degree = sums(p, v.mT.contiguous().mT)
+    torch.testing.assert_close((rows, cols), (p.sum(-1), p.sum(-2)))
+    torch.testing.assert_close(mean, torch.einsum("bmn,bmn->bm", p, v) / p.sum(-1))
+    torch.testing.assert_close(rhs, torch.einsum("bmn,bmn->bn", p, v - mean.unsqueeze(-1)))
+    torch.testing.assert_close(degree, laplacian_matrix(p).diagonal(dim1=-2, dim2=-1))
+    p[:, 1], p[:, :, 1] = 0, 0
+    rows, cols, mean, _, degree = sums(p, v)
+    assert not any(values[:, 1].any() for values in (rows, cols, mean, degree))
 
 
 def test_every_sample_stops_at_its_own_tolerance_whatever_its_neighbours(threads: int) -> None:
