@@ -159,11 +159,11 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
         stalled = pool.candidates.score[0] < best + rule.better
         bettered = bettered if stalled else searched
         best = float(pool.candidates.score[0])
-        leaders = pool.leaders()
-        # A pose that was just found may be an optimum beside a better one, which starts around it will find.
-        settled = stalled or is_unique(leaders, sets, rule)
-        if settled and (safe := pool.certain(leaders)) is not None:
-            return safe
+        if pool.is_settled():
+            leaders = pool.leaders()
+            # A pose that was just found may be an optimum beside a better one, which starts around it will find.
+            if (stalled or is_unique(leaders, sets, rule)) and (safe := pool.certain(leaders)) is not None:
+                return safe
         pool.turned = pool.different([pool.turned, found])
         exhausted = is_exhausted(pool.candidates, scene, 0.0 if near else searched - bettered)
         if near and pool.batches >= ROUND * rule.hits and not (pool.candidates.log10_false_alarms < 0).any():

@@ -12,7 +12,7 @@ from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Evidence
-from bpnp.search.verdict import SearchResult, is_certain, judged, weighed_leaders, with_false_alarms
+from bpnp.search.verdict import SearchResult, is_certain, is_settled, judged, weighed_leaders, with_false_alarms
 
 
 class Pool:
@@ -43,6 +43,11 @@ class Pool:
         """The best candidates as a verdict needs them; what chance says of them is kept."""
         self.candidates, leaders = weighed_leaders(self.candidates, self.scene, self.sets)
         return leaders
+
+    def is_settled(self) -> bool:
+        """Whether a verdict could be confident of one of the candidates: only then is there need to weigh them."""
+        each, rule = (self.candidates[k : k + 1] for k in range(len(self.candidates))), self.scene.settings.evidence
+        return any(is_settled(one, self.sets, rule, batches=self.batches) for one in each)
 
     def different(self, parts: list[Candidates]) -> Candidates:
         """The best poses of several sets of them, no two turned by less than `settings.beside_deg`."""

@@ -174,7 +174,7 @@ class SearchSettings:
         `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
-    sampled: points a cluster that centres are computed from in lloyd_iterations. starts_a_check: on clusters, of time.
+    sampled: points a cluster that lloyd_iterations start from. starts_a_check: starts between two looks at the clock.
     """
 
     max_batches: int = 32

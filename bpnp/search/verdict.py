@@ -123,11 +123,16 @@ def is_certain(
     """
     if not len(candidates):
         return False
-    well_matched = batches >= rule.hits and candidates.matched[0] >= rule.well_matched
-    repeated = int(candidates.hits[0]) >= (rule.well_matched_hits if well_matched else rule.hits)
-    found = exhaustive or repeated or is_unique(candidates, sets, rule)
+    found = exhaustive or is_settled(candidates, sets, rule, batches=batches)
     chance = float(candidates.log10_false_alarms[0]) <= rule.false_alarms
     return chance and found and not is_rough(candidates) and lead(candidates, sets, rule)[0] >= rule.lead
+
+
+def is_settled(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT.evidence, *, batches: int) -> bool:
+    """Whether enough batches of starts found the first candidate, or its matches are unique."""
+    well_matched = batches >= rule.hits and candidates.matched[0] >= rule.well_matched
+    repeated = int(candidates.hits[0]) >= (rule.well_matched_hits if well_matched else rule.hits)
+    return repeated or is_unique(candidates, sets, rule)
 
 
 def is_rough(candidates: Candidates) -> bool:

@@ -86,10 +86,9 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
             seen = directions_of(sets, rotations[k], translations[k])
             if int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
                 continue
-            evidence, ratio = _log_evidence(sets, seen), np.ones(len(sets.image.scales))
-            if scales is not None:
-                ratio = _ratio(sets.image, float(scales[k]))
+            ratio = np.ones(len(sets.image.scales)) if scales is None else _ratio(sets.image, float(scales[k]))
             own, rough = _is_own(ratio), ratio >= ROUGH
+            evidence = _log_evidence(sets, seen, int(own.argmax()))
             result.own[k] -= np.logaddexp.reduce(evidence[own]) / math.log(10)
             result.rough[k] -= np.logaddexp.reduce(evidence[rough], initial=-math.inf) / math.log(10)
     return result
@@ -118,8 +117,9 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
 def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
     """log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the share and the s within a
     factor of two of the scale of its residuals, radians, at which their sum is largest."""
-    terms = _terms(sets, directions_of(sets, rotation, translation))
-    terms = terms[:, _is_own(_ratio(sets.image, scale))].reshape(len(terms), -1)
+    own = np.flatnonzero(_is_own(_ratio(sets.image, scale)))
+    terms = _terms(sets, directions_of(sets, rotation, translation), int(own[0]))[:, : len(own)]
+    terms = terms.reshape(len(terms), -1)
     return np.asarray(terms[:, terms.sum(0).argmax()])
 
 
@@ -132,18 +132,21 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
     return (ratio >= 1 / OWN) & (ratio <= OWN)
 
 
-def _terms(sets: PointSets, seen: Array) -> Array:
-    """log x_i / c_i (k, S, W), clumps weighted, of points seen in directions (n, 3)."""
-    return np.asarray(sets.image.weights @ point_evidence(sets, seen, sets.image.scales, SHARES))
+def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
+    """log x_i / c_i (k, S', W), clumps weighted, at the scales from the finest one on, of points seen in directions
+    (n, 3)."""
+    image = sets.image
+    return np.asarray(image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], SHARES))
 
 
-def _log_evidence(sets: PointSets, seen: Array) -> Array:
+def _log_evidence(sets: PointSets, seen: Array, finest: int) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
-    points seen in directions (n, 3)."""
-    terms = _terms(sets, seen)
-    fixing = np.partition(terms * sets.image.together[:, :, None], len(terms) - FIXING, 0)[-FIXING:]
+    points seen in directions (n, 3); -inf at the scales before the finest one, which are not looked at."""
+    image, terms = sets.image, _terms(sets, seen, finest)
+    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - FIXING, 0)[-FIXING:]
     evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
-    return np.asarray(np.logaddexp.reduce(evidence, 1)) - math.log(evidence.size)
+    total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
+    return np.r_[np.full(finest, -math.inf), total]
 
 
 def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:
@@ -172,11 +175,10 @@ def _density(image: ImageStatistics, bearings: Array, directions: Array) -> Arra
         return np.full(len(bearings), mean)
     width2 = (OUTLINE * image.spread) ** 2
     # From the centre of the view float32 has the digits of a narrow one.
-    one, other = ((points - image.centre).astype(np.float32) for points in (bearings, some))
-    sharp = np.float32(0.5 / width2)
-    exponent = one @ (2 * sharp * other.T)
-    exponent -= sharp * (one * one).sum(1)[:, None]
-    exponent -= sharp * (other * other).sum(1)
-    kernel = np.exp(exponent, out=exponent).sum(1, dtype=np.float64)
+    one, other = ((points - image.centre) / math.sqrt(2 * width2) for points in (bearings, some))
+    one = np.column_stack([2 * one, -(one * one).sum(1), np.ones(len(one))]).astype(np.float32)
+    other = np.column_stack([other, np.ones(len(other)), -(other * other).sum(1)]).astype(np.float32)
+    exponent = one @ other.T
+    kernel = (np.exp(exponent, out=exponent) @ np.ones(len(other), np.float32)).astype(np.float64)
     smooth = kernel / (2 * math.pi * width2) * (len(directions) / len(some))
     return np.maximum(smooth, mean)
