@@ -21,7 +21,7 @@ from numba.core import event
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
-from numba.core.typed_passes import InlineOverloads, NopythonRewrites
+from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
 from numba.core.types import BaseFunction
 from numba.core.untyped_passes import InlineClosureLikes
 from threadpoolctl import ThreadpoolController
@@ -41,10 +41,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     ones call has no wrapper for Python (`no_cpython_wrapper`; a call from there ends the process), and is optimised and
     kept with its callers alone, which saves another quarter.
     """
-    options |= {"nogil": True, "no_cfunc_wrapper": True}
     part = "no_cpython_wrapper" in options
-    if part:
-        options["pipeline_class"] = _PartCompiler
+    options |= {"nogil": True, "no_cfunc_wrapper": True, "pipeline_class": _LoopCompiler}
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -64,6 +62,18 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
+class _LoopCode(JITCodeLibrary):
+    """The code of a loop, and of its wrapper for Python, which only takes arrays apart and is not optimised."""
+
+    def add_ir_module(self, ir_module: Any) -> None:
+        if ir_module.name == "wrapper":
+            for function in ir_module.functions:
+                if not function.is_declaration:
+                    function.attributes.add("noinline")
+                    function.attributes.add("optnone")
+        super().add_ir_module(ir_module)
+
+
 class _PartCode(JITCodeLibrary):
     """The code of a function that is linked into those that call it, as numba translated it."""
 
@@ -74,17 +84,23 @@ class _PartCode(JITCodeLibrary):
         self._finalized = True
 
 
-class _PartCompiler(Compiler):
-    """Compiles a function that only compiled ones call, without machine code of its own."""
+class _LoopCompiler(Compiler):
+    """Compiles a loop, or a part of one, which gets no machine code of its own."""
 
-    def __init__(self, typing: Any, target: Any, _: Any, *rest: Any) -> None:
-        super().__init__(typing, target, _PartCode(target.codegen(), "part"), *rest)
-        self.state.targetctx.get_executable = _without_machine_code
+    def __init__(self, typing: Any, target: Any, _: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
+        code = (_PartCode if flags.no_cpython_wrapper else _LoopCode)(target.codegen(), "loop")
+        code.enable_object_caching()
+        super().__init__(typing, target, code, args, result, flags, *rest)
+        if flags.no_cpython_wrapper:
+            self.state.targetctx.get_executable = _without_machine_code
 
     def define_pipelines(self) -> Any:
-        """Without the passes for closures, inlined functions and expressions of arrays, which these functions lack."""
+        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
+        the end of each variable's life, which matters where references are counted."""
         (pipeline,) = super().define_pipelines()
-        unused = InlineClosureLikes, InlineOverloads, NopythonRewrites
+        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
+        if not self.state.flags.nrt:
+            unused.add(IRLegalization)
         pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
         pipeline.finalize()
         return [pipeline]
