@@ -118,7 +118,7 @@ def sweep(
 
 def _rescale(scaling: Tensor, factor: Tensor, active: Bool[Tensor, " b"]) -> Tensor:
     """Padded points, whose factor is 0/0, keep their scaling, and so do samples that have stopped."""
-    return torch.where(active.unsqueeze(-1) & (factor > 0) & factor.isfinite(), scaling * factor, scaling)
+    return torch.where(active.unsqueeze(-1) & (factor > 0) & (factor < math.inf), scaling * factor, scaling)
 
 
 def _newton(

@@ -16,7 +16,7 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.robust.consensus import consensus
 from bpnp.robust.scoring import Pairs, residuals
 
-FEWEST = 100  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
+FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
