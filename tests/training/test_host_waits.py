@@ -35,6 +35,8 @@ READS = {
     "layers/assignment.py:check_mu": 1,  # in an error
     "layers/assignment.py:sinkhorn": 1,  # whether a given mask has a real point in every sample
     "layers/compiled.py:conjugate_gradients": 1,  # on the CPU only
+    "layers/compiled.py:first_sums": 2,  # on the CPU only
+    "layers/compiled.py:work": 1,  # of the one before
     "layers/implicit.py:record": 1,  # unconverged backward passes
     "layers/laplacian.py:conjugate_gradients": 1,  # the end, every eighth iteration
     "layers/laplacian.py:solve_laplacian": 2,  # float64: what to factorise
