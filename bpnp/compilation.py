@@ -26,6 +26,8 @@ from numba.core.types import BaseFunction
 from numba.core.untyped_passes import InlineClosureLikes
 from threadpoolctl import ThreadpoolController
 
+# Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
+FAST = {"reassoc", "contract", "arcp", "nsz"}
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
 
 
@@ -36,13 +38,13 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     names another one); where neither can, each process compiles again. So it is after a change of the function's file,
     or of this one, or of another with functions that its file calls, which numba does not look at. A function is
     compiled without the wrappers that a type checker puts around it when it is imported.
-    options: of `numba.njit`. No wrapper for function pointers is made: that would be a tenth of the time. Counting
-    references is a fifth, which `_nrt=False` leaves out of a function that allocates nothing. One that only compiled
-    ones call has no wrapper for Python (`no_cpython_wrapper`; a call from there ends the process), and is optimised and
-    kept with its callers alone, which saves another quarter.
+    options: of `numba.njit`. A division by zero is infinite, as in C. No wrapper for function pointers is made: that
+    would be a tenth of the time. Counting references is a fifth, which `_nrt=False` leaves out of a function that
+    allocates nothing. One that only compiled ones call has no wrapper for Python (`no_cpython_wrapper`; a call from
+    there ends the process), and is optimised and kept with its callers alone, which saves another quarter.
     """
     part = "no_cpython_wrapper" in options
-    options |= {"nogil": True, "no_cfunc_wrapper": True, "pipeline_class": _LoopCompiler}
+    options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "pipeline_class": _LoopCompiler}
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)

@@ -12,13 +12,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.compilation import compiler, in_threads
+from bpnp.compilation import FAST, compiler, in_threads
 from bpnp.layers.plan import SHORT_SUM, Plan
 
-# Sums in any order, as in `bpnp.search.kernels.dense`, but NaN and infinity keep their meaning: they flag a sample.
-FAST = {"reassoc", "contract", "arcp", "nsz"}
-compiled = compiler(fastmath=FAST, error_model="numpy", _nrt=False)
-part = compiler(fastmath=FAST, error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by `_solve`
+compiled = compiler(fastmath=FAST, _nrt=False)
+part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by `_solve`
 SHORT_COLUMN = 256  # rows that are added up in the precision of the data
 LINE = 16  # numbers of a cache line: sums whose memory begins with one are added to in two thirds of the time
 

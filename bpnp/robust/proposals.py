@@ -19,7 +19,7 @@ from bpnp.robust.scoring import Pairs, in_scene, normalised, truncated_scores
 from bpnp.types import SolveStats
 
 TRIPLES = 1024  # solved for each sample
-DRAWN = 4  # triples drawn for each that is solved: those of the widest triangles
+DRAWN_EACH = 4  # triples drawn for each that is solved: those of the widest triangles
 SCORED = 512  # pairs drawn to score the poses on
 APART_DEG = 15.0  # smallest angle between two proposals
 
@@ -61,7 +61,7 @@ def pose_hypotheses(
     mass = probability.sum(-1, dtype=torch.float64)
     usable = mass.isfinite() & (mass > 0) & (torch.minimum(real2d.sum(-1), real3d.sum(-1)) >= 3)
 
-    drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN * TRIPLES, seed)
+    drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN_EACH * TRIPLES, seed)
     chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
     pairs, centre, scale = normalised(chosen)
     poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in pairs[:2]))
@@ -120,9 +120,9 @@ def _poses_of_widest(
         seen = torch.cat([along, across], -1)[..., [0, 1, 3, 4]]
         alike = torch.cosine_similarity(torch.cat([x, y], -1), seen, dim=-1)
         alike = alike.masked_fill(wide < wide.median(-1, keepdim=True).values, -1)
-        chosen = alike.topk(image.shape[1] // (2 * DRAWN)).indices
+        chosen = alike.topk(image.shape[1] // (2 * DRAWN_EACH)).indices
     else:
-        chosen = wide.topk(image.shape[1] // DRAWN).indices
+        chosen = wide.topk(image.shape[1] // DRAWN_EACH).indices
     return poses_of_triples(bearings(take(image, chosen)), take(scene, chosen))
 
 

@@ -11,11 +11,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bpnp.compilation import compiler, in_threads
+from bpnp.compilation import FAST, compiler, in_threads
 
-# NaN and infinity keep their meaning, as in `bpnp.layers.compiled`.
-OPTIONS = {"fastmath": {"reassoc", "contract", "arcp", "nsz"}, "error_model": "numpy"}
-compiled, part = compiler(**OPTIONS), compiler(**OPTIONS, no_cpython_wrapper=True, _nrt=False)
+compiled, part = compiler(fastmath=FAST), compiler(fastmath=FAST, no_cpython_wrapper=True, _nrt=False)
 AT_ONCE = 8  # points: a loop over the channels of one would be short
 
 
@@ -41,7 +39,7 @@ def norm_gradient(
     return result
 
 
-@compiler(**OPTIONS, no_cpython_wrapper=True)
+@compiler(fastmath=FAST, no_cpython_wrapper=True)
 def _zeros(count: int, like: Any) -> Any:
     """Zeros that begin with a cache line: stores that cross two take longer."""
     values = np.zeros(count + 64, like.dtype)

@@ -12,8 +12,8 @@ from typing import Any
 from bpnp.compilation import compiler
 from bpnp.search.kernels.dense import solve_normal_equations
 
-compiled = compiler(error_model="numpy", _nrt=False)
-part = compiler(error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
+compiled = compiler(_nrt=False)
+part = compiler(_nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
 WIDEST_MATCHED = math.cos(math.radians(87.0))  # of the angle between a normal and the line of sight: no match beyond
 WIDEST_EXPECTED = math.cos(math.radians(72.0))  # a point is expected to be seen up to this angle
 RADII = 5  # of the ladder 1, 1/2, 1/4 ... at which matches are counted

@@ -1,7 +1,7 @@
 """Perspective-three-point for one triple at a time, compiled: the solver of `bpnp.robust.p3p` without a batch.
 
 The three pairs of points are 01, 12, 20. The caller puts the longest side of the scene's triangle between 1 and 2.
-`error_model` makes a division by zero infinite, as in C; every root is tested before it is used.
+A division by zero is infinite, as in C; every root is tested before it is used.
 """
 
 import math

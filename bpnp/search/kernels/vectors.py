@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.compilation import compiler
+from bpnp.compilation import FAST, compiler
 
 F = np.float32
-# Sums in any order, but NaN and infinity keep their meaning: they mark a lost pose.
-FAST = {"reassoc", "contract", "arcp", "nsz", "afn"}
-compiled = compiler(fastmath=FAST, error_model="numpy", _nrt=False)
-part = compiler(fastmath=FAST, error_model="numpy", _nrt=False, no_cpython_wrapper=True)  # called by compiled ones
+compiled = compiler(fastmath=FAST | {"afn"}, _nrt=False)
+part = compiler(fastmath=FAST | {"afn"}, _nrt=False, no_cpython_wrapper=True)  # called by compiled ones
 LARGEST_TURN = 0.5  # radians in one step
 
 
