@@ -24,13 +24,14 @@ from bpnp.search.settings import Nearby
 from bpnp.search.starts import Array
 
 LOG_DEPTH = 0.7  # of the weak-perspective distance: half to twice of it
-AT_ONCE = 64  # scores of so many poses in memory; for 64 x 64 shifts 1 MB
+AIM_CELLS = 0.5  # of the raster, a scale: with 1 no more poses are found, at twice the time
+AT_ONCE = 256  # scores of so many poses in memory; for 32 x 32 shifts 1 MB
 
 
 def anywhere(scene: Scene, rule: Nearby) -> Candidates:
     """Distinct poses from starts within the cones of the points, of which there must be some."""
     starts = drawn_in_cones(scene, rule.starts)
-    raster = raster_of(scene, replace(rule, cells=1.0), rule.first_scale)
+    raster = raster_of(scene, replace(rule, cells=AIM_CELLS), rule.first_scale)
     points = scene.sides(points=rule.points[0])[1]
     score, shift = np.empty(len(starts), np.float32), np.empty((len(starts), 2), np.float32)
 
