@@ -174,11 +174,21 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
 
 
 def _from_looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> SearchResult | None:
-    """Look after look for poses that clusters hide, until one is certain: its result."""
+    """Look after look for poses that clusters hide, until one is certain: its result.
+
+    A pose that is the first to exceed chance by far, or more so than those before, is annealed on all points and looked
+    around at once: what then matches more points is certain more often.
+    """
+    rule, exceeded = pool.scene.settings.evidence, 0.0
     for found in _looks(pool, anywhere_rules, proposals):
         pool.merge(found)
-        if (safe := pool.certain(pool.leaders())) is not None:
+        leaders = pool.leaders()
+        if (safe := pool.certain(leaders)) is not None:
             return safe
+        if len(leaders) and leaders.log10_false_alarms[0] < exceeded - rule.lead:
+            exceeded = leaders.log10_false_alarms[0]
+            if (result := _beside_best(pool, pool.result())).verdict == "confident":
+                return result
         if pool.scene.deadline.passed():
             break
     return None

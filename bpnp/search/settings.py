@@ -190,8 +190,8 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     nearby: Nearby = Nearby()
-    anywhere: tuple[Nearby, ...] = 3 * (
-        Nearby(2**13, points=(300,), kept=(2**12,), copies=32, halved=True),
+    anywhere: tuple[Nearby, ...] = 2 * (
+        *3 * (Nearby(2**13, points=(300,), kept=(2**12,), copies=32, halved=True),),
         Nearby(2**14, points=(300,), kept=(2**12,), first_scale=0.09, steps=6, copies=32, halved=True),
     )
     beside: Nearby = Nearby(
