@@ -13,7 +13,7 @@ from bpnp.compilation import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
 from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.search import is_few, search_few
+from bpnp.search.few.search import is_crowd, is_few, search_few
 from bpnp.search.nearby import admitted, beside, cooled, drawn_around, is_near, likeliest, nearby_batch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool, against_repetitions
@@ -101,11 +101,6 @@ def search_poses(
     return pool.result()
 
 
-def is_crowd(sets: PointSets) -> bool:
-    """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
-    return not is_few(replace(sets, prior=None))
-
-
 @one_blas_thread
 def search_proposed(
     sets: PointSets, proposals: Proposals, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER,
@@ -120,9 +115,7 @@ def search_proposed(
     settings = settings if clutter is None else settings.expecting(clutter)
     pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
     pool.batches = 1
-    if (safe := _from_looks(pool, (), proposals)) is not None:
-        return safe
-    return _beside_best(pool, pool.result())
+    return _from_looks(pool, (), proposals) or _beside_best(pool, pool.result())
 
 
 def _enumerated(
@@ -176,18 +169,17 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
 def _from_looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> SearchResult | None:
     """Look after look for poses that clusters hide, until one is certain: its result.
 
-    A pose that is the first to exceed chance by far, or more so than those before, is annealed on all points and looked
-    around at once: what then matches more points is certain more often.
+    A pose that exceeds chance by more than those before is annealed on all points at once: more of them match then.
     """
-    rule, exceeded = pool.scene.settings.evidence, 0.0
+    exceeded = 0.0
     for found in _looks(pool, anywhere_rules, proposals):
         pool.merge(found)
         leaders = pool.leaders()
         if (safe := pool.certain(leaders)) is not None:
             return safe
-        if len(leaders) and leaders.log10_false_alarms[0] < exceeded - rule.lead:
-            exceeded = leaders.log10_false_alarms[0]
-            if (result := _beside_best(pool, pool.result())).verdict == "confident":
+        if len(leaders) and leaders.log10_false_alarms[0] < exceeded - pool.scene.settings.evidence.lead:
+            exceeded, result = leaders.log10_false_alarms[0], pool.result()
+            if result.verdict == "confident":
                 return result
         if pool.scene.deadline.passed():
             break

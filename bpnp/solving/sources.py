@@ -11,7 +11,8 @@ import torch
 from torch import nn
 
 from bpnp.compilation import Deadline
-from bpnp.search.many import is_crowd, search_poses, search_proposed
+from bpnp.search.few.search import is_crowd
+from bpnp.search.many import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.finishing import finished, without_pose

@@ -28,6 +28,11 @@ def is_few(sets: PointSets) -> bool:
     return pairs <= (FEW_PAIRS if sets.pairs_that_fix == 3 else KNOWN_PAIRS)
 
 
+def is_crowd(sets: PointSets) -> bool:
+    """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
+    return not is_few(replace(sets, prior=None))
+
+
 def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
     """Candidates in the user's coordinates, best first, and whether every hypothesis was tried.
 
