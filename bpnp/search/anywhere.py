@@ -24,7 +24,7 @@ from bpnp.search.settings import Nearby
 from bpnp.search.starts import Array
 
 LOG_DEPTH = 0.7  # of the weak-perspective distance: half to twice of it
-AIM_CELLS = 0.5  # of the raster, a scale: with 1 no more poses are found, at twice the time
+AIM_CELLS = 0.5  # of the raster, a scale: with 1 no more poses are found, in twice the time
 AT_ONCE = 256  # scores of so many poses in memory; for 32 x 32 shifts 1 MB
 
 
