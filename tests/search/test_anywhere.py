@@ -8,13 +8,16 @@ from numpy.typing import NDArray
 from planted import directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
+from bpnp.search import many
 from bpnp.search.anywhere import best_shifts, drawn_in_cones, shifted
 from bpnp.search.candidates import Candidates
 from bpnp.search.many import search_poses
 from bpnp.search.nearby import raster_of
 from bpnp.search.point_sets import PointSets
+from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
+from bpnp.search.verdict import no_pose
 
 Array = NDArray[np.float64]
 CONE = np.cos(np.radians(35))
@@ -35,6 +38,17 @@ def test_a_pose_among_six_outliers_a_true_pair_is_found_within_the_cones() -> No
     found = search_poses(sets, settings=replace(DEFAULT, max_batches=2))
     np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
+
+
+def test_a_pose_that_exceeds_chance_is_judged_on_all_points_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before it is annealed on all of them it may match too few to be certain, and all looks would follow."""
+    sets, rotation, _ = seen_in_cones(0, true=300, outliers=100)
+    monkeypatch.setattr(Pool, "certain", lambda *_: None)
+    pool = Pool(Scene(sets, 0, DEFAULT), sets, no_pose("no pose was found"))
+    found = many._from_looks(pool, DEFAULT.anywhere[:1], None)
+    assert found is not None
+    assert found.verdict == "confident"
+    np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
 
 
 def test_a_camera_that_looks_beside_the_scene_is_aimed_at_it() -> None:
