@@ -20,7 +20,7 @@ from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.settings import DEFAULT, Nearby, SearchSettings
 from bpnp.search.starts import PosePrior, Prior, draw_poses
-from bpnp.search.verdict import SearchResult, is_exhausted, is_unique, judged, no_pose, weighed_leaders
+from bpnp.search.verdict import SearchResult, is_exhausted, judged, no_pose, weighed_leaders
 
 ROUND = 3  # batches with a prior, of which the last is without
 Progress = Callable[[int, float], None]  # batches so far, seconds
@@ -154,8 +154,8 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
         best = float(pool.candidates.score[0])
         if pool.is_settled():
             leaders = pool.leaders()
-            # A pose that was just found may be an optimum beside a better one, which starts around it will find.
-            if (stalled or is_unique(leaders, sets, rule)) and (safe := pool.certain(leaders)) is not None:
+            # A pose that was just found and leaves points may be beside a better one, which starts around it will find.
+            if (stalled or leaders.matched[0] >= rule.well_matched) and (safe := pool.certain(leaders)) is not None:
                 return safe
         pool.turned = pool.different([pool.turned, found])
         exhausted = is_exhausted(pool.candidates, scene, 0.0 if near else searched - bettered)

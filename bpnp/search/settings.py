@@ -129,7 +129,7 @@ class Evidence:
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
     loose_deg: error of the rotation about its least certain axis that is exceeded once in a thousand, at most.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
-    first four have 720 starts, of which 5 are within 30 degrees of any rotation. Of so many batches well_matched_hits
+    first four have 1080 starts, of which 8 are within 30 degrees of any rotation. Of so many batches well_matched_hits
     are enough where the share well_matched is matched: it leaves a better pose little to explain. Or
     matched, over_chance: this share of the points is matched, and so many times the share expected by chance.
     stalled: so many full batches of starts that do not better the best log-likelihood by `better` nats a bearing end
@@ -179,7 +179,7 @@ class SearchSettings:
 
     max_batches: int = 32
     starts: int = 1200
-    first_starts: int = 48
+    first_starts: int = 72
     least_kept: int = 3
     recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
     coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0, halvings=(6, 8)),)

@@ -52,7 +52,7 @@ def test_search_finds_planted_poses(problem):
 
 def test_batches_grow_until_they_are_full():
     sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
-    assert sizes == [48, 96, 192, 384, 768, 1200, 1200, 1200]
+    assert sizes == [72, 144, 288, 576, 1152, 1200, 1200, 1200]
     for stage in (*DEFAULT.coarse, *DEFAULT.middle):
         kept = [DEFAULT.kept_by(stage, starts) for starts in sizes]
         assert kept == sorted(kept)
@@ -67,10 +67,10 @@ def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
     unrelated = PointSets(directions(noise), rng.normal(size=(80, 3)))
     search_poses(unrelated, settings=settings, progress=lambda batches, _: seen.append(batches))
     assert seen == [1, 2, 3, 4]  # 24 + 48 + 96 starts are less than 2 x 96, and one more batch is not
-    related = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
+    related = PointSets(problem.bearings[1].double().numpy(), problem.points3d[1].double().numpy())
     easy = search_poses(related)
     assert easy.verdict == "confident"
-    assert easy.batches <= 4  # 720 starts
+    assert easy.batches <= 4  # 1080 starts
 
 
 def test_neighbours_padding_and_batch_size_do_not_matter(problem):

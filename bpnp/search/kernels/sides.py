@@ -127,6 +127,8 @@ def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArr
 
 def _fitting(side: Side, other: Side) -> Array:
     """For each point the share, by weight, of the other side whose labels fit; above 0, for points without any."""
+    if (side.labels < 0).all():
+        return np.ones(len(side.labels), np.float32)
     values, place = np.unique(other.labels, return_inverse=True)
     weights, free = np.bincount(place, other.weights), other.weights[other.labels < 0].sum()
     at = np.minimum(np.searchsorted(values, side.labels), len(values) - 1)
