@@ -35,10 +35,9 @@ def anneal_on_clusters(
     for stage, clusters in zip(stages, sides, strict=True):
         kept = scene.settings.kept_by(stage, starts)
         scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
-        for part in np.split(scales, stage.halvings):
-            if part[0] != scales[0]:
-                half = np.argsort(-poses.score, kind="stable")[: max(len(poses) // 2, 2 * kept)]
-                poses = poses[np.sort(half)]
+        for k, part in enumerate(np.split(scales, stage.halvings)):
+            if k:  # best first, since only the first ones go on after the deadline
+                poses = poses[np.argsort(-poses.score, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
             poses = _annealed(scene, poses, clusters, part, outlier)
         poses = best_distinct(poses, scene, kept, degrees=stage.apart_deg, shift=math.inf)
     return poses
@@ -46,14 +45,12 @@ def anneal_on_clusters(
 
 def _annealed(scene: Scene, starts: Candidates, sides: Sides, scales: Array, outlier: np.float32) -> Candidates:
     """The poses for which there was time, after a step at each of the scales (k,), radians."""
-    bearings, points = sides
+    bearings, points = map(tuple, sides)
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
-        scratch = dense_scratch(len(bearings.a), len(points.b))
-        descend(
-            tuple(bearings), tuple(points), rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch
-        )  # fmt: skip
+        scratch = dense_scratch(*(len(side.label) for side in sides))
+        descend(bearings, points, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
     return replace(starts, rotation=rotation, translation=translation, score=score)[:done]

@@ -154,7 +154,7 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
         best = float(pool.candidates.score[0])
         if pool.is_settled():
             leaders = pool.leaders()
-            # A pose that was just found and leaves points may be beside a better one, which starts around it will find.
+            # One that was just found and leaves points may lie beside a better one, which starts around it will find.
             if (stalled or leaders.matched[0] >= rule.well_matched) and (safe := pool.certain(leaders)) is not None:
                 return safe
         pool.turned = pool.different([pool.turned, found])

@@ -9,9 +9,9 @@ import numpy as np
 from bpnp.search.annealing import finish
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Evidence
 from bpnp.search.verdict import SearchResult, is_certain, is_settled, judged, weighed_leaders, with_false_alarms
 
 

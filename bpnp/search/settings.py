@@ -3,6 +3,8 @@
 import math
 from dataclasses import dataclass, replace
 
+from bpnp.search.evidence.thresholds import Evidence
+
 
 @dataclass(frozen=True)
 class Recipe:
@@ -23,7 +25,8 @@ class ClusterStage:
     clusters: of each side, at most; one iteration costs their number squared.
     first_scale, last_scale: in spreads of the bearings. iterations: from one to the other, a Gauss-Newton step each.
     kept: poses that go on to the next stage. apart_deg: least angle between their rotations.
-    halvings: iterations after which the likelier half goes on; after fewer than 6 it lacks right poses in clutter.
+    halvings: iterations after which the likelier half goes on, and twice `kept` at least; after fewer than 6 it lacks
+        right poses in clutter.
     """
 
     clusters: int
@@ -80,9 +83,9 @@ class Nearby:
         the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
         factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
     copies: of a pose at each step. points_again: 3D points that are looked up there. halved: half of the poses go on
-        each time, the best copy of each, so that some do not crowd out the others. annealed: on all points at the end.
-    outliers: share without a partner, at least. background: scales of the density that is chance.
-    cells: of the raster, a scale; most_cells: a side. starts_a_check: of the clock.
+        each time, the best copy of each, so that those of some do not crowd out the others.
+    annealed: on all points from the last scale. outliers: share without a partner, at least. cells: of the raster, a
+        scale; most_cells: a side. background: scales of the density that is chance. starts_a_check: of the clock.
     """
 
     starts: int = 2**17
@@ -120,41 +123,6 @@ class Facing:
 
 
 @dataclass(frozen=True)
-class Evidence:
-    """When a pose is accepted (`bpnp.search.verdict`). Logarithms to base 10.
-
-    false_alarms: of the number of false alarms, at most, for "confident". It is a bound; on unrelated points an
-    exhaustive search stayed above 1 in 999 of 1000 cases, and never came below 0.1.
-    lead: by which every different pose must have more: a wrong pose leads so by chance once in a thousand. other_deg,
-        other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
-    loose_deg: error of the rotation about its least certain axis that is exceeded once in a thousand, at most.
-    hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
-    first four have 1080 starts, of which 8 are within 30 degrees of any rotation. Of so many batches well_matched_hits
-    are enough where the share well_matched is matched: it leaves a better pose little to explain. Or
-    matched, over_chance: this share of the points is matched, and so many times the share expected by chance.
-    stalled: so many full batches of starts that do not better the best log-likelihood by `better` nats a bearing end
-    the search, as do enough_hits at one pose, if its residuals are below plausible_scale, in half the spacing of the
-    bearings, and its matched share above plausible_matched; wrong poses of sparse points had up to a quarter.
-    """
-
-    false_alarms: float = -2.0
-    lead: float = 3.0
-    other_deg: float = 2.0
-    other_shift: float = 0.05
-    loose_deg: float = 3.0
-    hits: int = 4
-    well_matched: float = 0.6
-    well_matched_hits: int = 2
-    matched: float = 0.2
-    over_chance: float = 6.0
-    stalled: float = 4.0
-    better: float = 0.002
-    enough_hits: int = 12
-    plausible_scale: float = 2.0
-    plausible_matched: float = 0.25
-
-
-@dataclass(frozen=True)
 class SearchSettings:
     """All of it; the stages are described in docs/search.md.
 
@@ -174,7 +142,8 @@ class SearchSettings:
         `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
-    sampled: points a cluster that lloyd_iterations start from. starts_a_check: starts between two looks at the clock.
+    sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
+    starts_a_check: starts that are annealed on clusters between two looks at the clock, if time is limited.
     """
 
     max_batches: int = 32
@@ -231,7 +200,8 @@ class SearchSettings:
     def expecting(self, clutter: float) -> "SearchSettings":
         """These settings where the share of the points without a partner is known. Raises ValueError outside [0, 1).
 
-        It is expected in all stages, the only one tried at the end, and `well_matched` is a share of the other points.
+        It is expected in all stages and the only one tried at the end, and a pose that matches the share `well_matched`
+        of the other points leaves a better one little to explain.
         """
         if not 0 <= clutter < 1:
             raise ValueError(f"expected `clutter` in [0, 1), a share of the points, got {clutter}")

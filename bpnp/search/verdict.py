@@ -18,10 +18,11 @@ from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.rivals import contested_by
+from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.evidence.uncertainty import linearised, rotation_bound, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT, Evidence
+from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 

@@ -58,6 +58,21 @@ def test_halving_keeps_the_likeliest_ends_and_anneals_fewer(scene: Scene, monkey
     np.testing.assert_array_equal(ends[1].score[:10], ends[0].score[:10])
 
 
+def test_of_the_half_that_goes_on_the_likeliest_are_annealed_after_the_deadline(scene: Scene, monkeypatch) -> None:
+    calls = []
+
+    def until_late(*arguments) -> None:
+        begin = arguments[2].copy()
+        descend(*arguments)
+        calls.append((begin, arguments[2], arguments[6]))
+        scene.deadline = PASSED
+
+    monkeypatch.setattr("bpnp.search.annealing.descend", until_late)
+    coarse(scene, starts(scene, 500))
+    (_, rotation, score), (goes_on, *_), *_ = calls
+    np.testing.assert_array_equal(goes_on, rotation[np.argsort(-score)[: DEFAULT.starts_a_check]])
+
+
 def test_clusters_of_each_count_have_the_weight_of_all_points(scene: Scene) -> None:
     few, many = scene.clusters([8, 64])
     for smaller, larger in zip(few, many, strict=True):

@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
+from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
 NEAR = 3.0  # scales of the residuals within which an image point has a partner, and two partners are in one place

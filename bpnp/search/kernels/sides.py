@@ -34,12 +34,12 @@ class Side(NamedTuple):
 
         Points with normals are near each other if these are too: half an extent counts as much as half a radian.
         """
-        parts = []
+        parts = [self.at(slice(0))]  # in case no point has a partner: their clusters are dropped
         for label in np.unique(self.labels):
             members = np.flatnonzero(self.labels == label)
             share = count if len(members) == len(self.labels) else -(-count * len(members) // len(self.labels))
             parts.append(_clusters(self.at(members), share, settings, rng))
-        return parts[0] if len(parts) == 1 else Side(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+        return Side(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
 def side_of(points: Array, scores: Any, labels: Any, cones: Any, order: NDArray[np.int64]) -> Side:
@@ -122,7 +122,7 @@ def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArr
             blocks.append((0, len(labels2d), *own))
         else:
             blocks += [(0, free, *own), (*np.searchsorted(labels2d, (label, label + 1)), *own)]
-    return np.array(blocks, np.uintp)
+    return np.array(blocks, np.uintp).reshape(-1, 4)
 
 
 def _fitting(side: Side, other: Side) -> Array:
