@@ -20,10 +20,10 @@ import numpy as np
 import pandas as pd
 import torch
 
-from bpnp.compilation import Deadline
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.loader import PairDataset
 from bpnp.geometry import bearings
+from bpnp.loops.parallel import Deadline
 from bpnp.metrics.errors import rotation_error, translation_error
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets

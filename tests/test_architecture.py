@@ -19,7 +19,7 @@ GROUND = {
     "configs",
     "lazy",
     "metrics",
-    "compilation",
+    "loops",
     "precision",
     "checks",
     "distinct_poses",

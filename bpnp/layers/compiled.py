@@ -12,8 +12,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.compilation import FAST, compiler, in_threads
 from bpnp.layers.plan import SHORT_SUM, Plan
+from bpnp.loops.compilation import FAST, compiler
+from bpnp.loops.parallel import in_threads
 
 compiled = compiler(fastmath=FAST, _nrt=False)
 part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by `_solve`

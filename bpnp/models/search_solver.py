@@ -8,8 +8,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from bpnp.compilation import Deadline
 from bpnp.geometry import bearings
+from bpnp.loops.parallel import Deadline
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.refine import refine_poses

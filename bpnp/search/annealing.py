@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import in_time
+from bpnp.loops.parallel import in_time
 from bpnp.search.candidates import Candidates, best_distinct
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import in_time
+from bpnp.loops.parallel import in_time
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_shifted
 from bpnp.search.kernels.tiles import LANES

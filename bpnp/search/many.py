@@ -9,7 +9,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import NEVER, Deadline, one_blas_thread
+from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
 from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates

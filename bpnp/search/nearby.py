@@ -21,7 +21,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import in_time
+from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up

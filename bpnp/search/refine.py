@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.compilation import NEVER, Deadline, one_blas_thread
+from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.kernels.sides import FORWARD

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import MIN_POINTS
+from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.kernels.sides import FORWARD, blocks_of, kernel_sides, side_of, with_partners
 from bpnp.search.kernels.tiles import Tiles, build_tiles

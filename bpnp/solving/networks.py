@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.many import Proposals
 from bpnp.search.refine import score_poses
 from bpnp.search.starts import PosePrior

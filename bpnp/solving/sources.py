@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.few.search import is_crowd
 from bpnp.search.many import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from planted import plant
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.dense import descend

@@ -9,8 +9,8 @@ import torch
 from planted import degrees_between, directions, plant
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import Deadline
 from bpnp.geometry import bearings
+from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
 from bpnp.models.search_solver import best_poses, refine

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
 from bpnp.search.many import search_poses

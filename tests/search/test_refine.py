@@ -4,7 +4,7 @@ import numpy as np
 import torch
 from planted import plant
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error
 from bpnp.search.point_sets import PointSets
 from bpnp.search.refine import score_poses

@@ -10,7 +10,7 @@ from planted import directions
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.thresholds import Evidence

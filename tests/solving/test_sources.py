@@ -12,7 +12,7 @@ from planted import plant
 from small_data import small_net
 
 from bpnp import solve
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving import sources
 from bpnp.solving.networks import evaluation_copy

@@ -8,8 +8,8 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from bpnp.checks import check_positive
-from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
+from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement
 from bpnp.robust.consensus import refine_locally
 from bpnp.robust.p3p import p3p

@@ -5,8 +5,8 @@ import math
 from jaxtyping import Int
 from torch import Tensor
 
-from bpnp.compilation import Deadline
 from bpnp.geometry import MIN_POINTS, bearings
+from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement, pair_seed
 from bpnp.robust.p3p import p3p
 from bpnp.robust.sampling import distinct_triples

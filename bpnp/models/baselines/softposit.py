@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import random_rotations, retract
+from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.models.baselines.single_pairs import (
     Answer,
     PairSolver,

@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from bpnp.compilation import FAST, compiler, in_threads
+from bpnp.loops.compilation import FAST, compiler
+from bpnp.loops.parallel import in_threads
 
 compiled, part = compiler(fastmath=FAST), compiler(fastmath=FAST, no_cpython_wrapper=True, _nrt=False)
 AT_ONCE = 8  # points: a loop over the channels of one would be short

@@ -9,7 +9,7 @@ that every point can be seen.
 import math
 from typing import Any
 
-from bpnp.compilation import compiler
+from bpnp.loops.compilation import compiler
 from bpnp.search.kernels.dense import solve_normal_equations
 
 compiled = compiler(_nrt=False)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.compilation import Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
 from bpnp.search.few.priors import predicted_pose

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.compilation import FAST, compiler
+from bpnp.loops.compilation import FAST, compiler
 
 F = np.float32
 compiled = compiler(fastmath=FAST | {"afn"}, _nrt=False)

@@ -7,9 +7,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from bpnp.checks import check_positive
-from bpnp.compilation import NEVER, Deadline
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
+from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound.boxes import (
     Boxes,
     Found,

@@ -1,24 +1,17 @@
-"""Compiled loops: kept where they can be kept, announced, and shared among threads of which none is stuck."""
+"""Compiled loops: kept where they can be kept, and announced."""
 
-import multiprocessing
 import os
 import shutil
 import subprocess
 import sys
-import threading
-from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
-import torch
-from threadpoolctl import threadpool_info, threadpool_limits
 
-import bpnp.compilation
-from bpnp.compilation import in_threads, one_blas_thread
+import bpnp.loops.compilation
 
 FACTOR = """
-from bpnp.compilation import compiler
+from bpnp.loops.compilation import compiler
 
 
 @compiler(no_cpython_wrapper=True)
@@ -26,7 +19,7 @@ def factor():
     return 2
 """
 LOOP = """
-from bpnp.compilation import compiler
+from bpnp.loops.compilation import compiler
 from bpnp.factor import factor
 
 
@@ -36,73 +29,11 @@ def double(x):
 """
 
 
-@pytest.fixture(params=[1, 2, 5])
-def threads(request: pytest.FixtureRequest) -> Iterator[int]:
-    before = torch.get_num_threads()
-    torch.set_num_threads(request.param)
-    yield request.param
-    torch.set_num_threads(before)
-
-
-@pytest.mark.parametrize("count", [0, 1, 2, 7, 100])
-def test_every_index_is_visited_once_and_no_share_is_empty(threads: int, count: int) -> None:
-    seen, shares = np.zeros(count, int), list[int]()
-
-    def work(first: int, last: int) -> None:
-        seen[first:last] += 1
-        shares.append(last - first)
-
-    in_threads(work, count)
-    assert (seen == 1).all()
-    assert len(shares) == max(min(threads, count), 1)
-    assert count == 0 or min(shares) >= 1
-
-
-@pytest.mark.parametrize("threads", [3], indirect=True)
-def test_shares_run_at_the_same_time(threads: int) -> None:
-    together = threading.Barrier(threads, timeout=20)
-    in_threads(lambda _first, _last: together.wait(), threads)
-
-
-def test_an_error_in_any_share_is_raised(threads: int) -> None:
-    def fail(_first: int, last: int) -> None:
-        if last == 10:
-            raise ArithmeticError("last share")
-
-    with pytest.raises(ArithmeticError, match="last share"):
-        in_threads(fail, 10)
-
-
-def _square(results: "multiprocessing.Queue[float]") -> None:
-    torch.set_num_threads(2)
-    squares = np.zeros(10)
-
-    def work(first: int, last: int) -> None:
-        squares[first:last] = np.arange(first, last) ** 2
-
-    in_threads(work, 10)
-    results.put(float(squares.sum()))
-
-
-@pytest.mark.filterwarnings("ignore:.*multi-threaded.*")
-@pytest.mark.parametrize("threads", [2], indirect=True)
-@pytest.mark.usefixtures("threads")
-def test_a_fork_has_threads_of_its_own() -> None:
-    in_threads(lambda _first, _last: None, 10)
-    context = multiprocessing.get_context("fork")
-    results = context.Queue()
-    child = context.Process(target=_square, args=(results,))
-    child.start()
-    assert results.get(timeout=60) == 285.0
-    child.join()
-
-
 @pytest.fixture
 def package(tmp_path: Path) -> Path:
     """A folder with a package `bpnp` of a compiled loop beside which nothing can be written, whoever runs the test."""
     folder = tmp_path / "installed" / "bpnp"
-    folder.mkdir(parents=True)
-    shutil.copy(bpnp.compilation.__file__, folder / "compilation.py")
+    shutil.copytree(Path(bpnp.loops.compilation.__file__).parent, folder / "loops")
     (folder / "__init__.py").touch()
     (folder / "factor.py").write_text(FACTOR)
     (folder / "loop.py").write_text(LOOP)
@@ -156,7 +87,7 @@ def test_what_rests_while_a_loop_is_compiled_goes_on_afterwards(
     """Python's collector, and numba's own way to resolve the types of a call."""
     printed, _ = started(package, str(tmp_path / "cache"), NOTE_STATE + before).communicate(timeout=120)
     compiling, called, values, last = printed.splitlines()
-    assert (compiling, called, values) == ("False bpnp.compilation", "False bpnp.compilation", "8 10")
+    assert (compiling, called, values) == ("False bpnp.loops.compilation", "False bpnp.loops.compilation", "8 10")
     assert last == f"{collects} numba.core.types.functions"
 
 
@@ -165,7 +96,7 @@ def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path,
     assert doubled(package, cache)[0] == "8 10\n"
     (package / "bpnp" / "factor.py").write_text(FACTOR.replace("2", "30"))
     assert doubled(package, cache)[0] == "120 150\n"
-    with (package / "bpnp" / "compilation.py").open("a") as source:
+    with (package / "bpnp" / "loops" / "compilation.py").open("a") as source:
         source.write("# compiles in another way\n")
     assert doubled(package, cache)[1].count("compiling") == 1
 
@@ -189,21 +120,6 @@ def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, t
         printed, logged = process.communicate(timeout=120)
         assert (process.returncode, printed) == (0, "8 10\n"), logged
     assert doubled(package, cache) == ("8 10\n", "")
-
-
-def test_blas_has_one_thread_until_the_last_of_several_users_ends() -> None:
-    def of_blas() -> set[int]:
-        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
-
-    with threadpool_limits(3, "blas"):
-        one_blas_thread.__enter__()
-        with one_blas_thread:
-            assert of_blas() == {1}
-        with pytest.raises(ValueError, match="bad"):
-            one_blas_thread(int)("bad")
-        assert of_blas() == {1}
-        one_blas_thread.__exit__()
-        assert of_blas() == {3}
 
 
 SIGNATURES = """
