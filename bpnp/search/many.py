@@ -2,29 +2,27 @@
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
-from bpnp.search.anywhere import anywhere
 from bpnp.search.candidates import Candidates
 from bpnp.search.few.search import is_crowd, is_few, search_few
-from bpnp.search.nearby import admitted, beside, cooled, drawn_around, is_near, likeliest, nearby_batch
+from bpnp.search.looks.nearby import cooled, drawn_around, is_near, nearby_batch
+from bpnp.search.looks.sequence import Proposals, beside_best, from_looks, proposed
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, Nearby, SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import PosePrior, Prior, draw_poses
 from bpnp.search.verdict import SearchResult, is_exhausted, judged, no_pose, weighed_leaders
 
 ROUND = 3  # batches with a prior, of which the last is without
 Progress = Callable[[int, float], None]  # batches so far, seconds
-Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
 
 @one_blas_thread
@@ -91,13 +89,13 @@ def search_poses(
     doubtful = result.log10_false_alarms > (0.0 if sets.prior is None else settings.evidence.false_alarms)
     if doubtful and (cones or not ended_alike) and not deadline.passed():
         asked = proposals if sets.prior is None and crowd else None
-        if (safe := _from_looks(pool, settings.anywhere if cones else (), asked)) is not None:
+        if (safe := from_looks(pool, settings.anywhere if cones else (), asked)) is not None:
             return safe
         result = pool.result()
-    result = _beside_best(pool, result)
+    result = beside_best(pool, result)
     if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
         return result
-    pool.merge(_proposed(pool, proposals))
+    pool.merge(proposed(pool, proposals))
     return pool.result()
 
 
@@ -115,7 +113,7 @@ def search_proposed(
     settings = settings if clutter is None else settings.expecting(clutter)
     pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
     pool.batches = 1
-    return _from_looks(pool, (), proposals) or _beside_best(pool, pool.result())
+    return from_looks(pool, (), proposals) or beside_best(pool, pool.result())
 
 
 def _enumerated(
@@ -164,66 +162,6 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
             known, near, best, searched, bettered = None, False, -math.inf, 0.0, 0.0
             pool.candidates = pool.turned = Candidates.none()
     return None
-
-
-def _from_looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> SearchResult | None:
-    """Look after look for poses that clusters hide, until one is certain: its result.
-
-    A pose that exceeds chance by more than those before is annealed on all points at once: more of them match then.
-    """
-    exceeded = 0.0
-    for found in _looks(pool, anywhere_rules, proposals):
-        pool.merge(found)
-        leaders = pool.leaders()
-        if (safe := pool.certain(leaders)) is not None:
-            return safe
-        if len(leaders) and leaders.log10_false_alarms[0] < exceeded - pool.scene.settings.evidence.lead:
-            exceeded, result = leaders.log10_false_alarms[0], pool.result()
-            if result.verdict == "confident":
-                return result
-        if pool.scene.deadline.passed():
-            break
-    return None
-
-
-def _looks(pool: Pool, anywhere_rules: Sequence[Nearby], proposals: Proposals | None) -> Iterator[Candidates]:
-    """Around the likeliest poses of different rotations, from within the cones of the points, from those proposed."""
-    yield from _around_each(pool, pool.turned)
-    for rule in anywhere_rules:
-        yield (found := anywhere(pool.scene, rule))
-        yield from _around_each(pool, pool.different([found]))
-    if proposals is not None:
-        yield (found := _proposed(pool, proposals))
-        yield from _around_each(pool, pool.different([found]))
-
-
-def _around_each(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
-    settings, since = pool.scene.settings, 0  # looks since the best pose was bettered
-    for k in range(len(poses)):
-        if since == settings.beside_patience:
-            break
-        best = pool.candidates.preference.max()
-        yield beside(pool.scene, poses[k : k + 1], settings.beside)
-        since = 0 if pool.candidates.preference.max() > best else since + 1
-
-
-def _beside_best(pool: Pool, result: SearchResult) -> SearchResult:
-    """Looks beside a pose that exceeds chance but leaves a doubt, an optimum beside a better one, while they help."""
-    scene = pool.scene
-    while result.verdict != "confident" and result.log10_false_alarms <= 0 and not scene.deadline.passed():
-        best = Candidates.unscored(*scene.enter(*(values[None] for values in result.best)))
-        pool.merge(beside(scene, best, scene.settings.beside))
-        better = pool.result()
-        lead = scene.settings.evidence.lead
-        if better.verdict != "confident" and better.log10_false_alarms > result.log10_false_alarms - lead:
-            break
-        result = better
-    return result
-
-
-def _proposed(pool: Pool, proposals: Proposals) -> Candidates:
-    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals())), pool.sets.prior)
-    return likeliest(pool.scene, poses, pool.scene.settings.proposed)
 
 
 def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:

@@ -74,7 +74,7 @@ class Shaking:
 
 @dataclass(frozen=True)
 class Nearby:
-    """Starts around a rough pose, looked up in a raster of the view (`bpnp.search.nearby`).
+    """Starts around a rough pose, looked up in a raster of the view (`bpnp.search.looks.nearby`).
 
     starts: a batch for a prior of `wide_deg` and `wide_shift` (of the distance) or more; these leave few gaps over the
     width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
@@ -139,7 +139,7 @@ class SearchSettings:
     refined_directly: starts of `refine_poses` that need no clusters. proposed: rule of the starts of `search_proposed`.
     anywhere, beside: rules of the looks after batches without a pose that exceeds chance, since clusters hide the right
         one among many outliers: around the likeliest `beside_poses`, no two turned by less than `beside_deg`, until
-        `beside_patience` are in vain; if there are cones, within these (`search.anywhere`), and around the ends.
+        `beside_patience` are in vain; if there are cones, within these (`search.looks.anywhere`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.

@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from planted import directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
-from bpnp.search import many
-from bpnp.search.anywhere import best_shifts, drawn_in_cones, shifted
 from bpnp.search.candidates import Candidates
+from bpnp.search.looks.anywhere import best_shifts, drawn_in_cones, shifted
+from bpnp.search.looks.nearby import raster_of
+from bpnp.search.looks.sequence import from_looks
 from bpnp.search.many import search_poses
-from bpnp.search.nearby import raster_of
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
@@ -45,7 +45,7 @@ def test_a_pose_that_exceeds_chance_is_judged_on_all_points_at_once(monkeypatch:
     sets, rotation, _ = seen_in_cones(0, true=300, outliers=100)
     monkeypatch.setattr(Pool, "certain", lambda *_: None)
     pool = Pool(Scene(sets, 0, DEFAULT), sets, no_pose("no pose was found"))
-    found = many._from_looks(pool, DEFAULT.anywhere[:1], None)
+    found = from_looks(pool, DEFAULT.anywhere[:1], None)
     assert found is not None
     assert found.verdict == "confident"
     np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)

@@ -14,8 +14,8 @@ from scipy.spatial.transform import Rotation
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
+from bpnp.search.looks.nearby import admitted, cooled, drawn_around, nearby_batch, raster_of
 from bpnp.search.many import search_poses
-from bpnp.search.nearby import admitted, cooled, drawn_around, nearby_batch, raster_of
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT

@@ -2,8 +2,8 @@
 
 A point with a cone is seen by cameras within it. So a start takes a point, a direction within its cone, a distance and
 a roll: four numbers instead of the six of a pose. The other two say where the camera looks, and all of them are tried
-at once: the score of `bpnp.search.nearby`, as a function of the shift of the points in the image, is a sum of copies of
-the view's raster, each shifted to the place of a point.
+at once: the score of `bpnp.search.looks.nearby`, as a function of the shift of the points in the image, is a sum of
+copies of the view's raster, each shifted to the place of a point.
 """
 
 import math
@@ -18,7 +18,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_shifted
 from bpnp.search.kernels.tiles import LANES
 from bpnp.search.kernels.weighted import WeightedPoints
-from bpnp.search.nearby import narrowed, raster_of
+from bpnp.search.looks.nearby import narrowed, raster_of
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby
 from bpnp.search.starts import Array
