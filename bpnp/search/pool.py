@@ -58,7 +58,7 @@ class Pool:
         """The result, if it is confident and holds on all bearings too."""
         if not is_certain(leaders, self.sets, self.scene.settings.evidence, batches=self.batches):
             return None
-        result = self._judged(self.candidates[np.isfinite(self.candidates.log10_false_alarms)], 1)
+        result = self._judged(self.candidates, 1)
         return result if result.verdict == "confident" else None
 
     def result(self) -> SearchResult:
