@@ -17,13 +17,13 @@ from bpnp.loops.compilation import FAST, compiler
 from bpnp.loops.parallel import in_threads
 
 compiled = compiler(fastmath=FAST, _nrt=False)
-part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by `_solve`
+part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
 SHORT_COLUMN = 256  # rows that are added up in the precision of the data
 LINE = 16  # numbers of a cache line: sums whose memory begins with one are added to in two thirds of the time
 
 
 def applies_to(tensor: Tensor) -> bool:
-    """Whether the compiled loop can read this tensor."""
+    """Whether the compiled loops can read this tensor."""
     return tensor.is_cpu
 
 

@@ -147,14 +147,11 @@ def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None])
         tell(pool.batches)
         if not len(pool.candidates):
             continue
-        stalled = pool.candidates.score[0] < best + rule.better
-        bettered = bettered if stalled else searched
+        pool.new = bool(pool.candidates.score[0] >= best + rule.better)
+        bettered = searched if pool.new else bettered
         best = float(pool.candidates.score[0])
-        if pool.is_settled():
-            leaders = pool.leaders()
-            # One that was just found and leaves points may lie beside a better one, which starts around it will find.
-            if (stalled or leaders.matched[0] >= rule.well_matched) and (safe := pool.certain(leaders)) is not None:
-                return safe
+        if pool.is_settled() and (safe := pool.certain(pool.leaders())) is not None:
+            return safe
         pool.turned = pool.different([pool.turned, found])
         exhausted = is_exhausted(pool.candidates, scene, 0.0 if near else searched - bettered)
         if near and pool.batches >= ROUND * rule.hits and not (pool.candidates.log10_false_alarms < 0).any():

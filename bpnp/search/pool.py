@@ -19,12 +19,13 @@ class Pool:
     """Distinct poses of a scene, best first, from all batches of starts and looks of a search.
 
     few: the result of the enumeration of few points, whose poses are the first. candidates: at most `settings.kept`.
-    turned: the likeliest ones of different rotations. batches: so far.
+    turned: the likeliest ones of different rotations. batches: so far. new: whether the last batch bettered the best
+    pose, and no look has followed.
     """
 
     def __init__(self, scene: Scene, sets: PointSets, few: SearchResult) -> None:
         self.scene, self.sets, self.few = scene, sets, few
-        self.batches = 0
+        self.batches, self.new = 0, False
         self.candidates = self.turned = Candidates.none()
         if len(few.candidates):
             rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
@@ -37,7 +38,7 @@ class Pool:
         """
         if (self.candidates.log10_false_alarms < 0).any():
             found, _ = weighed_leaders(found, self.scene, self.sets)
-        self.candidates = merged([self.candidates, found], self.scene)
+        self.candidates, self.new = merged([self.candidates, found], self.scene), False
 
     def leaders(self) -> Candidates:
         """The best candidates as a verdict needs them; what chance says of them is kept."""
@@ -56,22 +57,22 @@ class Pool:
 
     def certain(self, leaders: Candidates) -> SearchResult | None:
         """The result, if it is confident and holds on all bearings too."""
-        if not is_certain(leaders, self.sets, self.scene.settings.evidence, batches=self.batches):
+        if not is_certain(leaders, self.sets, self.scene.settings.evidence, batches=self.batches, new=self.new):
             return None
-        result = self._judged(self.candidates, 1)
+        result = self._judged(self.candidates, 1, new=False)
         return result if result.verdict == "confident" else None
 
     def result(self) -> SearchResult:
         """The verdict on the best candidates, annealed to the end on all points."""
-        return self._judged(self.candidates, self.scene.settings.finished)
+        return self._judged(self.candidates, self.scene.settings.finished, new=self.new)
 
-    def _judged(self, poses: Candidates, annealed: int) -> SearchResult:
+    def _judged(self, poses: Candidates, annealed: int, *, new: bool) -> SearchResult:
         scene, sets, rule = self.scene, self.sets, self.scene.settings.evidence
         ends = finish(scene, poses, annealed) if len(poses) else poses
         if sets.prior is not None and len(ends):  # of a pose before and after, that which chance explains less
             ends, _ = weighed_leaders(ends, scene, sets)
             ends = best_distinct(Candidates.concatenated([ends, poses]), scene, scene.settings.kept)
-        result = judged(in_user_frame(ends, scene), sets, batches=self.batches, rule=rule)
+        result = judged(in_user_frame(ends, scene), sets, batches=self.batches, new=new, rule=rule)
         if self.few.log10_false_alarms < result.log10_false_alarms:
             return replace(self.few, batches=self.batches)
         return against_repetitions(result, sets, lambda: scene, rule)

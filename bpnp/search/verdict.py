@@ -116,15 +116,18 @@ def is_certain(
     *,
     exhaustive: bool = False,
     batches: int = 0,
+    new: bool = False,
 ) -> bool:
     """Whether weighed candidates leave no doubt about the first: the verdict "confident".
 
     exhaustive: whether every pose that fits some points was looked at. Otherwise a better one may have been missed,
-    unless enough batches of starts found this one, or its matches are unique.
+    unless enough batches of starts found this one, or its matches are unique. new: whether the last batch bettered it;
+    if it leaves many points unmatched it may lie beside a better one, which starts around it find in the next batch.
     """
     if not len(candidates):
         return False
-    found = exhaustive or is_settled(candidates, sets, rule, batches=batches)
+    doubtful = new and candidates.matched[0] < rule.well_matched
+    found = exhaustive or (is_settled(candidates, sets, rule, batches=batches) and not doubtful)
     chance = float(candidates.log10_false_alarms[0]) <= rule.false_alarms
     return chance and found and not is_rough(candidates) and lead(candidates, sets, rule)[0] >= rule.lead
 
@@ -165,17 +168,17 @@ def is_exhausted(candidates: Candidates, scene: Scene, stalled: float) -> bool:
 
 
 def judged(
-    candidates: Candidates, sets: PointSets, *, batches: int, exhaustive: bool = False,
+    candidates: Candidates, sets: PointSets, *, batches: int, exhaustive: bool = False, new: bool = False,
     rule: Evidence = DEFAULT.evidence,
 ) -> SearchResult:  # fmt: skip
-    """The verdict on candidates in the user's coordinates, best first."""
+    """The verdict on candidates in the user's coordinates, best first. exhaustive, new: as in `is_certain`."""
     if not len(candidates):
         return no_pose("no pose was found", batches)
     candidates = weighed(candidates, sets, rule)
     alarms, (ahead, other) = float(candidates.log10_false_alarms[0]), lead(candidates, sets, rule)
     chance = f"unrelated points are expected to fit as well under {_number(alarms)} of all poses"
     count = float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
-    certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches)
+    certain = is_certain(candidates, sets, rule, exhaustive=exhaustive, batches=batches, new=new)
     off, bent, rival = math.inf, False, -1
     if certain:
         pairs = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from planted import degrees_between, directions, plant
+from planted import degrees_between, directions, plant, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import bearings
@@ -281,3 +281,22 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
     result = search_poses(sets, settings=replace(DEFAULT, max_batches=1))
     assert result.verdict == "failed"
     assert not len(result.candidates)
+
+
+def test_a_pose_that_was_just_found_is_in_doubt_until_another_batch_has_not_bettered_it():
+    bearings, points, rotation, _ = view_with_outliers(np.random.default_rng(1), 120, 100)
+    batches = []
+
+    class AfterTheFirst(Deadline):
+        def passed(self) -> bool:
+            return bool(batches)
+
+    cut = search_poses(
+        PointSets(bearings, points), deadline=AfterTheFirst(), progress=lambda number, _: batches.append(number)
+    )
+    assert cut.batches == 1
+    assert degrees_between(cut.best[0], rotation) < 0.5
+    assert cut.verdict == "ambiguous"
+    assert "too few batches" in cut.reason
+    whole = search_poses(PointSets(bearings, points))
+    assert (whole.verdict, whole.batches) == ("confident", 2)

@@ -1,6 +1,7 @@
 """What a verdict asks for beside few false alarms: residuals that carry the evidence, a lead, a pose that is fixed."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,6 +54,18 @@ def test_a_pose_that_its_points_leave_loose_is_ambiguous() -> None:
         assert found.log10_false_alarms < -2
         assert found.verdict == verdict
         assert ("loose" in found.reason) == (verdict == "ambiguous")
+
+
+@pytest.mark.parametrize(
+    ("matched", "new", "verdict"), [(0.5, False, "confident"), (0.5, True, "ambiguous"), (0.7, True, "confident")]
+)
+def test_a_new_pose_that_leaves_many_points_unmatched_is_ambiguous(matched: float, new: bool, verdict: str) -> None:
+    points = np.random.default_rng(1).uniform(-1, 1, (60, 3))
+    sets = PointSets(directions(points + SHIFT), points)
+    pose = replace(
+        Candidates.unscored(np.eye(3)[None], SHIFT[None]), matched=np.array([matched]), scale=np.array([1e-4])
+    )
+    assert judged(pose, sets, batches=1, new=new).verdict == verdict
 
 
 def test_a_different_pose_that_fits_as_well_leaves_a_doubt() -> None:
