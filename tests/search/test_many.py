@@ -278,8 +278,9 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
     rng = np.random.default_rng(4)
     sets = PointSets(directions(rng.normal(size=(300, 3)) + [0, 0, 4]), rng.normal(size=(280, 3)))
     sets = replace(sets, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
-    result = search_poses(sets, settings=replace(DEFAULT, max_batches=1))
+    result = search_poses(sets)
     assert result.verdict == "failed"
+    assert result.batches == 0
     assert not len(result.candidates)
 
 
