@@ -148,7 +148,7 @@ class SearchSettings:
 
     max_batches: int = 32
     starts: int = 1200
-    first_starts: int = 72
+    first_starts: int = 48
     least_kept: int = 3
     recipes: tuple[Recipe, ...] = (Recipe(0.0, 0.5), Recipe(1.0, 0.8), Recipe(0.5, 1.2))
     coarse: Stages = (ClusterStage(64, 0.3, 0.1, iterations=10, kept=48, apart_deg=3.0, halvings=(6, 8)),)

@@ -52,7 +52,7 @@ def test_search_finds_planted_poses(problem):
 
 def test_batches_grow_until_they_are_full():
     sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
-    assert sizes == [72, 144, 288, 576, 1152, 1200, 1200, 1200]
+    assert sizes == [48, 96, 192, 384, 768, 1200, 1200, 1200]
     for stage in (*DEFAULT.coarse, *DEFAULT.middle):
         kept = [DEFAULT.kept_by(stage, starts) for starts in sizes]
         assert kept == sorted(kept)
@@ -70,7 +70,7 @@ def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
     related = PointSets(problem.bearings[1].double().numpy(), problem.points3d[1].double().numpy())
     easy = search_poses(related)
     assert easy.verdict == "confident"
-    assert easy.batches <= 4  # 1080 starts
+    assert easy.batches <= 4  # 720 starts
 
 
 def test_neighbours_padding_and_batch_size_do_not_matter(problem):
@@ -286,18 +286,19 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
 
 def test_a_pose_that_was_just_found_is_in_doubt_until_another_batch_has_not_bettered_it():
     bearings, points, rotation, _ = view_with_outliers(np.random.default_rng(1), 120, 100)
-    batches = []
+    batches, settings = [], replace(DEFAULT, first_starts=72)
 
     class AfterTheFirst(Deadline):
         def passed(self) -> bool:
             return bool(batches)
 
     cut = search_poses(
-        PointSets(bearings, points), deadline=AfterTheFirst(), progress=lambda number, _: batches.append(number)
-    )
+        PointSets(bearings, points), settings=settings, deadline=AfterTheFirst(),
+        progress=lambda number, _: batches.append(number),
+    )  # fmt: skip
     assert cut.batches == 1
     assert degrees_between(cut.best[0], rotation) < 0.5
     assert cut.verdict == "ambiguous"
     assert "too few batches" in cut.reason
-    whole = search_poses(PointSets(bearings, points))
+    whole = search_poses(PointSets(bearings, points), settings=settings)
     assert (whole.verdict, whole.batches) == ("confident", 2)

@@ -13,7 +13,7 @@ class Evidence:
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
     loose_deg: error of the rotation about its least certain axis that is exceeded once in a thousand, at most.
     hits: batches of starts that must have found the pose, so that a better one is unlikely to have been missed: the
-    first four have 1080 starts, of which 8 are within 30 degrees of any rotation. Of so many batches well_matched_hits
+    first four have 720 starts, of which 5 are within 30 degrees of any rotation. Of so many batches well_matched_hits
     are enough where the share well_matched is matched: it leaves a better pose little to explain. Or
     matched, over_chance: this share of the points is matched, and so many times the share expected by chance. A pose
     that was just found is accepted after another batch; at once if the share well_matched is matched.
