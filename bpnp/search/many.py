@@ -80,7 +80,8 @@ def search_poses(
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
     scene = entered()
-    if any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in (scene.image, scene.seen)):
+    lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
+    if any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, sets, few)
     if (safe := _from_batches(pool, around, tell)) is not None:
