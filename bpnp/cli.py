@@ -14,7 +14,7 @@ from importlib.metadata import version
 from bpnp.commands import COMMANDS
 from bpnp.commands.parser import first_line, parsed_arguments
 from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
-from bpnp.configs import config_names, packaged_config
+from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
 WIDTH = 80  # columns of the help
@@ -122,9 +122,12 @@ def _with_packaged_configs(arguments: Sequence[str]) -> list[str]:
     words = [part for text in arguments for part in (text.split("=", 1) if text.startswith("--config=") else [text])]
     for i, before in enumerate(words[:-1], 1):
         if before in ("-c", "--config"):
-            words[i] = packaged_config(words[i])
-            if not os.path.isfile(words[i]):
-                _known(words[i], config_names(), "a configuration file or the name of a packaged one")
+            file = packaged_config(words[i])
+            if not os.path.isfile(file):
+                _known(file, config_names(), "a configuration file or the name of a packaged one")
+            if file != words[i] not in config_names():
+                print(f"bpnp: there is no {words[i]} in this folder, so the packaged {file} is used", file=sys.stderr)
+            words[i] = file
     return words
 
 

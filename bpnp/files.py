@@ -1,4 +1,4 @@
-"""Files and folders that are written whole or not at all, locks, the checksum of bytes, and the user's cache."""
+"""Files and folders written whole or not at all, locks, checksums, the packaged configurations, the user's cache."""
 
 import fcntl
 import hashlib
@@ -12,6 +12,8 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+CONFIGS = Path(__file__).parent / "configs"  # in a checkout a link to the folder `configs` at its top
 
 
 @contextmanager
@@ -134,3 +136,19 @@ def cache_folder() -> Path:
     if chosen := os.environ.get("BPNP_CACHE"):
         return Path(chosen)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bpnp"
+
+
+def packaged_config(name: str) -> str:
+    """The file of a configuration: a path that is a file as it is, or of a name such as `quickstart` the packaged one.
+
+    >>> Path(packaged_config("quickstart")).name
+    'quickstart.yaml'
+    """
+    inside = name.removeprefix("configs/").removesuffix(".yaml")
+    path = CONFIGS / f"{inside}.yaml"
+    return str(path) if path.is_file() and not Path(name).is_file() else name
+
+
+def config_names() -> list[str]:
+    """The names that `packaged_config` takes."""
+    return sorted(str(path.relative_to(CONFIGS).with_suffix("")) for path in CONFIGS.rglob("*.yaml"))

@@ -16,7 +16,6 @@ GROUND = {
     "geometry",
     "cameras",
     "files",
-    "configs",
     "lazy",
     "metrics",
     "loops",

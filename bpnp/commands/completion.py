@@ -6,7 +6,7 @@ from typing import Any
 
 from bpnp.commands.parser import command_parser
 from bpnp.commands.training_help import GROUPS, LIGHTNING, OPTIONS
-from bpnp.configs import config_names
+from bpnp.files import config_names
 
 Commands = Mapping[str, Callable[..., Any] | Mapping[str, Any]]
 WEIGHTS = Path(__file__).parents[1] / "weights"

@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Literal
 
 from bpnp.commands.output import console, progress, say
 from bpnp.commands.parser import at_least
-from bpnp.configs import packaged_config
-from bpnp.files import claimed
+from bpnp.files import claimed, packaged_config
 from bpnp.report.tables.published import Paper
 
 if TYPE_CHECKING:

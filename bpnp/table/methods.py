@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 from torch import nn
 
-from bpnp.configs import packaged_config
+from bpnp.files import packaged_config
 from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.table.pairs import build

@@ -16,7 +16,8 @@ from bpnp import BPnPNet
 from bpnp.cli import main
 from bpnp.training import BlindPnPTask
 
-CONFIGS = Path(bpnp.__file__).parent / "configs"
+CONFIGS = Path(bpnp.__file__).parents[1] / "configs"
+EXPERIMENT = "PoseLossWarmup.start_epoch"  # modelnet40 names the paper's 120 epochs itself
 RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
 
@@ -119,5 +120,19 @@ def test_a_recipe_says_only_what_differs_from_the_defaults(recipe: str) -> None:
     data = import_object(content["data"]["class_path"])
     found = [*restated(content["model"], BlindPnPTask), *restated(content["data"].get("init_args"), data)]
     found += restated(content["trainer"], Trainer)
-    assert found == []
+    assert found == ([EXPERIMENT] if recipe == "modelnet40.yaml" else [])
     assert list(restated({"batch_size": 16}, data)) == [f"{data.__name__}.batch_size"]
+
+
+@pytest.mark.parametrize("file", sorted(CONFIGS.rglob("*.yaml")), ids=lambda file: file.stem)
+def test_a_configuration_begins_with_what_it_is_for_what_it_needs_and_how_long_it_takes(file: Path) -> None:
+    comments = [line for line in file.read_text().splitlines() if line.startswith("#")]
+    heads = [line[2:].split(":")[0] for line in comments if not line.startswith("#   ")]
+    assert heads == ["For", "Needs", "Takes"]
+    assert file.read_text().startswith("\n".join(comments))
+
+
+def test_the_papers_experiment_names_its_epochs() -> None:
+    trainer = yaml.safe_load((CONFIGS / "modelnet40.yaml").read_text())["trainer"]
+    (warmup,) = (each for each in trainer["callbacks"] if each["class_path"].endswith("PoseLossWarmup"))
+    assert (warmup["init_args"]["start_epoch"], trainer["max_epochs"]) == (120, 120 + 80)
