@@ -21,6 +21,7 @@ from bpnp.report.samples import PairView, select_views, thin, views_from, write_
 from bpnp.types import Batch, Prediction
 
 POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
+NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
 class ResultsWriter(Callback):
@@ -36,16 +37,18 @@ class ResultsWriter(Callback):
     chosen: Sequence[PairView]
     views: list[PairView]
     poses: dict[tuple[int, str], list[Any]]
+    numbers: set[int]  # of the problems so far
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.rows, self.losses, self.chosen, self.views = [], {}, (), []
+        self.rows, self.losses, self.chosen, self.views, self.numbers = [], {}, (), [], set()
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        self._note_numbers(batch)
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
         views = views_from(outputs["prediction"], batch)
         self.chosen = select_views([*self.chosen, *views])
@@ -64,6 +67,7 @@ class ResultsWriter(Callback):
     def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
         if trainer.is_global_zero:
             rows = [row for part, _, _, _ in gathered for row in part]
+            _check_repeated(rows)
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer, "test")
@@ -76,11 +80,12 @@ class ResultsWriter(Callback):
             )
 
     def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.poses = {}
+        self.poses, self.numbers = {}, set()
 
     def on_predict_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        self._note_numbers(batch)
         self.poses |= _pose_rows(outputs, batch)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -92,6 +97,13 @@ class ResultsWriter(Callback):
             with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as table:
                 csv.writer(table).writerows(rows)
             rank_zero_info(f"{len(merged)} poses in {path}")
+
+    def _note_numbers(self, batch: Batch) -> None:
+        """Raises ValueError for a number that another problem had: of the two only one would be in the results."""
+        for number in batch.index.tolist():
+            if number in self.numbers:
+                raise ValueError(f"expected one number in `Batch.index` for each problem, got {number} again; {NUMBER}")
+            self.numbers.add(number)
 
     def _folder(self, trainer: Trainer, stage: str) -> Path:
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / stage
@@ -112,6 +124,18 @@ def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], li
             values = numbers[i] if is_found else [""] * 7
             rows[int(batch.index[i]), name] = [batch.ids[i], name, *values, is_found, converged]
     return rows
+
+
+def _check_repeated(rows: Sequence[PairRow]) -> None:
+    """Among several processes the first problems are repeated to fill the last batch: raises ValueError for others."""
+    first: dict[tuple[int, str], PairRow] = {}
+    for row in rows:
+        other = first.setdefault((row.index, row.estimate), row)
+        if (other.id, other.m, other.n) != (row.id, row.m, row.n):
+            raise ValueError(
+                f"expected one number in `Batch.index` for each problem, got {row.index} for {other.id} and {row.id} "
+                f"of {other.m} and {row.m} 2D points; {NUMBER}"
+            )
 
 
 def _settings(trainer: Trainer) -> dict[str, Any]:

@@ -82,6 +82,7 @@ class BlindPnPTask(LightningModule):
         self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
         self.refine_validation = refine_validation
         self.training_seed: str | None = None  # of the checkpoint that was loaded, if it is known
+        self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
@@ -115,6 +116,16 @@ class BlindPnPTask(LightningModule):
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
         return self.solver(batch)
+
+    def on_validation_epoch_start(self) -> None:
+        self.numbers.clear()
+
+    def on_validation_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """A data module that collates with `Batch.from_arrays` numbers the problems of each batch from 0 on."""
+        number_globally(batch, self.numbers, processes=self.trainer.world_size)
+
+    on_test_epoch_start = on_predict_epoch_start = on_validation_epoch_start
+    on_test_batch_start = on_predict_batch_start = on_validation_batch_start
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
         """The matching loss and, with a weight, that of the pose; a sample whose pose did not converge has none."""
@@ -237,6 +248,26 @@ class BlindPnPTask(LightningModule):
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
             loss.reset()
+
+
+def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
+    """Number the problems of a batch after all `numbers` so far if one of its own has been seen, and note its numbers.
+
+    Raises ValueError among several processes, which do not know the numbers of the others.
+    """
+    index = batch.index.tolist()
+    if len(set(index)) < len(index) or not numbers.isdisjoint(index):
+        if processes > 1:
+            raise ValueError(
+                f"expected one number in `Batch.index` for each problem, got some of {index} again; try "
+                "Batch.from_arrays(..., index=...) with the position of each problem in its data set"
+            )
+        first = max(numbers, default=-1) + 1
+        unnamed = [name == str(number) for name, number in zip(batch.ids, index, strict=True)]
+        batch.ids = tuple(str(first + i) if unnamed[i] else name for i, name in enumerate(batch.ids))
+        batch.index = torch.arange(first, first + len(index), device=batch.index.device)
+        index = batch.index.tolist()
+    numbers.update(index)
 
 
 def _wait(device: torch.device) -> None:

@@ -1,17 +1,18 @@
 import csv
 import math
+import warnings
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from lightning import Callback, Trainer
+from lightning import Callback, LightningDataModule, Trainer
 from planted import padded, plant, posed
 from planted_model import plant_model
 from scipy.spatial.transform import Rotation
 from small_data import SMALL_MESHES, quiet_trainer, small_net
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
+from torch.utils.data import DataLoader, Dataset
 
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
@@ -20,7 +21,7 @@ from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup
 from bpnp.training.losses import correspondence_loss, pose_loss
 from bpnp.training.results_writer import ResultsWriter
-from bpnp.training.task import BlindPnPTask, TrainingDivergedError
+from bpnp.training.task import BlindPnPTask, TrainingDivergedError, number_globally
 
 
 class CountingSolver(nn.Module):
@@ -200,6 +201,74 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     lines = (tmp_path / "predict" / "poses.csv").read_text().splitlines()
     assert lines[0] == "id,estimate,qw,qx,qy,qz,tx,ty,tz,found,converged"
     assert len(lines) == 1 + 7 * 3
+
+
+class Numbers(Dataset):
+    """Ten problems without a number, as a user's own data set gives them."""
+
+    def __len__(self) -> int:
+        return 10
+
+    def __getitem__(self, number: int) -> Batch:
+        return plant(1, 12, seed=number, dtype=torch.float32).batch()
+
+
+def collated(problems: list[Batch]) -> Batch:
+    """What docs/data.md says of one's own data: `Batch.from_arrays` of lists, without `index`."""
+    names = ("points2d", "points3d", "rotation", "translation", "match3d")
+    return Batch.from_arrays(*([getattr(problem, name)[0] for problem in problems] for name in names))
+
+
+class OwnData(LightningDataModule):
+    def loader(self) -> DataLoader:
+        return DataLoader(Numbers(), batch_size=2, collate_fn=collated)
+
+    test_dataloader = predict_dataloader = val_dataloader = loader
+
+
+def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path: Path) -> None:
+    task, one_batch = BlindPnPTask(small_net()), collated([Numbers()[i] for i in range(10)])
+    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="expected one (pair|problem) per")
+        run.test(task, datamodule=OwnData(), verbose=False)
+        tested = dict(run.callback_metrics)
+        run.predict(task, datamodule=OwnData(), return_predictions=False)
+        run.validate(task, datamodule=OwnData(), verbose=False)
+        validated = dict(run.callback_metrics)
+    rows = read_results(tmp_path / "test").of("ransac")
+    assert [(row.index, row.id) for row in rows] == [(i, str(i)) for i in range(10)]
+    assert len((tmp_path / "predict" / "poses.csv").read_text().splitlines()) == 1 + 10 * 3
+    with torch.no_grad():
+        expected = correspondence_loss(task.solver.eval().match(one_batch).assignment, one_batch.match3d).mean()
+    assert float(tested["test/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
+    assert float(validated["val/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
+
+
+class Unnumbered(BlindPnPTask):
+    """A user's own task: its batches keep the numbers that they came with."""
+
+    def on_test_batch_start(self, batch: Batch, *_: int) -> None: ...
+
+
+def test_one_number_of_two_problems_is_an_error_in_the_results_of_any_task(tmp_path: Path) -> None:
+    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
+    with pytest.raises(
+        ValueError, match=r"expected one number in `Batch.index` for each .*, got 0 again; try .*index="
+    ):
+        run.test(Unnumbered(small_net()), datamodule=OwnData(), verbose=False)
+    assert not (tmp_path / "test").exists()
+
+
+def test_several_processes_cannot_number_anew() -> None:
+    first, second = (collated([Numbers()[i], Numbers()[i + 1]]) for i in (0, 2))
+    numbers = set[int]()
+    number_globally(first, numbers, processes=2)
+    assert numbers == {0, 1}
+    with pytest.raises(
+        ValueError, match=r"expected one number in `Batch.index` for each problem, got some of \[0, 1\]"
+    ):
+        number_globally(second, numbers, processes=2)
 
 
 def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Path) -> None:
