@@ -14,7 +14,7 @@ from bench_search import source
 from bpnp import solve
 from bpnp.metrics.errors import rotation_error
 from bpnp.report.figures import save_figure
-from bpnp.report.pictures import solution_picture
+from bpnp.solving.pictures import solution_picture
 
 
 def main() -> None:

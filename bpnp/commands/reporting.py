@@ -100,7 +100,7 @@ def view(
 
 def _solution(path: Path) -> "PairView":
     """The view of a solution's file. Raises ValueError that names the file."""
-    from bpnp.report.solutions import solution_view
+    from bpnp.solving.pictures import solution_view
     from bpnp.solving.solution import Solution
 
     try:

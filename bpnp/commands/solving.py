@@ -82,7 +82,8 @@ def solve(
         raise ValueError("expected --photo with --picture and --camera, got it without")
     if picture is not None:
         from bpnp.report.figures import SUFFIXES, save_figure  # matplotlib, where something is drawn
-        from bpnp.report.pictures import read_photo, size_in_camera, solution_picture
+        from bpnp.report.photos import read_photo, size_in_camera
+        from bpnp.solving.pictures import solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
             raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")

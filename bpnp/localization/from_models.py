@@ -22,13 +22,12 @@ from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.datamodules.keyed_random import row_keys
 from bpnp.files import write_text
 from bpnp.metrics.errors import centre_error, rotation_error
-from bpnp.report.exports import pose_text
 from bpnp.report.figures import save_figure
 from bpnp.report.palette import VERDICTS
 from bpnp.report.photos import PhotoFinder, picture_box
-from bpnp.report.pictures import solution_picture
 from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.rows import number
+from bpnp.solving.pictures import pose_text, solution_picture
 from bpnp.solving.solution import Solution
 from bpnp.solving.solve import solve
 from bpnp.types import Batch

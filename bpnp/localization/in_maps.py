@@ -13,12 +13,12 @@ from bpnp.maps.colmap_database import is_database, read_database
 from bpnp.maps.keypoints import Keypoints, detected_keypoints, read_features
 from bpnp.maps.photos import camera_from_exif, photo_size
 from bpnp.maps.scene_map import SceneMap
-from bpnp.report.exports import pose_text
 from bpnp.report.figures import save_figure
 from bpnp.report.palette import VERDICTS
-from bpnp.report.pictures import read_photo, solution_picture
+from bpnp.report.photos import read_photo
 from bpnp.report.tables.fitted_table import FittedTable
 from bpnp.report.tables.rows import number
+from bpnp.solving.pictures import pose_text, solution_picture
 from bpnp.solving.solution import Solution
 
 # The last four are found too although Pillow may not read them, so that the error names the photo.

@@ -12,15 +12,14 @@ if TYPE_CHECKING:
     from bpnp.report.results import PairRow, Results, cause_shares, count_inliers, rows_from, summarise
     from bpnp.report.runs import table
     from bpnp.report.samples import PairView, read_views, select_views, views_from, write_views
-    from bpnp.report.solutions import solution_view, view_of
     from bpnp.report.tables.result_tables import learning_table, recall_table, report, results_table
     from bpnp.report.training_log import TrainingLog, read_training_log
 
 __all__ = [
     "PairRow", "PairView", "Results", "TrainingLog", "cause_shares", "count_inliers", "learning_table", "plot_image",
     "plot_pair", "plot_residuals", "plot_scene", "read_results", "read_training_log", "read_views", "recall_curve",
-    "recall_table", "report", "results_table", "rows_from", "save_figure", "select_views", "solution_view", "summarise",
-    "table", "view_of", "views_from", "write_page", "write_results", "write_views",
+    "recall_table", "report", "results_table", "rows_from", "save_figure", "select_views", "summarise",
+    "table", "views_from", "write_page", "write_results", "write_views",
 ]  # fmt: skip
 
 MODULES = {
@@ -31,7 +30,6 @@ MODULES = {
     "bpnp.report.results": ("PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"),
     "bpnp.report.runs": ("table",),
     "bpnp.report.samples": ("PairView", "read_views", "select_views", "views_from", "write_views"),
-    "bpnp.report.solutions": ("solution_view", "view_of"),
     "bpnp.report.tables.result_tables": ("learning_table", "recall_table", "report", "results_table"),
     "bpnp.report.training_log": ("TrainingLog", "read_training_log"),
 }

@@ -19,7 +19,6 @@ from bpnp.report.pictures import Lines, estimate_of, plot_image
 from bpnp.report.results import Results
 from bpnp.report.runs import read_runs, series_of
 from bpnp.report.samples import Array, PairView
-from bpnp.report.solutions import solution_view
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,17 +62,16 @@ def line_style(colour: int, dashes: int) -> dict[str, Any]:
 
 
 def plot_pair(
-    view: Any, *, estimate: str | None = None, lines: Lines | None = "match3d", photo: Array | None = None
+    view: PairView, *, estimate: str | None = None, lines: Lines | None = "match3d", photo: Array | None = None
 ) -> "Figure":
     """A pair in space, points with true and estimated cameras, and in the image, seen and reprojected points.
 
-    view: `PairView` of a test, or the solution of `bpnp.solve`. estimate, lines: see `plot_image`. photo: (h, w, 3)
+    estimate, lines: see `plot_image`. photo: (h, w, 3)
     uint8 under the image points, undistorted, that fills `bpnp.report.photos.box_of(view)`. Raises ValueError for an
     unknown estimate.
     """
     from matplotlib.figure import Figure
 
-    view = view if isinstance(view, PairView) else solution_view(view)
     figure = Figure(figsize=(13, 6), layout="constrained")
     figure.suptitle(_text(view.id), fontsize=10)
     plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), view)

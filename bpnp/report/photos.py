@@ -1,16 +1,46 @@
-"""Photos under the 2D views: undistorted crops in normalised image coordinates, small enough for a page."""
+"""Photos: read from files, and as undistorted crops that lie under the image points of a page."""
 
 import base64
 import io
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from bpnp.cameras import Camera, Lens
 from bpnp.report.samples import Array, PairView
 
 MARGIN = 0.15  # of the extent of the image points, around them
 MOST_BYTES = 3_000_000  # of all photos of a page
+
+
+def read_photo(path: Path | str) -> Array:
+    """The picture in a file (h, w, 3), uint8. Raises ValueError that names a file that is none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as photo:
+            return np.asarray(photo.convert("RGB"))
+    except OSError as error:
+        raise ValueError(f"expected a picture, got {path}: {error}") from error
+
+
+def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
+    """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
+
+    Raises ValueError for a photo of another shape than the camera's images.
+    """
+    height, width = photo.shape[:2]
+    known = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
+    if not all(known):
+        return width, height
+    if abs(width * known[1] - height * known[0]) > max(*known, width, height):  # a pixel of rounding on a side
+        raise ValueError(
+            f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
+            f"{height}; try the photo of this camera"
+        )
+    return known
 
 
 class Box(NamedTuple):

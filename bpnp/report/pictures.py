@@ -1,72 +1,21 @@
-"""The image of a pair and the residuals of its matches as matplotlib axes; the picture of a solution.
+"""The image of a pair and the residuals of its matches as matplotlib axes.
 
 Axes are in pixels of the pair's camera, in normalised coordinates where there is none.
 """
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from bpnp.cameras import Camera, Lens, in_front
-from bpnp.report.palette import LIGHT, QUIET, VERDICTS
-from bpnp.report.photos import Box, picture_box
+from bpnp.cameras import Camera, in_front
+from bpnp.report.palette import LIGHT, QUIET
+from bpnp.report.photos import Box, picture_box, size_in_camera
 from bpnp.report.samples import Array, PairView
-from bpnp.report.solutions import solution_view
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 Lines = Literal["match3d", "assigned3d"]
-WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches
-
-
-def read_photo(path: Path | str) -> Array:
-    """The picture in a file (h, w, 3), uint8. Raises ValueError that names a file that is none."""
-    from PIL import Image
-
-    try:
-        with Image.open(path) as photo:
-            return np.asarray(photo.convert("RGB"))
-    except OSError as error:
-        raise ValueError(f"expected a picture, got {path}: {error}") from error
-
-
-def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
-    """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
-
-    Raises ValueError for a photo of another shape than the camera's images.
-    """
-    height, width = photo.shape[:2]
-    known = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
-    if not all(known):
-        return width, height
-    if abs(width * known[1] - height * known[0]) > max(*known, width, height):  # a pixel of rounding on a side
-        raise ValueError(
-            f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
-            f"{height}; try the photo of this camera"
-        )
-    return known
-
-
-def solution_picture(
-    solution: Any, *, title: str | None = None, photo: Array | None = None, box: Box | None = None
-) -> "Figure":
-    """The image of a solution, as `bpnp.solve` returns it, and a close-up of its residuals; see `plot_image`."""
-    from matplotlib.figure import Figure
-
-    view = solution_view(solution, title=title)
-    figure = Figure(layout="constrained")
-    axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
-    plot_image(axes, view, photo=photo, box=box)
-    plot_residuals(close, view)
-    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
-    height = float(np.clip(WIDTH * (bottom - top) / (right - left), 3, 10))
-    figure.set_size_inches(WIDTH + CLOSE_UP, height + CAPTIONS)
-    figure.suptitle(view.id.replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
-    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
-    return figure
 
 
 def plot_image(

@@ -136,7 +136,8 @@ class Solution:
         coordinates without a camera. photo: a file or (h, w, 3) uint8 under the points, as it was taken; it needs a
         camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
         """
-        from bpnp.report.pictures import read_photo, solution_picture
+        from bpnp.report.photos import read_photo
+        from bpnp.solving.pictures import solution_picture
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
         drawn = self if camera is None else replace(self, camera=camera_from(camera))
@@ -161,23 +162,9 @@ class Solution:
         the image file. size: its width and height, pixels; by default the camera's, or what holds the points. Raises
         ValueError without a pose.
         """
-        from bpnp.report.exports import write_colmap
+        from bpnp.solving.pictures import write_colmap
 
         return write_colmap(self, Path(folder), camera=camera, name=name, size=size)
-
-    def to_nerfstudio(
-        self, path: Path | str, *, camera: Any = None, name: str = "image.jpg", size: tuple[int, int] | None = None
-    ) -> Path:
-        """nerfstudio's transforms.json with this image as its frame; arguments and errors as for `to_colmap`."""
-        from bpnp.report.exports import write_nerfstudio
-
-        return write_nerfstudio(self, Path(path), camera=camera, name=name, size=size)
-
-    def to_rerun(self, entity: str = "bpnp", *, camera: Any = None, size: tuple[int, int] | None = None) -> None:
-        """Log points, camera and keypoints to rerun's current recording. Raises ValueError without rerun-sdk."""
-        from bpnp.report.exports import log_to_rerun
-
-        log_to_rerun(self, entity, camera=camera, size=size)
 
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""

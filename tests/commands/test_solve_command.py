@@ -17,7 +17,7 @@ import bpnp
 from bpnp import Solution
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.report.pictures import solution_picture
+from bpnp.solving.pictures import solution_picture
 
 PLANTED = plant(1, 40, seed=2)
 X, P = PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy()

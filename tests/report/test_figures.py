@@ -1,3 +1,4 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -5,7 +6,6 @@ import pytest
 from report_data import HOSTILE, view, write_run
 
 from bpnp.report.figures import plot_pair, recall_curve, save_figure
-from bpnp.report.solutions import view_of
 
 
 def points_of(axes: object, marker: str) -> np.ndarray:
@@ -50,14 +50,11 @@ def test_wrong_matches_are_dotted_and_unknown_ones_are_not() -> None:
     (wrong,) = plot_pair(planted, lines="assigned3d").axes[1].collections
     assert len(wrong.get_segments()) == 10
     assert wrong.get_linestyles()[0][1] is not None
-    assert planted.pose is not None
-    matches = np.stack([np.arange(4), np.arange(4)], -1)
-    solved = view_of(planted.points2d, planted.points3d, *planted.pose, matches=matches)
+    assigned = np.where(np.arange(10) < 4, np.arange(10), -1)
+    solved = replace(planted, match3d=np.full(10, -1), assigned3d=assigned)
     (unknown,) = plot_pair(solved).axes[1].collections
     assert len(unknown.get_segments()) == 4
     assert unknown.get_linestyles()[0][1] is None
-    with pytest.raises(ValueError, match=r"expected `matches` of 10 2D and 10 3D points, got indices up to \[0, 10\]"):
-        view_of(planted.points2d, planted.points3d, *planted.pose, matches=np.array([[0, 10]]))
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
