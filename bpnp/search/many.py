@@ -124,9 +124,9 @@ def _enumerated(
     sets: PointSets, entered: Callable[[], Scene], settings: SearchSettings, deadline: Deadline
 ) -> tuple[SearchResult, bool]:
     """The result of few points, and whether every hypothesis was tried."""
-    found, exhausted = search_few(sets, deadline, settings)
-    few = judged(found, sets, batches=0, exhaustive=True, rule=settings.evidence)
-    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=True), exhausted
+    found = search_few(sets, deadline, settings)
+    few = judged(found.candidates, sets, batches=0, exhaustive=True, rule=settings.evidence)
+    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=True), found.exhausted
 
 
 def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None]) -> SearchResult | None:

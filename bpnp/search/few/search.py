@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,34 +34,55 @@ def is_crowd(sets: PointSets) -> bool:
     return not is_few(replace(sets, prior=None))
 
 
-def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
-    """Candidates in the user's coordinates, best first, and whether every hypothesis was tried.
+class Enumerated(NamedTuple):
+    """What an enumeration found, and how it ended.
+
+    candidates: in the user's coordinates, best first. solved: hypotheses, each a minimal problem. exhausted: whether
+    every hypothesis of these points was tried. safe: whether it ended before that, since the best pose was certain.
+    interrupted: whether the deadline passed first. None of the three: as many hypotheses were solved as are allowed.
+    """
+
+    candidates: Candidates
+    solved: int
+    exhausted: bool
+    safe: bool
+    interrupted: bool
+
+
+def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> Enumerated:
+    """Enumerate the poses of few points.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
     """
 
     certain: Candidates | None = None
+    annotated = sets
     if sets.cosines3d is not None:
         sets = replace(sets, normals3d=None, cosines3d=None)
 
     def is_safe(found: FewPoses) -> bool:
         nonlocal certain
-        candidates = weighed(_candidates(found, sets, settings), sets, settings.evidence)
+        candidates = weighed(_candidates(found, annotated, settings), sets, settings.evidence)
         certain = candidates if is_certain(candidates, sets, settings.evidence, exhaustive=True) else None
         return certain is not None
+
+    def ended(candidates: Candidates, found: FewPoses, solved: int) -> Enumerated:
+        exhausted, safe = found.exhausted, certain is not None
+        return Enumerated(candidates, solved, exhausted, safe, not (exhausted or safe) and deadline.passed())
 
     radius = RADIUS if sets.floor is None else FLOORS * sets.floor
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
     chosen = SETTINGS._replace(stages=()) if near else SETTINGS
     found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
-    candidates = _candidates(found, sets, settings) if certain is None else certain
+    candidates = _candidates(found, annotated, settings) if certain is None else certain
     if certain is not None or not tracked or not (near or margin(found) < 0):
-        return candidates, found.exhausted
+        return ended(candidates, found, found.solved)
     free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
-    candidates = Candidates.concatenated([candidates, _candidates(free, sets, settings)])
-    return candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]], free.exhausted
+    candidates = Candidates.concatenated([candidates, _candidates(free, annotated, settings)])
+    order = np.argsort(-candidates.score, kind="stable")[: settings.kept]
+    return ended(candidates[order], free, found.solved + free.solved)
 
 
 def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
@@ -72,16 +94,32 @@ def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> C
     free = np.maximum(2 * count - 2 * found.used, 1)  # numbers that were measured, less those that were fitted
     scale = np.sqrt(np.where(np.isfinite(residual), residual, 0.0) ** 2 @ np.ones(len(sets.bearings)) / free)
     scale = np.maximum(scale, sets.floor or 1e-5)
-    score = _log_likelihood(sets, rotation, translation, scale, settings.outliers)
+    score = _log_likelihood(sets, rotation, translation, scale, settings)
     matched = count / min(len(sets.bearings), len(sets.points3d))
     return replace(Candidates.unscored(rotation, translation), score=score, matched=matched, scale=scale)
 
 
-def _log_likelihood(sets: PointSets, rotation: Array, translation: Array, scale: Array, outliers: float) -> Array:
-    """Mean log-likelihood of the bearings under the mixture of `search_poses`, for each pose (c,), nats."""
+def _log_likelihood(
+    sets: PointSets, rotation: Array, translation: Array, scale: Array, settings: SearchSettings
+) -> Array:
+    """Mean log-likelihood of the bearings under the mixture of `search_poses` for each pose (c,), nats, as the
+    annealing has it: in units in which a kernel is 1 / s^2 where it is largest, with scores, labels and visibility.
+    """
     camera = sets.points3d @ rotation.transpose(0, 2, 1) + translation[:, None]
     seen = camera / np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
+    m, n = len(sets.bearings), len(sets.points3d)
+    weight2d = np.ones(m) if sets.scores2d is None else sets.scores2d
+    weight3d = np.ones(n) if sets.scores3d is None else sets.scores3d
+    fits = np.ones((m, n), np.bool_)
+    if sets.labels2d is not None and sets.labels3d is not None:
+        fits = (sets.labels2d[:, None] == sets.labels3d) | (sets.labels2d[:, None] < 0) | (sets.labels3d < 0)
+    weight2d, weight3d = weight2d * fits.any(1), weight3d * fits.any(0)
+    odds = fits @ weight3d / max(float(weight3d.sum()), 1e-12)
+    if (cones := sets.cones3d) is not None:
+        facing = -(cones[:, :3] @ rotation.transpose(0, 2, 1) * seen).sum(-1) - cones[:, 3]
+        weight3d = weight3d * np.clip(0.5 + facing / (2 * settings.facing.softness), settings.facing.unseen, 1)
     variance = (scale**2)[:, None, None]
-    exponent = (sets.bearings @ seen.transpose(0, 2, 1) - 1) / variance
-    density = (np.exp(exponent) / (2 * math.pi * variance)).sum(-1) * (1 - outliers) / len(sets.points3d)
-    return np.asarray(np.log(density + outliers / sets.image.solid_angle).mean(-1))
+    kernel = fits * np.exp((sets.bearings @ seen.transpose(0, 2, 1) - 1) / variance) / variance
+    explained = (kernel @ (weight3d / weight3d.sum(-1, keepdims=True))[..., None])[..., 0]
+    outliers = 2 * math.pi * settings.outliers / sets.image.solid_angle * np.maximum(odds, 1e-6)
+    return np.asarray(np.log((1 - settings.outliers) * explained + outliers) @ weight2d / weight2d.sum())
