@@ -48,7 +48,13 @@ class Example:
     normals3d: Array | None = None
 
     def rotation_error_deg(self, rotation: Any) -> float:
-        """Angle between a rotation and the true one, degrees."""
+        """Angle between a rotation and the true one, degrees; NaN for one that is not finite, of a failed solution.
+
+        >>> load("mesh").rotation_error_deg(np.full((3, 3), np.nan))
+        nan
+        """
+        if not np.isfinite(np.asarray(rotation)).all():
+            return float("nan")
         return float(np.degrees(Rotation.from_matrix(np.asarray(rotation) @ self.rotation.T).magnitude()))
 
 

@@ -31,6 +31,15 @@ def test_every_example_is_solved(kind: Kind) -> None:
     assert (example.points2d < 2 * example.camera[:2, 2]).all()
 
 
+def test_the_error_of_a_failed_solution_is_not_a_number() -> None:
+    example = load("mesh")
+    failed = bpnp.solve(example.points2d, np.zeros((5, 3)) + [0, 0, 1.0], example.camera)
+    assert failed.verdict == "failed"
+    assert np.isnan(example.rotation_error_deg(failed.rotation))
+    turned = np.diag([-1.0, -1.0, 1.0]) @ example.rotation
+    assert example.rotation_error_deg(turned) == pytest.approx(180)
+
+
 def test_other_names_are_refused() -> None:
     with pytest.raises(ValueError, match="expected an example among mesh, photo, leds, got 'video'"):
         load("video")

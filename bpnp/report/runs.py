@@ -60,27 +60,34 @@ def series_of(runs: Mapping[str, Results]) -> list[Series]:
 
 def trained_only(paths: Sequence[Path | str]) -> bool:
     """Whether these are folders of trainings of which none has results yet."""
-    places = [place for path in paths for place in (Path(path), Path(path) / "test")]
-    return bool(paths) and not any((place / "summary.json").is_file() for place in places)
+    return bool(paths) and not any(path.is_file() for place in paths for path in Path(place).rglob("summary.json"))
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
-    """Results folders by what their paths do not share, at the start or at the end. Of a run's folder, its `test`.
+    """Results folders by what their paths do not share, at the start or at the end; a single one by its run.
 
-    Raises ValueError if there is none.
+    Of a run's folder, its `test`; of a folder of several results, such as that of `bpnp table`, all of them. Raises
+    ValueError if there is none.
     """
     if not paths:
         raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
     folders = [Path(path).absolute() for path in paths]
-    folders = [
-        path / "test" if (path / "test" / "summary.json").is_file() and not (path / "summary.json").exists() else path
-        for path in folders
-    ]
+    folders = [place for path in folders for place in _results_in(path)]
+    if len(folders) == 1:
+        (folder,) = folders
+        return {(folder.parent if folder.name == "test" else folder).name: folder}
     shared = os.path.commonpath([path.parent for path in folders])
     parts = [Path(os.path.relpath(path, shared)).parts for path in folders]
     while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({own[-1] for own in parts}) == 1:
         parts = [own[:-1] for own in parts]
     return {os.path.join(*own): path for own, path in zip(parts, folders, strict=True)}
+
+
+def _results_in(folder: Path) -> list[Path]:
+    for place in (folder, folder / "test"):
+        if (place / "summary.json").is_file():
+            return [place]
+    return sorted(path.parent for path in folder.rglob("summary.json")) or [folder]
 
 
 def seed_groups(runs: Mapping[str, Results]) -> dict[str, tuple[str, ...]]:

@@ -1,6 +1,7 @@
 """The files that a test or a prediction leaves."""
 
 import csv
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,7 @@ from bpnp.report.samples import PairView, select_views, thin, views_from, write_
 from bpnp.types import Batch, Prediction
 
 POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
+RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
 NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
@@ -44,10 +46,13 @@ class ResultsWriter(Callback):
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         self.rows, self.losses, self.chosen, self.views, self.numbers = [], {}, (), [], set()
+        self._check_replaced(trainer)
 
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
+        if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
+            return  # of a task of the user's own
         self._note_numbers(batch)
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
         views = views_from(outputs["prediction"], batch)
@@ -57,7 +62,12 @@ class ResultsWriter(Callback):
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self._write_test(trainer, _gather((self.rows, self.losses, self.chosen, self.views)), complete=True)
+        gathered = _gather((self.rows, self.losses, self.chosen, self.views))
+        if any(rows for rows, *_ in gathered):
+            self._write_test(trainer, gathered, complete=True)
+            return
+        logged = ", ".join(f"{name} {float(value):.6g}" for name, value in trainer.callback_metrics.items())
+        rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Of an interrupted test the pairs that are finished; of several processes those of the first."""
@@ -85,8 +95,9 @@ class ResultsWriter(Callback):
     def on_predict_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
-        self._note_numbers(batch)
-        self.poses |= _pose_rows(outputs, batch)
+        if isinstance(outputs, Prediction):
+            self._note_numbers(batch)
+            self.poses |= _pose_rows(outputs, batch)
 
     def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         gathered = _gather(self.poses)
@@ -97,6 +108,17 @@ class ResultsWriter(Callback):
             with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as table:
                 csv.writer(table).writerows(rows)
             rank_zero_info(f"{len(merged)} poses in {path}")
+
+    def _check_replaced(self, trainer: Trainer) -> None:
+        """Raises ValueError if results of a checkpoint would be replaced by those of a test without one."""
+        summary = self._folder(trainer, "test") / "summary.json"
+        if trainer.ckpt_path is None and summary.is_file():
+            checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
+            if checkpoint is not None:
+                raise ValueError(
+                    f"expected --ckpt_path, since {summary.parent} has the results of {checkpoint}, got none, which "
+                    "would replace them; try --ckpt_path last, or --results.folder for another folder"
+                )
 
     def _note_numbers(self, batch: Batch) -> None:
         """Raises ValueError for a number that another problem had: of the two only one would be in the results."""

@@ -194,7 +194,7 @@ def test_a_checkpoint_that_is_none_is_named(fails: Callable[..., str], tmp_path:
     assert "broken.ckpt" in fails("test", *MESHES, *root, *SMALL_NET, f"--ckpt_path={broken}")
 
 
-def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
     common = [*MESHES, *SMALL_NET, f"--data.root={meshes}", f"--data.cache_dir={tmp_path}/cache",
               f"--trainer.default_root_dir={tmp_path}/run", "--data.val_fraction=0.3"]  # fmt: skip
@@ -210,6 +210,11 @@ def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     )
     assert "━" not in capsys.readouterr().out
     assert (tmp_path / "run" / "predict" / "poses.csv").is_file()
+    trained = (tmp_path / "run" / "test" / "summary.json").read_bytes()
+    assert "last.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
+    assert (tmp_path / "run" / "test" / "summary.json").read_bytes() == trained
+    main(["test", *common, f"--results.folder={tmp_path}/run/untrained"])
+    assert (tmp_path / "run" / "untrained" / "summary.json").is_file()
     capsys.readouterr()
     main(["report", f"{tmp_path}/run/test", "--paper=modelnet40"])
     table = capsys.readouterr().out

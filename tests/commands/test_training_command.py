@@ -56,6 +56,9 @@ class OwnTask(LightningModule):
     def validation_step(self, batch: Any, batch_idx: int) -> None:
         self.log("val/rotation_q2_deg", 0.0)
 
+    def test_step(self, batch: Any, batch_idx: int) -> None:
+        self.log("test/points", float(batch.points2d.shape[1]))
+
     def configure_optimizers(self) -> Any:
         return torch.optim.SGD(self.parameters(), lr=self.rate)
 
@@ -119,6 +122,14 @@ def test_a_task_by_class_path_trains(given: str, tmp_path: Path) -> None:
     main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path)])
     assert seen == [0.5, 0.5]
     assert (tmp_path / "run" / "checkpoints" / "last.ckpt").is_file()
+
+
+def test_a_task_whose_test_step_returns_nothing_is_tested(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    main(["test", "--model=test_training_command.OwnTask", *MESHES, *folders(tmp_path)])
+    (said,) = (record.getMessage() for record in caplog.records if "test/points" in record.getMessage())
+    assert "logged: test/points 24; no results folder: `test_step` does not return a dictionary" in said
+    assert not (tmp_path / "run" / "test").exists()
 
 
 @pytest.mark.parametrize(("name", "kind"), [("procedural-so3", BPnPNet), ("matcher-sfm", Matcher)])

@@ -122,7 +122,12 @@ def test_names_are_what_paths_do_not_share(tmp_path: Path) -> None:
     assert names("x/a/test", "x/b/c/test") == ["a", "b/c"]
     assert names("a/test", "a/untrained") == ["test", "untrained"]
     assert names("a/test", "test") == ["a/test", "test"]
-    assert names("a/test") == ["test"]
+    assert names("a/test") == names("a") == ["a"]
+    for method in ("table/rho-0/blind", "table/rho-1/blind", "run/test", "run/untrained"):
+        (tmp_path / method).mkdir(parents=True)
+        (tmp_path / method / "summary.json").write_text("{}")
+    assert names("table") == ["rho-0", "rho-1"]
+    assert names("run") == ["run"]
 
 
 def test_long_curves_are_thinned_without_moving_their_mean(tmp_path: Path) -> None:
@@ -140,7 +145,7 @@ def test_the_table_has_a_row_per_run_and_estimate(tmp_path: Path) -> None:
     by_path, by_name = (
         table(runs).to_dict("records") for runs in ([tmp_path / "run"], {"mine": results})
     )  # fmt: skip
-    assert [(row["run"], row["estimate"]) for row in by_path] == [("test", "ransac"), ("test", "pnp")]
+    assert [(row["run"], row["estimate"]) for row in by_path] == [("run", "ransac"), ("run", "pnp")]
     errors = [row.rotation_error_deg for row in results.rows if row.estimate == "pnp"]
     assert by_name[1]["rotation_q2_deg"] == by_path[1]["rotation_q2_deg"] == pytest.approx(np.median(errors))
     assert by_name[1]["correspondence_loss"] == 0.25
