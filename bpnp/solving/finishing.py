@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bpnp.geometry import MIN_POINTS
+from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.matches import count_one_to_one, fit_pose, mutual_nearest, one_to_one
 from bpnp.solving.problem import Array, Problem
@@ -47,6 +48,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         reprojection_error=error,
         reprojection_error_deg=error_deg,
         unit=problem.unit,
+        covariance=_covariance(problem, *poses[0], result),
         candidates=candidates,
         verdict=result.verdict,
         reason=result.reason,
@@ -57,6 +59,14 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         points3d=problem.points3d,
         camera=problem.camera,
     )
+
+
+def _covariance(problem: Problem, rotation: Array, translation: Array, result: SearchResult) -> Array:
+    """Of the pose, in the user's coordinates; NaN for one that is a guess."""
+    sets, count = problem.sets, float(result.candidates.matched[0]) * min(len(problem.bearings), len(problem.points3d))
+    linear = None if result.verdict == "failed" else linearised(sets, rotation, translation, result.residual)
+    covariance = pose_covariance(sets, linear, count, problem.origin)
+    return np.full((6, 6), math.nan) if covariance is None else covariance
 
 
 def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:

@@ -8,10 +8,19 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
-from scipy.stats import t as student
+from scipy.stats import chi2
 
 from bpnp import solve
-from bpnp.search.evidence.uncertainty import OUTLIERS, linearised, rotation_bound, rotation_sigma, systematic_misfit
+from bpnp.search.evidence.uncertainty import (
+    OUTLIERS,
+    centre_bound,
+    centre_covariance,
+    linearised,
+    local_covariance,
+    pose_covariance,
+    rotation_bound,
+    systematic_misfit,
+)
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.matches import fit_pose
@@ -26,22 +35,55 @@ def noisy(rays: Array, rng: np.random.Generator, noise: float = NOISE) -> Array:
 
 
 def sigma_of(sets: PointSets, rotation: Array, translation: Array) -> float:
-    return rotation_sigma(sets, linearised(sets, rotation, translation, NOISE))
+    """Standard deviation about the least certain axis, radians."""
+    covariance = local_covariance(linearised(sets, rotation, translation, NOISE))
+    return math.inf if covariance is None else math.sqrt(np.linalg.eigvalsh(covariance[:3, :3])[-1])
 
 
 @pytest.mark.parametrize("count", [6, 20])
-def test_it_is_the_spread_of_fits_to_repeated_noise(count: int) -> None:
+def test_it_is_the_covariance_of_fits_to_repeated_noise(count: int) -> None:
+    """Of rotation and translation, and of the camera's centre, in a scene whose origin is far from its points."""
     rng = np.random.default_rng(count)
     points, rotation = rng.uniform(-1, 1, (count, 3)), Rotation.random(random_state=count).as_matrix()
+    origin = np.array([30.0, -20, 10])
+    moved = SHIFT - rotation @ origin  # of the points with their origin
     rays = directions(points @ rotation.T + SHIFT)
-    turns = []
-    for _ in range(60):
-        found, _ = fit_pose(lambda r, t: directions(points @ r.T + t), noisy(rays, rng), rotation, SHIFT, scale=NOISE)
-        turns.append(Rotation.from_matrix(found @ rotation.T).as_rotvec())
-    spread = math.sqrt(np.linalg.eigvalsh(np.cov(np.array(turns).T))[-1])
-    sigmas = [sigma_of(PointSets(noisy(rays, rng), points), rotation, SHIFT) for _ in range(20)]
-    assert np.median(sigmas) == pytest.approx(spread, rel=0.35)
-    assert min(sigmas) > 0.7 * spread
+    errors, centres, covariances = [], [], []
+    for _ in range(80):
+        seen = noisy(rays, rng)
+        turn, shift = fit_pose(lambda r, t: directions(points @ r.T + t), seen, rotation, SHIFT, scale=NOISE)
+        errors.append(np.r_[Rotation.from_matrix(rotation @ turn.T).as_rotvec(), moved - (shift - turn @ origin)])
+        centres.append(rotation @ (-rotation.T @ SHIFT + turn.T @ shift))
+        sets = PointSets(seen, points)
+        covariance = pose_covariance(sets, linearised(sets, turn, shift, NOISE), 1e6, origin)
+        assert covariance is not None
+        covariances.append((covariance, centre_covariance(covariance, shift - turn @ origin)))
+    for vectors, expected in ((errors, 6), (centres, 3)):
+        spread = [np.cov(np.array(vectors).T), np.mean([both[expected == 3] for both in covariances], 0)]
+        roots = np.linalg.eigvals(np.linalg.solve(*spread)).real
+        assert 0.5 < roots.min() <= roots.max() < 2.2
+        squared = [v @ np.linalg.solve(both[expected == 3], v) for v, both in zip(vectors, covariances, strict=True)]
+        assert np.mean(squared) == pytest.approx(expected, rel=0.25)
+
+
+def test_points_of_another_label_are_no_partners() -> None:
+    """A wall of other points close to each right one leaves the pose as certain as if it were not there."""
+    rng = np.random.default_rng(4)
+    points = rng.uniform(-1, 1, (20, 3))
+    rays = noisy(directions(points + SHIFT), rng)
+    others = np.repeat(points, 10, axis=0) + 0.02 * rng.standard_normal((200, 3))
+    labels2d = np.arange(20) % 3
+    labels2d[0] = -1
+    labels3d = np.concatenate([np.arange(20) % 3, np.repeat((np.arange(20) + 1) % 3, 10)])
+    scene = np.concatenate([points, others])
+    alone = sigma_of(PointSets(rays[1:], points), np.eye(3), SHIFT)
+    for wide in (False, True):  # so many points that neighbours are looked up
+        far = rng.uniform(-1, 1, (300 * wide, 3)) + [0, 0, 300]
+        everything = np.concatenate([scene, far])
+        labels = np.concatenate([labels3d, np.zeros(len(far), int)])
+        labelled = PointSets(rays, everything, labels2d=labels2d, labels3d=labels)
+        assert sigma_of(labelled, np.eye(3), SHIFT) == pytest.approx(alone, rel=0.15)
+        assert sigma_of(PointSets(rays, everything), np.eye(3), SHIFT) > 1.2 * alone
 
 
 def log_likelihood(rays: Array, points: Array, rotation: Array, translation: Array, area: float) -> float:
@@ -75,16 +117,23 @@ def test_points_as_dense_as_their_residuals_fix_less_than_their_number_says() ->
     assert sigma == pytest.approx(by_differences, rel=0.2)
 
 
-def test_a_bound_is_exceeded_once_in_a_thousand_by_students_law() -> None:
+def test_bounds_are_exceeded_once_in_a_thousand() -> None:
+    """Drawn from a normal distribution with the covariance, over a scale of so many degrees of freedom."""
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (8, 3))
     sets = PointSets(noisy(directions(points + SHIFT), rng), points)
-    pairs = linearised(sets, np.eye(3), SHIFT, NOISE)
-    sigma = rotation_sigma(sets, pairs)
-    for count, free in ((4, 2), (8, 10), (500, 994)):
-        bound = rotation_bound(sets, pairs, float(count))
-        assert 2 * student.sf(bound / sigma, free) == pytest.approx(1e-3, rel=1e-6)
-    assert rotation_bound(sets, pairs, 3.0) == math.inf
+    linear = linearised(sets, np.eye(3), SHIFT, NOISE)
+    covariance = local_covariance(linear)
+    assert linear is not None
+    assert covariance is not None
+    for count, free in ((5, 4), (8, 10), (500, 994)):
+        errors = rng.multivariate_normal(np.zeros(6), covariance, 100_000)
+        errors /= np.sqrt(chi2.rvs(free, size=(100_000, 1), random_state=rng) / free)
+        turns, centres = errors[:, :3], errors[:, 3:] + np.cross(linear.middle, errors[:, :3])
+        for vectors, bound in ((turns, rotation_bound), (centres, centre_bound)):
+            exceeded = np.mean(np.linalg.norm(vectors, axis=1) > bound(sets, linear, float(count)))
+            assert 0.5e-3 < exceeded < 1.6e-3
+    assert rotation_bound(sets, linear, 3.0) == centre_bound(sets, linear, 3.0) == math.inf
 
 
 def test_a_prior_bounds_what_the_points_leave_loose() -> None:
@@ -95,6 +144,10 @@ def test_a_prior_bounds_what_the_points_leave_loose() -> None:
     known = PointSets(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
     assert free > math.radians(60)
     assert sigma_of(known, np.eye(3), np.array([0, 0, 6.0])) < math.radians(2.001)
+    fixed = PointSets(rays, points, prior=PosePrior(np.eye(3), np.array([0, 0, 6.0]), 2.0, 1e-5))
+    covariance = pose_covariance(fixed, linearised(fixed, np.eye(3), np.array([0, 0, 6.0]), NOISE), 1e6, np.zeros(3))
+    assert covariance is not None
+    np.testing.assert_allclose(np.sqrt(np.diag(covariance[3:, 3:])), 1e-5, rtol=0.01)
     up = np.array([0.0, 1, 0])
     upright = PointSets(rays, points, prior=GravityPrior(up, up, 1.0))  # the turn about the line tilts the vertical
     assert sigma_of(upright, np.eye(3), np.array([0, 0, 6.0])) == pytest.approx(math.radians(1), rel=0.1)

@@ -332,8 +332,42 @@ def test_a_solution_is_the_same_after_its_json(tmp_path) -> None:
             assert again.to_json() == text
             np.testing.assert_array_equal(again.rotation, solution.rotation)
             np.testing.assert_array_equal(again.matches, solution.matches)
+            np.testing.assert_array_equal(again.covariance, solution.covariance)
+            np.testing.assert_array_equal(again.centre_std, solution.centre_std)
             assert (again.verdict, again.stats.iterations) == (solution.verdict, solution.stats.iterations)
             assert len(again.candidates) == len(solution.candidates)
+
+
+def test_errors_are_as_large_as_the_solution_says() -> None:
+    """60 planted poses, 20 to 80 points, an outlier for every third of them: errors over their standard deviations."""
+    rng, whitened, turns, centres = np.random.default_rng(0), [], [], []
+    for seed in range(60):
+        count, noise = int(rng.integers(20, 81)), float(rng.uniform(5e-4, 3e-3))
+        planted = plant(1, count, noise=noise, outliers2d=count // 3, outliers3d=count // 3, seed=seed)
+        solution = solve(planted.points2d[0], planted.points3d[0] + 100)
+        rotation = planted.rotation[0].numpy()
+        translation = planted.translation[0].numpy() - rotation @ np.full(3, 100)
+        if degrees(solution, planted) > 5:
+            continue
+        turn = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec()
+        error = np.r_[turn, translation - solution.translation]
+        whitened.extend(np.linalg.solve(np.linalg.cholesky(solution.covariance), error))
+        turns.append(np.degrees(np.linalg.norm(turn)) / solution.rotation_std_deg)
+        centres.append(np.linalg.norm(solution.centre + rotation.T @ translation) / solution.centre_std)
+    assert len(turns) >= 55
+    within = [np.mean(np.abs(whitened) < sigmas) for sigmas in (1, 2, 3)]
+    np.testing.assert_allclose(within, [0.683, 0.954, 0.997], atol=0.05)
+    for errors in (turns, centres):  # of a vector, over the largest of its standard deviations
+        assert 0.7 < np.median(errors) < 1.7
+        assert max(errors) < 4.5
+
+
+def test_what_failed_has_no_covariance() -> None:
+    rng = np.random.default_rng(0)
+    solution = solve(rng.uniform(-0.4, 0.4, (30, 2)), rng.normal(size=(30, 3)), time_limit=0.3)
+    assert solution.verdict == "failed"
+    assert np.isnan(solution.covariance).all()
+    assert np.isnan([solution.rotation_std_deg, solution.centre_std]).all()
 
 
 @pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": 2}', "\0"])
