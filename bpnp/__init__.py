@@ -3,7 +3,7 @@
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
-from bpnp.lazy import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from bpnp.maps.scene_map import SceneMap
@@ -15,20 +15,30 @@ if TYPE_CHECKING:
     from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 __all__ = [
-    "BPnPNet", "Batch", "GravityPrior", "Matcher", "Pose", "PosePrior", "Prediction", "SceneMap", "Solution",
-    "SolveStats", "solve", "solve_many",
-]  # fmt: skip
+    "BPnPNet",
+    "Batch",
+    "GravityPrior",
+    "Matcher",
+    "Pose",
+    "PosePrior",
+    "Prediction",
+    "SceneMap",
+    "Solution",
+    "SolveStats",
+    "solve",
+    "solve_many",
+]
 
-__getattr__, __dir__ = lazy_names(
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {
-        "bpnp.maps.scene_map": ("SceneMap",),
-        "bpnp.models.bpnpnet": ("BPnPNet",),
-        "bpnp.models.matcher": ("Matcher",),
-        "bpnp.search.starts": ("GravityPrior", "PosePrior"),
-        "bpnp.solving.solution": ("Solution",),
-        "bpnp.solving.solve": ("solve", "solve_many"),
-        "bpnp.types": ("Batch", "Pose", "Prediction", "SolveStats"),
+    submod_attrs={
+        "maps.scene_map": ["SceneMap"],
+        "models.bpnpnet": ["BPnPNet"],
+        "models.matcher": ["Matcher"],
+        "search.starts": ["GravityPrior", "PosePrior"],
+        "solving.solution": ["Solution"],
+        "solving.solve": ["solve", "solve_many"],
+        "types": ["Batch", "Pose", "Prediction", "SolveStats"],
     },
 )
 

@@ -1,6 +1,5 @@
 """Files and folders written whole or not at all, locks, checksums, the packaged configurations, the user's cache."""
 
-import fcntl
 import hashlib
 import json
 import os
@@ -12,6 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
+from platformdirs import user_cache_path
 
 CONFIGS = Path(__file__).parent / "configs"  # in a checkout a link to the folder `configs` at its top
 
@@ -75,26 +77,23 @@ def claimed(folder: Path, *, wait: bool = False) -> Iterator[None]:
     Raises ValueError if it is a file, or if another process holds it, unless told to wait. The lock ends with the
     process, however it ends.
     """
-    while True:
+    lock = FileLock(folder / ".lock", timeout=-1 if wait else 0)
+    while not lock.is_locked:
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            file = (folder / ".lock").open("w")
+            lock.acquire()
         except FileNotFoundError:
             continue  # another process has just removed the folder
         except (FileExistsError, NotADirectoryError) as error:
             raise ValueError(f"expected a folder to write to, got {folder}, which is or lies in a file") from error
-        with file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-            except BlockingIOError:
-                message = f"expected a folder that no other process writes to, got {folder}; try another, or later"
-                raise ValueError(message) from None
-            if os.fstat(file.fileno()).st_nlink:  # else the process that held it has removed it
-                try:
-                    yield
-                finally:
-                    (folder / ".lock").unlink(missing_ok=True)
-                return
+        except Timeout:
+            message = f"expected a folder that no other process writes to, got {folder}; try another, or later"
+            raise ValueError(message) from None
+    try:
+        yield
+    finally:
+        (folder / ".lock").unlink(missing_ok=True)
+        lock.release()
 
 
 @contextmanager
@@ -133,9 +132,7 @@ def files_as_they_are(files: Iterable[Path]) -> list[tuple[str, int, int]]:
 
 def cache_folder() -> Path:
     """Where data that can be made again is kept: BPNP_CACHE, else the user's cache, ``~/.cache/bpnp``."""
-    if chosen := os.environ.get("BPNP_CACHE"):
-        return Path(chosen)
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "bpnp"
+    return Path(os.environ.get("BPNP_CACHE") or user_cache_path("bpnp"))
 
 
 def packaged_config(name: str) -> str:

@@ -61,5 +61,5 @@ def test_every_public_name_is_found_and_listed(name: str) -> None:
 
 
 def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="'bpnp' has no attribute 'solver'"):
+    with pytest.raises(AttributeError, match="No bpnp attribute solver"):
         bpnp.solver  # noqa: B018

@@ -1,4 +1,4 @@
-"""`bpnp fit`, `validate`, `test` and `predict`: Lightning's own command line, with this project's run folder."""
+"""`bpnp fit`, `validate` and `test`: Lightning's own command line, with this project's run folder."""
 
 import re
 import sys
@@ -96,8 +96,6 @@ class BpnpCLI(LightningCLI):
         parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
         if subcommand == "test":
             parser.set_defaults({"verbose": False})
-        if subcommand == "predict":
-            parser.set_defaults({"return_predictions": False})
         return parser
 
     def _parse_ckpt_path(self) -> None:
@@ -133,7 +131,7 @@ def _checkpoint_folder(root: str) -> str:
 
 
 def run_training(arguments: Sequence[str], *, help_of: str | None = None) -> None:
-    """Parse the arguments of fit, validate, test or predict, and run it; or show the options of a group of `GROUPS`.
+    """Parse the arguments of fit, validate or test, and run it; or show the options of a group of `GROUPS`.
 
     Raises ValueError for a mistake of the user's, and for a training that diverged.
     """

@@ -1,10 +1,9 @@
-"""The short help of `bpnp fit`, `validate`, `test` and `predict`: what most runs need, without importing Lightning."""
+"""The short help of `bpnp fit`, `validate` and `test`: what most runs need, without importing Lightning."""
 
 LIGHTNING = {
     "fit": "Train a solver.",
     "validate": "Evaluate a solver on the validation pairs.",
     "test": "Evaluate a solver on the test pairs and write their results.",
-    "predict": "Write the poses of pairs whose true pose need not be known.",
 }
 # What `bpnp fit --help GROUP` shows: the options that begin with these.
 GROUPS = {
@@ -58,12 +57,14 @@ def short_help(command: str) -> str:
 def group_asked_for(arguments: list[str]) -> str | None:
     """The group in `fit --help GROUP`: "" without one, None where no help is asked for.
 
-    Raises ValueError for another group.
+    Raises ValueError for another word that is no option.
     """
     found = next((i for i, text in enumerate(arguments) if text in ("-h", "--help")), None)
     if found is None:
         return None
     following = arguments[found + 1 : found + 2]
+    if following and following[0].startswith("-"):
+        return ""
     if following and following[0] not in GROUPS:
         raise ValueError(f"expected --help, or --help and one of {', '.join(GROUPS)}, got {following[0]!r}")
     return following[0] if following else ""

@@ -1,12 +1,10 @@
 """`bpnp convert-weights`: the authors' released weights as a checkpoint."""
 
-import logging
 from pathlib import Path
 from typing import Any, Literal
 
+from bpnp.commands.output import say
 from bpnp.files import written_whole
-
-logger = logging.getLogger(__name__)
 
 
 def convert_weights(
@@ -43,4 +41,4 @@ def convert_weights(
     task.on_save_checkpoint(checkpoint)
     with written_whole(out) as temporary:
         torch.save(checkpoint, temporary)
-    logger.info("wrote %s", out)
+    say(f"wrote {out}")

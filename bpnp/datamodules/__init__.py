@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from bpnp.lazy import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from bpnp.datamodules.augment import Outliers
@@ -19,16 +19,16 @@ __all__ = [
     "SfmSceneDataModule", "write_pairs",
 ]  # fmt: skip
 
-__getattr__, __dir__ = lazy_names(
+__getattr__, __dir__, _ = lazy_loader.attach(
     __name__,
-    {
-        "bpnp.datamodules.augment": ("Outliers",),
-        "bpnp.datamodules.colmap.module": ("ColmapDataModule",),
-        "bpnp.datamodules.meshes.module": ("MeshDataModule",),
-        "bpnp.datamodules.module": ("PairDataModule",),
-        "bpnp.datamodules.pair": ("Pair", "PairSource"),
-        "bpnp.datamodules.released.module": ("PreprocessedDataModule",),
-        "bpnp.datamodules.stored_pairs": ("write_pairs",),
-        "bpnp.datamodules.synthetic_maps.module": ("SfmSceneDataModule",),
+    submod_attrs={
+        "augment": ["Outliers"],
+        "colmap.module": ["ColmapDataModule"],
+        "meshes.module": ["MeshDataModule"],
+        "module": ["PairDataModule"],
+        "pair": ["Pair", "PairSource"],
+        "released.module": ["PreprocessedDataModule"],
+        "stored_pairs": ["write_pairs"],
+        "synthetic_maps.module": ["SfmSceneDataModule"],
     },
 )

@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from bpnp.lazy import lazy_names
+import lazy_loader
 
 if TYPE_CHECKING:
     from bpnp.report.figures import plot_pair, plot_scene, recall_curve, save_figure
@@ -23,14 +23,14 @@ __all__ = [
 ]  # fmt: skip
 
 MODULES = {
-    "bpnp.report.figures": ("plot_pair", "plot_scene", "recall_curve", "save_figure"),
-    "bpnp.report.folder": ("read_results", "write_results"),
-    "bpnp.report.page.write": ("write_page",),
-    "bpnp.report.pictures": ("plot_image", "plot_residuals"),
-    "bpnp.report.results": ("PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"),
-    "bpnp.report.runs": ("table",),
-    "bpnp.report.samples": ("PairView", "read_views", "select_views", "views_from", "write_views"),
-    "bpnp.report.tables.result_tables": ("learning_table", "recall_table", "report", "results_table"),
-    "bpnp.report.training_log": ("TrainingLog", "read_training_log"),
+    "figures": ["plot_pair", "plot_scene", "recall_curve", "save_figure"],
+    "folder": ["read_results", "write_results"],
+    "page.write": ["write_page"],
+    "pictures": ["plot_image", "plot_residuals"],
+    "results": ["PairRow", "Results", "cause_shares", "count_inliers", "rows_from", "summarise"],
+    "runs": ["table"],
+    "samples": ["PairView", "read_views", "select_views", "views_from", "write_views"],
+    "tables.result_tables": ["learning_table", "recall_table", "report", "results_table"],
+    "training_log": ["TrainingLog", "read_training_log"],
 }
-__getattr__, __dir__ = lazy_names(__name__, MODULES)
+__getattr__, __dir__, _ = lazy_loader.attach(__name__, submod_attrs=MODULES)

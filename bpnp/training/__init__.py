@@ -1,11 +1,15 @@
 """The LightningModule, its losses, and the callbacks of a training."""
 
-from bpnp.training.callbacks import CompileNets, LearningRateSchedule, PoseLossWarmup, SafeCheckpointIO
+from bpnp.training.callbacks import PoseLossWarmup, SafeCheckpointIO
 from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
 
 __all__ = [
-    "BlindPnPTask", "CompileNets", "LearningRateSchedule", "OfflineWandbLogger", "PoseLossWarmup",
-    "ResultsWriter", "SafeCheckpointIO", "TrainingMonitor",
-]  # fmt: skip
+    "BlindPnPTask",
+    "OfflineWandbLogger",
+    "PoseLossWarmup",
+    "ResultsWriter",
+    "SafeCheckpointIO",
+    "TrainingMonitor",
+]

@@ -1,7 +1,6 @@
-"""What a trainer is given beside the task: schedules, compiled nets, and checkpoints read as data."""
+"""What a trainer is given beside the task: the pose loss that joins later, and checkpoints read as data."""
 
 import io
-import math
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
-from torch import nn
 
 from bpnp.files import written_whole
 from bpnp.models.weights import read_checkpoint
@@ -48,44 +46,6 @@ class PoseLossWarmup(Callback):
         self.switched_at = state_dict["switched_at"]
 
 
-class LearningRateSchedule(Callback):
-    """Linear warm-up, then the model's learning rate, then a half cosine down to `final` of it.
-
-    The rate depends on the step alone, so that a resumed run goes on where it was, or on another schedule.
-
-    Args:
-        warmup_steps: optimiser steps until the full rate.
-        decay_start: step at which the rate begins to fall; null for never.
-        decay_steps: steps of the fall.
-        final: factor on the rate from then on.
-    """
-
-    def __init__(
-        self, warmup_steps: int = 200, decay_start: int | None = None, decay_steps: int = 1000, final: float = 0.02
-    ) -> None:
-        if warmup_steps < 0 or (decay_start or 0) < 0 or decay_steps < 1 or not 0 <= final <= 1:
-            raise ValueError(
-                "expected warmup_steps, decay_start >= 0, decay_steps >= 1 and final in [0, 1], got "
-                f"{warmup_steps}, {decay_start}, {decay_steps} and {final}"
-            )
-        self.warmup_steps, self.decay_start = warmup_steps, decay_start
-        self.decay_steps, self.final = decay_steps, final
-
-    def factor(self, step: int) -> float:
-        """On the learning rate, at a step."""
-        rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
-        if self.decay_start is None:
-            return rise
-        done = min(1.0, max(0.0, (step - self.decay_start) / self.decay_steps))
-        return rise * (self.final + (1 - self.final) * (1 + math.cos(math.pi * done)) / 2)
-
-    def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        rate = float(pl_module.learning_rate) * self.factor(trainer.global_step)  # type: ignore[arg-type]
-        for optimizer in trainer.optimizers:
-            for group in optimizer.param_groups:
-                group["lr"] = rate
-
-
 class SafeCheckpointIO(TorchCheckpointIO):
     """Checkpoints written whole or not at all, and read as data only, with one clear error for a file that is none."""
 
@@ -99,28 +59,6 @@ class SafeCheckpointIO(TorchCheckpointIO):
         self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
     ) -> dict[str, Any]:
         return read_checkpoint(path, map_location=map_location)
-
-
-class CompileNets(Callback):
-    """torch.compile of `features2d` and `features3d` for training: a minute or more to start, then quicker steps.
-
-    The layers stay as they are, and so do checkpoints: parameters keep their names. On a CPU it pays from about a
-    thousand steps on.
-
-    Args:
-        backend: of torch.compile.
-    """
-
-    def __init__(self, backend: str = "inductor") -> None:
-        self.backend = backend
-
-    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        solver = pl_module.get_submodule("solver")
-        nets = [getattr(solver, f"features{side}", None) for side in ("2d", "3d")]
-        if not all(isinstance(net, nn.Module) for net in nets):
-            raise ValueError(f"expected a solver with `features2d` and `features3d`, got {type(solver).__name__}")
-        for net in nets:
-            net.compile(backend=self.backend)  # type: ignore[union-attr]
 
 
 class InterruptedCheckpoint(Callback):

@@ -1,44 +1,37 @@
-"""The files that a test or a prediction leaves."""
+"""The files that a test leaves."""
 
-import csv
 import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import roma
-import torch
 import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
-from bpnp.files import written_whole
 from bpnp.report import report
 from bpnp.report.folder import write_results
 from bpnp.report.results import PairRow, rows_from
 from bpnp.report.samples import PairView, select_views, thin, views_from, write_views
-from bpnp.types import Batch, Prediction
+from bpnp.types import Batch
 
-POSE_COLUMNS = ("id", "estimate", "qw", "qx", "qy", "qz", "tx", "ty", "tz", "found", "converged")
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
 NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
 class ResultsWriter(Callback):
-    """Writes `pairs.csv`, `summary.json`, the points of some pairs and a few points of every pair after a test, and
-    `poses.csv` after a prediction.
+    """Writes `pairs.csv`, `summary.json`, the points of some pairs and a few points of every problem after a test.
 
     Args:
-        folder: where; null for `test` and `predict` in the trainer's default_root_dir.
+        folder: where; null for `test` in the trainer's default_root_dir.
     """
 
     rows: list[PairRow]
     losses: dict[int, float]
     chosen: Sequence[PairView]
     views: list[PairView]
-    poses: dict[tuple[int, str], list[Any]]
     numbers: set[int]  # of the problems so far
 
     def __init__(self, folder: str | None = None) -> None:
@@ -80,7 +73,7 @@ class ResultsWriter(Callback):
             _check_repeated(rows)
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
-            folder = self._folder(trainer, "test")
+            folder = self._folder(trainer)
             write_results(folder, rows, correspondence_loss=mean, settings=_settings(trainer) | {"complete": complete})
             chosen = select_views([view for _, _, part, _ in gathered for view in part])
             write_views(folder, [*chosen, *(view for *_, part in gathered for view in part)])
@@ -89,29 +82,9 @@ class ResultsWriter(Callback):
                 f"{'' if complete else 'interrupted: '}results of {len({row.index for row in rows})} pairs in {folder}"
             )
 
-    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.poses, self.numbers = {}, set()
-
-    def on_predict_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
-    ) -> None:
-        if isinstance(outputs, Prediction):
-            self._note_numbers(batch)
-            self.poses |= _pose_rows(outputs, batch)
-
-    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather(self.poses)
-        if trainer.is_global_zero:
-            merged = {key: row for part in gathered for key, row in part.items()}
-            path = self._folder(trainer, "predict") / "poses.csv"
-            rows = [POSE_COLUMNS, *(merged[key] for key in sorted(merged))]
-            with written_whole(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as table:
-                csv.writer(table).writerows(rows)
-            rank_zero_info(f"{len(merged)} poses in {path}")
-
     def _check_replaced(self, trainer: Trainer) -> None:
         """Raises ValueError if results of a checkpoint would be replaced by those of a test without one."""
-        summary = self._folder(trainer, "test") / "summary.json"
+        summary = self._folder(trainer) / "summary.json"
         if trainer.ckpt_path is None and summary.is_file():
             checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
             if checkpoint is not None:
@@ -127,25 +100,8 @@ class ResultsWriter(Callback):
                 raise ValueError(f"expected one number in `Batch.index` for each problem, got {number} again; {NUMBER}")
             self.numbers.add(number)
 
-    def _folder(self, trainer: Trainer, stage: str) -> Path:
-        return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / stage
-
-
-def _pose_rows(prediction: Prediction, batch: Batch) -> dict[tuple[int, str], list[Any]]:
-    """World-to-camera quaternion and translation in COLMAP's order, in the scene's own coordinates; empty if none."""
-    rows: dict[tuple[int, str], list[Any]] = {}
-    for name, pose in prediction.poses.items():
-        found = pose.found
-        rotation = pose.rotation.double().where(found[:, None, None], torch.eye(3, device=found.device).double())
-        xyzw = roma.rotmat_to_unitquat(rotation)
-        translation = pose.translation.double()
-        if batch.origin is not None:
-            translation = translation - (rotation @ batch.origin.double().unsqueeze(-1)).squeeze(-1)
-        numbers = torch.cat([xyzw[:, 3:], xyzw[:, :3], translation], -1).tolist()
-        for i, (is_found, converged) in enumerate(zip(found.tolist(), pose.stats.converged.tolist(), strict=True)):
-            values = numbers[i] if is_found else [""] * 7
-            rows[int(batch.index[i]), name] = [batch.ids[i], name, *values, is_found, converged]
-    return rows
+    def _folder(self, trainer: Trainer) -> Path:
+        return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"
 
 
 def _check_repeated(rows: Sequence[PairRow]) -> None:

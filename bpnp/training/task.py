@@ -1,5 +1,6 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
+import math
 import os
 import time
 from dataclasses import replace
@@ -12,6 +13,7 @@ from lightning.pytorch.utilities.enums import GradClipAlgorithmType
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
+from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MetricCollection
 
 from bpnp.layers.implicit import BackwardStats
@@ -24,6 +26,7 @@ from bpnp.training.losses import Losses, MatchingLoss, correspondence_losses, ma
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
+DECAYED = 0.02  # of the learning rate, after its fall
 CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
 MOST_SKIPPED = 20  # steps in a row without a finite loss and gradient, which end the run
 
@@ -42,7 +45,10 @@ class BlindPnPTask(LightningModule):
         weights: packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
             those that it was built with. Optimiser and step start anew, other than with `--ckpt_path`.
         learning_rate: of Adam; the paper has 1e-5.
-        weight_decay: of Adam; the paper has 0, the released code 1e-3.
+        weight_decay: of Adam; the paper has 0, the authors' code 1e-3.
+        warmup_steps: optimiser steps in which the learning rate rises from zero.
+        decay_start: step at which it begins to fall, by a half cosine to a fiftieth; none for never.
+        decay_steps: steps of the fall.
         pose_weight: gamma_p of Eq. 13, for the pose "pnp". While it is 0 no pose is solved in training;
             `PoseLossWarmup` raises it.
         matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
@@ -62,6 +68,9 @@ class BlindPnPTask(LightningModule):
         weights: str | None = None,
         learning_rate: float = 1e-5,
         weight_decay: float = 0.0,
+        warmup_steps: int = 0,
+        decay_start: int | None = None,
+        decay_steps: int = 1000,
         pose_weight: float = 0.0,
         matching_loss: MatchingLoss = "correspondence",
         correspondence_angle: float | None = None,
@@ -74,6 +83,12 @@ class BlindPnPTask(LightningModule):
             self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver, grown=True))
         self.loss = None if loss is None else chosen(loss, nn.Module)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
+        if warmup_steps < 0 or (decay_start or 0) < 0 or decay_steps < 1:
+            raise ValueError(
+                "expected `warmup_steps` and `decay_start` >= 0 and `decay_steps` >= 1, got "
+                f"{warmup_steps}, {decay_start} and {decay_steps}"
+            )
+        self.warmup_steps, self.decay_start, self.decay_steps = warmup_steps, decay_start, decay_steps
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
@@ -177,7 +192,21 @@ class BlindPnPTask(LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         trained = (p for p in self.parameters() if p.requires_grad)
-        return Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        adam = Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        if not self.warmup_steps and self.decay_start is None:
+            return adam
+        # By the step alone: a resumed run goes on where it was, or on another schedule. `SequentialLR` would take its
+        # milestones and its rate from the checkpoint.
+        schedule = LambdaLR(adam, lambda _: self.rate_factor(self.trainer.global_step))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def rate_factor(self, step: int) -> float:
+        """Factor on the learning rate: a linear rise, one, and a half cosine down to `DECAYED`."""
+        rise = min(1.0, (step + 1) / (self.warmup_steps + 1))
+        if self.decay_start is None:
+            return rise
+        done = min(1.0, max(0.0, (step - self.decay_start) / self.decay_steps))
+        return rise * (DECAYED + (1 - DECAYED) * (1 + math.cos(math.pi * done)) / 2)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
@@ -188,6 +217,8 @@ class BlindPnPTask(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         fitting_state(checkpoint, self.solver)  # one clear error before any state is loaded
         self.training_seed = checkpoint.get("seed")
+        for schedule in checkpoint.get("lr_schedulers", ()):
+            schedule["base_lrs"] = [self.learning_rate]  # as it is now, in a run that goes on at another one
         self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
 
     def on_validation_epoch_end(self) -> None:

@@ -22,7 +22,7 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])
     text = capsys.readouterr().out
     listed = [line.split()[0] for line in text.splitlines() if re.match("  \\w", line)]
-    assert listed == [*COMMANDS, "fit", "validate", "test", "predict"]
+    assert listed == [*COMMANDS, "fit", "validate", "test"]
     assert "quickstart" in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -194,7 +194,7 @@ def test_a_checkpoint_that_is_none_is_named(fails: Callable[..., str], tmp_path:
     assert "broken.ckpt" in fails("test", *MESHES, *root, *SMALL_NET, f"--ckpt_path={broken}")
 
 
-def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
+def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
     common = [*MESHES, *SMALL_NET, f"--data.root={meshes}", f"--data.cache_dir={tmp_path}/cache",
               f"--trainer.default_root_dir={tmp_path}/run", "--data.val_fraction=0.3"]  # fmt: skip
@@ -205,11 +205,8 @@ def test_fit_test_predict_report(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert "val/rotation_q2_deg" in logs[0].read_text().splitlines()[0]
     main(["test", *common, "--ckpt_path=last"])
     assert "━" in capsys.readouterr().out
-    main(
-        ["predict", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"]
-    )
+    main(["test", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"])
     assert "━" not in capsys.readouterr().out
-    assert (tmp_path / "run" / "predict" / "poses.csv").is_file()
     trained = (tmp_path / "run" / "test" / "summary.json").read_bytes()
     assert "last.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
     assert (tmp_path / "run" / "test" / "summary.json").read_bytes() == trained

@@ -3,54 +3,51 @@
 from pathlib import Path
 
 import pytest
-from lightning import LightningModule, Trainer
+from lightning import Callback, LightningModule, Trainer
 from planted import plant
 from small_data import quiet_trainer, small_net
-from torch import nn
+from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from bpnp.training.callbacks import CompileNets, LearningRateSchedule, PoseLossWarmup
+from bpnp.training.callbacks import PoseLossWarmup
 from bpnp.training.task import BlindPnPTask
 
 
 def test_the_rate_rises_stays_and_falls() -> None:
-    schedule = LearningRateSchedule(warmup_steps=9, decay_start=100, decay_steps=50, final=0.2)
+    task = BlindPnPTask(small_net(), warmup_steps=9, decay_start=100, decay_steps=50)
     steps = (0, 4, 9, 100, 125, 150, 10_000)
-    assert [schedule.factor(step) for step in steps] == pytest.approx([0.1, 0.5, 1, 1, 0.6, 0.2, 0.2])
-    assert LearningRateSchedule(warmup_steps=0).factor(10**6) == 1
+    assert [task.rate_factor(step) for step in steps] == pytest.approx([0.1, 0.5, 1, 1, 0.51, 0.02, 0.02])
+    assert BlindPnPTask(small_net()).rate_factor(10**6) == 1
 
 
-def test_a_resumed_run_goes_on_at_the_rate_of_its_step(tmp_path: Path) -> None:
-    """20 steps an epoch, at a learning rate that changes next to nothing."""
+def test_a_resumed_run_goes_on_at_the_rate_of_its_step_or_on_another_schedule(tmp_path: Path) -> None:
+    """20 steps an epoch, at a learning rate that changes next to nothing; `rates` is what each step was made with."""
     data = DataLoader([plant(2, 10).batch()] * 20, batch_size=None)  # type: ignore[arg-type]
+    rates: list[float] = []
 
-    def rate(epochs: int, resume: str | None = None) -> tuple[Trainer, float]:
-        trainer = quiet_trainer(tmp_path, max_epochs=epochs, callbacks=[LearningRateSchedule(warmup_steps=39)])
-        trainer.fit(BlindPnPTask(small_net(8, 1), learning_rate=1e-12), data, ckpt_path=resume)
-        return trainer, trainer.optimizers[0].param_groups[0]["lr"]
+    class Rates(Callback):
+        def on_before_zero_grad(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
+            rates.append(optimizer.param_groups[0]["lr"])
 
-    trainer, half = rate(1)
-    assert half == pytest.approx(20 / 40 * 1e-12)
-    trainer.save_checkpoint(tmp_path / "half.ckpt")
-    resumed, full = rate(2, str(tmp_path / "half.ckpt"))
-    assert resumed.global_step == 40
-    assert full == pytest.approx(1e-12)
+    def fit(epochs: int, resume: str | None = None, *, rate: float = 1e-12, **schedule: int) -> Trainer:
+        rates.clear()
+        trainer = quiet_trainer(tmp_path, max_epochs=epochs, callbacks=[Rates()])
+        task = BlindPnPTask(small_net(8, 1), learning_rate=rate, warmup_steps=39, **schedule)
+        trainer.fit(task, data, ckpt_path=resume)
+        return trainer
 
-
-def test_the_nets_to_compile_are_the_solvers(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    compiled = []
-    monkeypatch.setattr(nn.Module, "compile", lambda net, backend: compiled.append((net, backend)))
-    task, trainer = LightningModule(), quiet_trainer(tmp_path)
-    task.solver = net = small_net(8, 2)
-    CompileNets(backend="eager").on_fit_start(trainer, task)
-    assert compiled == [(net.features2d, "eager"), (net.features3d, "eager")]
-    task.solver = nn.Identity()
-    with pytest.raises(ValueError, match="expected a solver with `features2d` and `features3d`, got Identity"):
-        CompileNets().on_fit_start(trainer, task)
+    fit(1).save_checkpoint(half := str(tmp_path / "half.ckpt"))
+    assert rates == pytest.approx([k / 40 * 1e-12 for k in range(1, 21)])
+    assert fit(2, half).global_step == 40
+    assert rates == pytest.approx([k / 40 * 1e-12 for k in range(21, 41)])
+    fit(2, half, decay_start=20, decay_steps=10)
+    assert rates[10:] == pytest.approx([0.02 * k / 40 * 1e-12 for k in range(31, 41)])
+    fit(2, half, rate=4e-12)
+    assert rates[1:] == pytest.approx([k / 40 * 4e-12 for k in range(22, 41)])
 
 
 def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected warmup_steps"):
-        LearningRateSchedule(warmup_steps=-1)
+    with pytest.raises(ValueError, match="expected `warmup_steps` and `decay_start` >= 0"):
+        BlindPnPTask(small_net(), warmup_steps=-1)
     with pytest.raises(ValueError, match="expected start_epoch >= 0"):
         PoseLossWarmup(start_epoch=-1)

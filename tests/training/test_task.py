@@ -1,22 +1,18 @@
-import csv
 import math
 import warnings
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from lightning import Callback, LightningDataModule, Trainer
-from planted import padded, plant, posed
-from planted_model import plant_model
-from scipy.spatial.transform import Rotation
+from planted import padded, plant
 from small_data import SMALL_MESHES, quiet_trainer, small_net
 from torch import Tensor, nn
 from torch.utils.data import DataLoader, Dataset
 
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
-from bpnp.datamodules import ColmapDataModule, MeshDataModule
+from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup
 from bpnp.training.losses import correspondence_loss, pose_loss
@@ -197,10 +193,6 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     logged = float(run.callback_metrics["test/rotation_q2_deg"])
     assert logged == pytest.approx(results.estimates["ransac"]["rotation_q2_deg"], rel=1e-6)
     assert float(run.callback_metrics["test/correspondence_loss"]) == pytest.approx(results.correspondence_loss)
-    run.predict(task, datamodule=module)
-    lines = (tmp_path / "predict" / "poses.csv").read_text().splitlines()
-    assert lines[0] == "id,estimate,qw,qx,qy,qz,tx,ty,tz,found,converged"
-    assert len(lines) == 1 + 7 * 3
 
 
 class Numbers(Dataset):
@@ -233,12 +225,10 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         warnings.filterwarnings("error", message="expected one (pair|problem) per")
         run.test(task, datamodule=OwnData(), verbose=False)
         tested = dict(run.callback_metrics)
-        run.predict(task, datamodule=OwnData(), return_predictions=False)
         run.validate(task, datamodule=OwnData(), verbose=False)
         validated = dict(run.callback_metrics)
     rows = read_results(tmp_path / "test").of("ransac")
     assert [(row.index, row.id) for row in rows] == [(i, str(i)) for i in range(10)]
-    assert len((tmp_path / "predict" / "poses.csv").read_text().splitlines()) == 1 + 10 * 3
     with torch.no_grad():
         expected = correspondence_loss(task.solver.eval().match(one_batch).assignment, one_batch.match3d).mean()
     assert float(tested["test/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
@@ -289,29 +279,3 @@ def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Pa
         BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
     with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
         BlindPnPTask(Matcher(), weights="matcher-of-nobody")
-
-
-class Oracle(nn.Module):
-    """Answers with the true pose of the pair."""
-
-    estimates = ("truth",)
-
-    def forward(self, batch: Batch) -> Prediction:
-        return Prediction(poses={"truth": posed(batch.rotation, batch.translation)})
-
-
-def test_poses_are_written_in_the_coordinates_of_a_scene_far_from_its_origin(tmp_path: Path) -> None:
-    planted = plant_model(tmp_path / "scene" / "sparse" / "0", origin=1e4)
-    module = ColmapDataModule(root=str(tmp_path / "scene"))
-    trainer = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
-    trainer.predict(BlindPnPTask(Oracle()), datamodule=module, return_predictions=False)
-    with (tmp_path / "predict" / "poses.csv").open(newline="") as file:
-        rows = {row["id"].split("/")[-1]: row for row in csv.DictReader(file)}
-    assert len(rows) == len(planted.rotations)
-    for i, (rotation, translation) in enumerate(zip(planted.rotations, planted.translations, strict=True)):
-        row = rows[f"photo {i}.jpg"]
-        written = Rotation.from_quat([float(row[k]) for k in ("qx", "qy", "qz", "qw")]).as_matrix()
-        centre = -written.T @ [float(row[k]) for k in ("tx", "ty", "tz")]
-        assert np.abs(written - rotation).max() < 1e-6
-        # float32 turns a point 1.7e4 away by 1e-7 of that; without the origin the centre would be off by 1.7e4.
-        assert np.abs(centre + rotation.T @ translation).max() < 1e-2
