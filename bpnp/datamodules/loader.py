@@ -173,10 +173,7 @@ class PairLoader(DataLoader[Batch]):
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
         sampler = self.sampler
         if not isinstance(sampler, BucketSampler):
-            raise ValueError(
-                f"expected the loader's BucketSampler, got {type(sampler).__name__}; Trainer(overfit_batches) replaces "
-                "it: try a small number of pairs instead"
-            )
+            raise ValueError(f"expected the loader's BucketSampler, got {type(sampler).__name__}")
         resumed, self.resumed = self.resumed, None
         self.served = resumed["served"] if resumed is not None and resumed["epoch"] == sampler.epoch else 0
         sampler.first_batch = self.served
@@ -191,6 +188,19 @@ class PairLoader(DataLoader[Batch]):
         self.resumed = dict(state_dict)
 
 
+class FixedBatches(Dataset[Any]):
+    """The batches of a loader's first epoch, by their number: Lightning takes them in their order."""
+
+    def __init__(self, dataset: PairDataset, sampler: BucketSampler) -> None:
+        self.dataset, self.keys = dataset, list(sampler)
+
+    def __len__(self) -> int:
+        return len(self.keys)
+
+    def __getitem__(self, number: int) -> Batch | PairKeys:
+        return self.dataset[self.keys[number]]
+
+
 def pair_loader(
     dataset: PairDataset,
     *,
@@ -199,10 +209,12 @@ def pair_loader(
     seed: int,
     num_workers: int = 0,
     max_cells: int | None = None,
+    overfit: bool = False,
 ) -> DataLoader[Batch]:
     """A loader of padded batches for this process of the process group, if there is one.
 
     See `BucketSampler` for the options; shuffle is True for training. max_cells bounds b * m * n of a padded batch.
+    overfit: the same batches in every epoch, for `Trainer(overfit_batches)`, which brings a sampler of its own.
     """
     group = distributed.is_available() and distributed.is_initialized()
     sampler = BucketSampler(
@@ -214,6 +226,8 @@ def pair_loader(
         rank=distributed.get_rank() if group else 0,
         max_cells=max_cells,
     )
+    if overfit:
+        return DataLoader(FixedBatches(dataset, sampler), batch_size=None, num_workers=num_workers)
     return PairLoader(
         dataset,
         sampler=sampler,

@@ -101,4 +101,5 @@ class PairDataModule(LightningDataModule):
             seed=self.seed,
             num_workers=self.num_workers,
             max_cells=None if training else self.max_cells,
+            overfit=self.trainer is not None and self.trainer.overfit_batches > 0,  # type: ignore[attr-defined]
         )

@@ -135,7 +135,7 @@ class BlindPnPTask(LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.numbers.clear()
 
-    def on_validation_batch_start(self, batch: Batch, batch_idx: int) -> None:
+    def on_validation_batch_start(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
         """A data module that collates with `Batch.from_arrays` numbers the problems of each batch from 0 on."""
         number_globally(batch, self.numbers, processes=self.trainer.world_size)
 

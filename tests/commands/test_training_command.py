@@ -1,6 +1,9 @@
 """Short help with groups on request, and a user's own task, loss and weights by name."""
 
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,9 +14,11 @@ from lightning import LightningModule
 from small_data import SMALL_MESHES, SMALL_NET
 from torch import Tensor, nn
 
+import bpnp.cli as cli
 import bpnp.commands.training_help as training_help
 from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
+from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
 from bpnp.solving.arguments import checked_prior, source_from
 
@@ -177,3 +182,43 @@ def test_the_log_of_weights_and_biases_is_in_the_folder_of_the_run(
     assert len(list((tmp_path / "run" / "wandb").glob("offline-run-*"))) == 1
     assert not (tmp_path / "wandb").exists()
     assert (tmp_path / "run" / "logs").is_dir()
+
+
+def test_help_beside_other_options_is_the_short_help(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["fit", "--help", "--config", "quickstart"])
+    assert capsys.readouterr().out.startswith("usage: bpnp fit --config NAME [options]")
+
+
+def test_a_class_in_the_current_folder_is_found(tmp_path: Path) -> None:
+    (tmp_path / "solver_of_mine.py").write_text("from bpnp import BPnPNet\nclass Mine(BPnPNet): ...\n")
+    data = ["--data=bpnp.datamodules.MeshDataModule", "--model.solver=solver_of_mine.Mine", "--print_config"]
+    program = f"from bpnp.cli import main; main({['fit', *data]})"
+    # Neither the script's folder nor the current one is on the path, as in the installed `bpnp`.
+    environment = os.environ | {"PYTHONSAFEPATH": "1"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
+    )
+    assert "class_path: solver_of_mine.Mine" in done.stdout, done.stderr
+
+
+def test_a_packaged_configuration_in_the_place_of_a_file_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for given, told in (("configs/quickstart.yaml", True), ("quickstart", False), ("presets/debug", False)):
+        with pytest.raises(SystemExit):
+            main(["fit", "--config=quickstart", f"--config={given}", "--print_config"])
+        line = f"there is no {given} in this folder, so the packaged {CONFIGS}"
+        assert (line in capsys.readouterr().err) == told
+
+
+def test_ctrl_c_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    def interrupted(*_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "parsed_arguments", interrupted)
+    for command, told in (("localize", "interrupted; run it again to go on"), ("solve", "interrupted")):
+        with pytest.raises(SystemExit) as ended:
+            main([command])
+        assert ended.value.code == 130
+        assert capsys.readouterr().err == f"bpnp: {told}\n"

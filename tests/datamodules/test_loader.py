@@ -152,7 +152,7 @@ def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"max_cells.*shuffle=False"):
         sampler([4], batch_size=4, shuffle=True, max_cells=100)
     pairs = dataset([4, 4])
-    with pytest.raises(ValueError, match="overfit_batches"):
+    with pytest.raises(ValueError, match="expected the loader's BucketSampler, got SequentialSampler"):
         next(iter(PairLoader(pairs, sampler=SequentialSampler(pairs), batch_size=None)))
 
 

@@ -62,10 +62,13 @@ def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: b
         torch.testing.assert_close(assignment[i, : len(p2), : len(p3)], plan(expected), rtol=1e-4, atol=1e-8)
 
 
-def test_convert_weights_writes_our_checkpoint(reference: Released, tmp_path: Path) -> None:
+def test_convert_weights_writes_our_checkpoint(
+    reference: Released, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file, out = tmp_path / "released.pth.tar", tmp_path / "sub" / "out.ckpt"
     torch.save(checkpoint(reference), file)
     main(["convert-weights", str(file), str(out)])
+    assert capsys.readouterr().out == f"wrote {out}\n"
     assert list(out.parent.iterdir()) == [out]
     (p2, p3), net = pairs()[0], BPnPNet.from_checkpoint(out)
     assert not net.training

@@ -279,3 +279,17 @@ def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Pa
         BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
     with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
         BlindPnPTask(Matcher(), weights="matcher-of-nobody")
+
+
+def test_overfit_batches_repeats_the_same_problems(tmp_path: Path) -> None:
+    seen: list[tuple[str, ...]] = []
+
+    class Seen(Callback):
+        def on_train_batch_start(self, trainer: Trainer, pl_module: object, batch: Batch, batch_idx: int) -> None:
+            seen.append(batch.ids)
+
+    run = quiet_trainer(tmp_path, callbacks=[Seen()], max_epochs=3, overfit_batches=2)
+    run.fit(BlindPnPTask(small_net()), datamodule=data(tmp_path, train_pairs=32, batch_size=4))
+    assert len(seen) == 6
+    assert len(set(seen)) == 2
+    assert seen[:2] * 3 == seen
