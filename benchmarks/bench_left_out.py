@@ -22,7 +22,7 @@ from descriptor_poses import Array, DescribedMap
 from rebuilt_maps import PhotoScene, aligned
 
 from bpnp import SceneMap
-from bpnp.maps.keypoints import detected_keypoints
+from bpnp.maps.photos import detected_keypoints
 
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 VIEWS = 3
@@ -66,7 +66,7 @@ def answers(
 def turn_rows(scene: PhotoScene, photo: str, full: SceneMap, methods: Sequence[str], **search: Any) -> list[dict]:
     """A row for each method, for one photo that is left out of its map."""
     place = SceneMap.from_colmap(scene.without(photo))
-    shared = full.covisibility[[full.view_numbers[photo]]].toarray()[0]
+    shared = full.visibility @ full.visibility[[full.view_numbers[photo]]].toarray()[0]
     likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
     views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
     (true,) = full.named([photo])

@@ -27,8 +27,7 @@ from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, sce
 
 from bpnp import PosePrior, solve
 from bpnp.cameras import camera_from
-from bpnp.maps.localize import localize
-from bpnp.maps.regions import VIEW_DEGREES, VIEW_SHARE
+from bpnp.maps.views import VIEW_DEGREES, VIEW_SHARE
 from bpnp.models import TrainedNet
 from bpnp.models.weights import pretrained_names
 from bpnp.solving.problem import problem_from
@@ -62,8 +61,8 @@ def view_prior(pair: ViewPair, seed: int, time_limit: float | None, *, asks: boo
 
 def in_map(pair: ViewPair, seed: int, time_limit: float | None) -> Answer:
     camera = np.diag([pair.focal, pair.focal, 1.0])
-    found = localize(
-        pair.scene, pair.focal * pair.points2d, camera, views=pair.views or None, seed=seed, time_limit=time_limit
+    found = pair.scene.localize(
+        pair.focal * pair.points2d, camera, views=pair.views or None, seed=seed, time_limit=time_limit
     )  # fmt: skip
     return found.rotation, found.translation, found.verdict
 

@@ -19,6 +19,7 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 ROUND_TRIP = 0.01  # pixels
+MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +92,9 @@ def in_front(points: Array) -> Array:
 
 
 def camera_from(given: Any) -> Camera:
-    """The camera of a 3x3 matrix K, of (COLMAP model name, parameters) or (name, width, height, parameters), of a
-    mapping with `model` and `params` (and `width`, `height`), or of a pycolmap.Camera; a `Camera` as it is.
+    """The camera of a 3x3 matrix K, of OpenCV's (K, distortion), of (COLMAP model name, parameters) or (name, width,
+    height, parameters), of a mapping with `model` and `params` (and `width`, `height`), or of a pycolmap.Camera; a
+    `Camera` as it is.
 
     Raises ValueError for a singular or broken K, an unknown model, a wrong number of parameters, or no positive focal
     length.
@@ -112,7 +114,40 @@ def camera_from(given: Any) -> Camera:
                 "values"
             )
         return colmap_camera(given[0], given[-1], given[1:-1] or (0, 0))
-    return _pinhole(given)
+    return _opencv(*given) if is_opencv(given) else _pinhole(given)
+
+
+def is_opencv(given: Any) -> bool:
+    """Whether a camera is OpenCV's (K, distortion), whose pixels count from (0, 0), the centre of the first one."""
+    return isinstance(given, tuple) and len(given) == 2 and np.shape(given[0]) == (3, 3)
+
+
+def image_size(camera: Camera) -> tuple[int, int] | None:
+    """Width and height of a camera's images in pixels, None where they are not known."""
+    size = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
+    return size if all(size) else None
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether images of two sizes are one scaled, to a pixel of rounding on a side."""
+    return abs(size[0] * other[1] - size[1] * other[0]) <= max(*size, *other)
+
+
+def scaled_camera(camera: Camera, size: tuple[int, int]) -> Camera:
+    """The camera of images that were scaled to `size`, width and height in pixels; itself where they have that size.
+
+    >>> scaled_camera(camera_from(("PINHOLE", 1000, 800, [900, 880, 500, 400])), (500, 400)).matrix.tolist()
+    [[450.0, 0.0, 250.0], [0.0, 440.0, 200.0], [0.0, 0.0, 1.0]]
+    """
+    known = image_size(camera)
+    if known is None or not same_shape(known, size):
+        raise ValueError(f"expected a camera with images of the shape {size[0]} x {size[1]}, got {known}")
+    if known == size:
+        return camera
+    scaled = camera_from(plain_camera(camera))
+    assert isinstance(scaled, Lens)
+    scaled.camera.rescale(*size)
+    return scaled
 
 
 def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:
@@ -141,7 +176,7 @@ def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
         width, height = (int(value) for value in size)
     except (TypeError, ValueError, OverflowError):
         width, height = -1, -1
-    if min(width, height) < 0:
+    if min(width, height) < 0 or max(width, height) > MOST_PIXELS:
         raise ValueError(f"expected width and height of a {model} camera in pixels, got {tuple(size)}")
     lens = Lens(_pycolmap().Camera(model=model, width=width, height=height, params=values.tolist()))
     return _checked(lens, f"{values.tolist()}")
@@ -184,6 +219,23 @@ def _checked(lens: Lens, shown: str) -> Lens:
     if not focal > 0:
         raise ValueError(f"expected a camera with a positive focal length, got {focal} of the parameters {shown}")
     return lens
+
+
+def _opencv(matrix: Any, distortion: Any) -> Camera:
+    """OpenCV's matrix and its coefficients k1, k2, p1, p2, k3, k4, k5, k6, of which the last two or four may lack."""
+    pinhole = _pinhole(matrix)
+    values = np.asarray([] if distortion is None else distortion, np.float64).ravel()
+    if len(values) not in (0, 4, 5, 8) and (len(values) not in (12, 14) or values[8:].any()):
+        raise ValueError(f"expected the 4, 5 or 8 distortion coefficients of OpenCV, got {values.tolist()}")
+    if not values.any():
+        return pinhole
+    if pinhole.matrix[0, 1]:
+        raise ValueError(f"expected a `camera` matrix without skew beside a distortion, got {pinhole.matrix.tolist()}")
+    (fx, _, cx), (_, fy, cy), _ = pinhole.matrix.tolist()
+    coefficients = np.zeros(8)
+    coefficients[: len(values[:8])] = values[:8]
+    count = 8 if coefficients[4:].any() else 4
+    return colmap_camera("FULL_OPENCV" if count == 8 else "OPENCV", [fx, fy, cx, cy, *coefficients[:count].tolist()])
 
 
 def _pinhole(given: Any) -> Pinhole:

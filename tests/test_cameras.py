@@ -8,7 +8,8 @@ import pycolmap
 import pytest
 import torch
 
-from bpnp.cameras import camera_from, plain_camera
+import bpnp
+from bpnp.cameras import camera_from, plain_camera, scaled_camera
 
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
 OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
@@ -43,6 +44,28 @@ def test_a_lens_is_undone_and_applied_as_in_opencv(given: object) -> None:
     assert camera.focal == pytest.approx(510)
 
 
+@pytest.mark.parametrize(
+    "distortion",
+    [
+        None,
+        np.zeros(4),
+        [-0.28, 0.09, 0.004, -0.006],
+        np.array([[-0.28, 0.09, 0.004, -0.006, 0.02]]),
+        np.array([0.2, -0.1, 0.004, -0.006, 0.02, 0.3, -0.12, 0.01]),
+        np.array([0.2, -0.1, 0.004, -0.006, 0.02, 0.3, -0.12, 0.01, 0, 0, 0, 0]),
+    ],
+)
+def test_opencvs_matrix_and_distortion_are_a_camera(distortion: object) -> None:
+    matrix = K * [[1, 0, 1], [1, 1, 1], [1, 1, 1]]  # OpenCV has no skew
+    camera = camera_from((matrix, distortion))
+    coefficients = np.zeros(5) if distortion is None else np.array(distortion)
+    expected, _ = cv2.projectPoints(RAYS, np.zeros(3), np.zeros(3), matrix, coefficients)
+    np.testing.assert_allclose(camera.project(2 * RAYS), expected[:, 0], atol=1e-6)
+    np.testing.assert_allclose(camera.normalise(expected[:, 0]), RAYS[:, :2], atol=1e-5)
+    found = bpnp.solve(expected[:, 0], RAYS * np.linspace(2, 5, 50)[:, None], (matrix, distortion), solver="search")
+    np.testing.assert_allclose(found.rotation, np.eye(3), atol=1e-4)
+
+
 @pytest.mark.parametrize("given", [K, OPENCV])
 def test_nothing_is_seen_behind_the_camera(given: object) -> None:
     pixels = camera_from(given).project(np.array([[0.1, 0.1, 1.0], [0.1, 0.1, -1.0], [0.1, 0.1, 0.0]]))
@@ -65,6 +88,9 @@ def test_pixels_that_no_ray_reaches_are_none() -> None:
         (np.eye(4), r"shape \(3, 3\)"),
         ("PINHOLE", "expected `camera` as a 3x3 matrix"),
         (object(), "expected `camera` as a 3x3 matrix"),
+        ((K, [0.1]), "the 4, 5 or 8 distortion coefficients of OpenCV, got"),
+        ((K, [0.1, 0, 0, 0]), "`camera` matrix without skew beside a distortion"),
+        ((np.diag([500.0, 0.0, 1.0]), None), "invertible `camera` matrix"),
         (("PINHOL", [1.0]), "COLMAP camera model among .*got 'PINHOL'"),
         (("PINHOLE", [500.0, 500.0, 320.0]), "4 parameters of a PINHOLE camera"),
         (("PINHOLE", [500.0, 500.0, np.inf, 240.0]), "finite parameters"),
@@ -87,3 +113,15 @@ def test_a_plain_camera_is_read_as_the_same(given: object) -> None:
     again = camera_from(json.loads(json.dumps(plain_camera(camera))))
     np.testing.assert_array_equal(again.project(RAYS), camera.project(RAYS))
     assert plain_camera(again) == plain_camera(camera)
+
+
+def test_a_scaled_camera_sees_the_same_rays_at_scaled_pixels() -> None:
+    camera = camera_from(("OPENCV", 800, 600, OPENCV[1]))
+    smaller = scaled_camera(camera, (400, 300))
+    np.testing.assert_allclose(smaller.project(RAYS), camera.project(RAYS) / 2, atol=1e-9)
+    assert scaled_camera(camera, (800, 600)) is camera
+    for size in ((400, 225), (300, 400)):
+        with pytest.raises(ValueError, match=f"of the shape {size[0]} x {size[1]}, got"):
+            scaled_camera(camera, size)
+    with pytest.raises(ValueError, match="got None"):
+        scaled_camera(camera_from(K), (800, 600))

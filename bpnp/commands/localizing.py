@@ -1,169 +1,225 @@
-"""`bpnp localize`: new photos in a map, or the images of a COLMAP model as if their poses were unknown."""
+"""`bpnp localize`: where photos were taken, in a map of the place."""
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any
+
+from rich.text import Text
 
 from bpnp.commands.output import console, progress, say
-from bpnp.files import claimed, interruptions_later, keep_settings
+from bpnp.files import claimed, interruptions_later
+
+if TYPE_CHECKING:
+    from bpnp.maps.many_photos import PhotoOptions, PhotoTask, SolutionFolder
+    from bpnp.maps.scene_map import SceneMap
+    from bpnp.solving.solution import Solution
+
+CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
+COLUMNS = ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec")
+LEGEND = (
+    "error px: mean distance between the keypoints of the matches and their points; log10 false: how many poses would "
+    "fit as well by chance, as a power of ten"
+)
 
 
 def localize(
-    map: Path | None = None,
-    photos: list[Path] | None = None,
+    map: Path,
+    photos: list[Path],
     *,
     camera: str | None = None,
     views: Path | None = None,
     keypoints: Path | None = None,
     leave_one_out: bool = False,
     cluster: str | None = None,
-    model: Path | None = None,
-    image: str = "all",
-    points: Literal["seen", "clutter", "all"] = "seen",
-    clutter: float = 0.25,
     output: Path = Path("runs/localize"),
     no_pictures: bool = False,
     solver: str = "auto",
-    inlier_threshold: float | None = None,
     time_limit: float | None = None,
     seed: int = 0,
-    device: str | None = None,
 ) -> None:
-    """Find where photos were taken in a map, or solve the images of a COLMAP model as if their poses were unknown.
+    """Find where photos were taken in a map.
 
-    MAP PHOTO... writes solutions/<photo>.json, pictures/<photo>.png and poses.txt (confident poses in the frame of the
-    map); an interrupted run resumes. --model instead turns the scene at random, so that nothing of a pose
-    leaks into its search, compares with the model and writes results.json, images.txt and pictures/<image>.png.
+    Writes solutions/<photo>.json, pictures/<photo>.png, and of all that were solved in this folder results.json and
+    poses.txt (confident poses in the frame of the map). A photo that was solved there before is kept, unless the photo,
+    the map or an option has changed.
 
     Args:
         map: COLMAP model of the place, such as sparse/0.
         photos: photos, or folders of them; a photo in a folder has its path within it as its name, as in hloc.
-        camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; EXIF by default.
-        views: text file of pairs "photo view", the views of the map to try; the whole map by default.
+        camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; or a COLMAP model, such as MAP
+            itself, for that of its images, scaled to the photo's size. By default that of EXIF, else of images of the
+            map that have the photo's size.
+        views: text file of lines "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map, and each is taken out of it first.
         cluster: address of a Dask scheduler whose workers localize the photos, or a number of processes here.
-        model: COLMAP model whose images are solved again, such as sparse/0.
-        image: one image, or all.
-        points: which 2D and 3D points to solve; "seen", the keypoints with a 3D point and these; "clutter", with
-            --clutter of the others on both sides; "all", every keypoint and every 3D point.
-        clutter: ratio to the true pairs.
         output: folder of the results.
         no_pictures: write no pictures.
         solver: auto, which asks the packaged matcher about a known view when the search is in doubt; search; or a
             checkpoint of a network.
-        inlier_threshold: largest error of a match, pixels.
-        time_limit: seconds a pair.
-        seed: of the rotation and of the search.
-        device: such as cuda; cpu by default.
+        time_limit: seconds a photo.
+        seed: of the search.
     """
-    if (map is None) == (model is None):
-        raise ValueError("expected MAP PHOTO... or --model MODEL, got " + ("neither" if map is None else "both"))
-    of_maps = {"camera": camera, "views": views, "keypoints": keypoints, "leave-one-out": leave_one_out}
-    of_models = {"image": image != "all", "points": points != "seen", "inlier-threshold": inlier_threshold}
-    others = of_maps | {"cluster": cluster} if map is None else of_models | {"device": device}
-    if useless := [f"--{name}" for name, value in others.items() if value]:
-        raise ValueError(f"expected {', '.join(useless)} with {'MAP PHOTO...' if map is None else '--model'} only")
-    shared = {"solver": solver, "seed": seed, "time_limit": time_limit}
-    if map is not None:
-        given = {"camera": camera, "views": views, "keypoints": keypoints, "leave_one_out": leave_one_out, **shared}
-        _localize_photos(map, photos or [], given, output, cluster, pictures=not no_pictures)
-    elif model is not None:
-        options = {"inlier_threshold": inlier_threshold, "device": device, **shared}
-        _localize_images(model, (image, points, clutter), options, output, pictures=not no_pictures)
-
-
-def _localize_photos(
-    place: Path, photos: list[Path], given: Mapping[str, Any], output: Path, cluster: str | None, *, pictures: bool
-) -> None:
-    """Photos in a map. Raises ValueError in the end if some of them could not be tried, after the others."""
-    from bpnp.cameras import camera_from
-    from bpnp.localization.in_maps import (
-        PhotoOptions,
-        attempts,
-        finished_solutions,
-        kept,
-        photo_files,
-        photos_table,
-        write_poses,
-    )
-    from bpnp.localization.point_files import read_camera
-    from bpnp.maps.regions import read_pairs
+    from bpnp.maps.many_photos import PhotoOptions, SolutionFolder, content_of_map, read_views
+    from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
     from bpnp.solving.arguments import source_from
 
-    camera, views, features, *rest = given.values()
-    known = None if camera is None else camera_from(read_camera(camera))
-    if features is not None and not features.is_file():
-        raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {features}, which is no file")
-    source_from(given["solver"])  # raises, where each photo would
-    options = PhotoOptions(known, None if views is None else read_pairs(views), features, *rest)
-    files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(place)
-    out, errors = console(), dict[str, str]()
-    with claimed(output), progress() as shown:
-        if not any((output / "solutions").rglob("*.json")):
-            (output / "settings.json").unlink(missing_ok=True)
-        keep_settings(output / "settings.json", {"map": place, **given})
-        done = finished_solutions(output, files)
-        task = shown.add_task("localizing", total=len(files), completed=len(done))
-        left = {name: photo for name, photo in files.items() if name not in done}
-        try:
-            for name, found in (attempts if cluster is None else _attempts_on(cluster))(scene, left, options):
-                shown.update(task, description=f"localized {name}", advance=1)
-                try:
-                    with interruptions_later():
-                        done[name] = kept(output, name, files[name], found, picture=pictures)
-                except (ValueError, OSError) as error:
-                    errors[name] = str(error)
-        finally:
-            write_poses(output, done)
-    if done:
-        out.print(photos_table({name: done[name] for name in files if name in done}))
-    for name, reason in errors.items():
-        say(f"{name}: {reason}", to=out)
-    folders = ", solutions/, pictures/" if pictures else ", solutions/"
-    say(f"wrote poses.txt{folders if done else ''} in {output}", to=out)
-    if errors:
-        name, reason = next(iter(errors.items()))
-        raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
+    if map.is_file():
+        hint = "; are MAP and PHOTO swapped?" if any(photo.is_dir() for photo in photos) else ""
+        raise ValueError(f"expected MAP as the folder of a COLMAP model, got the file {map}{hint}")
+    if keypoints is not None and not keypoints.is_file():
+        raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
+    source_from(solver)  # raises, where each photo would
+    wanted = None if views is None else read_views(views)
+    files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
+    lens = None if camera is None else _camera(camera, map, scene)
+    options = PhotoOptions(lens, wanted, keypoints, leave_one_out, solver, seed, time_limit)
+    with claimed(output):
+        run = _Run(scene, options, SolutionFolder(output, content_of_map(map)), pictures=not no_pictures)
+        run.localize(files, _attempts(cluster))
+    run.report(files)
 
 
-def _attempts_on(cluster: str) -> Any:
-    """As `attempts`, on the workers of a cluster."""
+class _Run:
+    """The photos of a call: which were kept or are solved again, and which could not be tried, and why."""
+
+    def __init__(self, scene: "SceneMap", options: "PhotoOptions", folder: "SolutionFolder", *, pictures: bool) -> None:
+        self.scene, self.options, self.folder, self.pictures = scene, options, folder, pictures
+        self.kept: list[str] = []
+        self.again: dict[str, str] = {}
+        self.errors: dict[str, str] = {}
+
+    def localize(self, files: Mapping[str, Path], attempts: Callable[..., Any]) -> None:
+        with progress() as shown:
+            bar = shown.add_task("localizing", total=len(files))
+
+            def advance(name: str) -> None:
+                shown.update(bar, description=f"localized {name}", advance=1)
+
+            try:
+                for task, solution in attempts(self.scene, self.tasks(files, advance)):
+                    try:
+                        with interruptions_later():
+                            self.keep(task, solution)
+                    except (ValueError, OSError) as error:
+                        self.fail(task.name, task.photo, error)
+                    advance(task.name)
+            finally:
+                self.folder.write()
+
+    def tasks(self, files: Mapping[str, Path], advance: Callable[[str], None]) -> Iterator["PhotoTask"]:
+        """What is not solved yet, each made ready when its turn comes: a photo may be replaced in the meantime."""
+        from bpnp.maps.many_photos import photo_task
+
+        for name, photo in files.items():
+            try:
+                task = photo_task(self.scene, self.folder.map_content, name, photo, self.options)
+            except (ValueError, OSError) as error:
+                self.fail(name, photo, error)
+                advance(name)
+                continue
+            changes = self.folder.changes(task)
+            if changes is None or changes:
+                if changes:
+                    self.again[name] = ", ".join(dict.fromkeys(CHANGES.get(key, "other options") for key in changes))
+                yield task
+            else:
+                self.kept.append(name)
+                advance(name)
+
+    def keep(self, task: "PhotoTask", solution: "Solution | str") -> None:
+        """Write a solution and its picture. Raises ValueError with the reason if there is none."""
+        from bpnp.report.figures import save_figure
+        from bpnp.report.photos import read_photo
+        from bpnp.solving.pictures import solution_picture
+
+        if isinstance(solution, str):
+            raise ValueError(solution)
+        picture = self.folder.picture(task.name)
+        picture.unlink(missing_ok=True)
+        if self.pictures:
+            title = f"{task.name}: {solution.view}"
+            save_figure(solution_picture(solution, title=title, photo=read_photo(task.photo)), picture)
+        self.folder.keep(task, solution)
+
+    def fail(self, name: str, photo: Path, error: Exception) -> None:
+        self.errors[name] = str(error)
+        self.folder.forget_replaced(name, photo)
+
+    def report(self, files: Mapping[str, Path]) -> None:
+        """Say what was found, kept and written. Raises ValueError if some photos could not be tried."""
+        folder, out = self.folder, console()
+        records = {name: folder.records[name] for name in files if name in folder.records and name not in self.errors}
+        if records:
+            out.print(_table(records))
+            say(LEGEND, to=out)
+            cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
+            say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
+        if self.kept:
+            say(
+                f"kept {len(self.kept)} of {len(files)} photos, solved before with the same content and options", to=out
+            )
+        for name, change in self.again.items():
+            say(f"solved again, with {change}: {name}", to=out)
+        if others := folder.of_other_maps():
+            say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
+        for name, reason in self.errors.items():
+            say(f"{name}: {reason}", to=out)
+        written = ", solutions/, pictures/" if self.pictures else ", solutions/"
+        say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)
+        if self.errors:
+            name, reason = next(iter(self.errors.items()))
+            raise ValueError(f"{len(self.errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
+
+
+def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
+    """The camera of all photos, or the map whose cameras are scaled to each."""
+    from bpnp.cameras import camera_from
+    from bpnp.maps.scene_map import SceneMap
+    from bpnp.solving.point_files import COLMAP_CAMERAS, read_camera
+
+    path = Path(text)
+    if path.is_file() and path.stem == COLMAP_CAMERAS:
+        path = path.parent
+    if text in ("map", "MAP") or (text and path.is_dir()):
+        return scene if not path.is_dir() or path.resolve() == map.resolve() else SceneMap.from_colmap(path)
+    return camera_from(read_camera(text))
+
+
+def _attempts(cluster: str | None) -> Callable[..., Any]:
+    """What localises the photos: here, or on the workers of a cluster."""
     from functools import partial
 
+    if cluster is None:
+        from bpnp.maps.many_photos import attempts
+
+        return attempts
     try:
-        from bpnp.localization.on_cluster import attempts_on_cluster
+        from bpnp.maps.on_cluster import attempts_on_cluster
     except ImportError as error:
         raise ValueError(f"expected Dask for --cluster, got {error}; try `pip install 'bpnp[cluster]'`") from error
     return partial(attempts_on_cluster, cluster=cluster)
 
 
-def _localize_images(
-    model: Path, chosen: tuple[str, str, float], options: Mapping[str, Any], output: Path, *, pictures: bool
-) -> None:
-    """The images of a model. chosen: which, which points, and how much clutter. options: of `bpnp.solve`."""
-    from bpnp.localization.from_models import (
-        draw_image,
-        image_source,
-        localize_image,
-        localized_table,
-        read_model,
-        summary,
-        write_localized,
-    )
+def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
+    """A row for each photo."""
+    from bpnp.report.palette import VERDICTS
+    from bpnp.report.tables.fitted_table import FittedTable
+    from bpnp.report.tables.rows import number
 
-    scene, find = read_model(model)
-    source = image_source(scene, *chosen, options["seed"])
-    settings, done, out = {"model": str(model), "points": chosen[1], "seed": options["seed"]}, [], console()
-    with claimed(output), progress() as shown:
-        try:
-            for index in shown.track(range(len(source.images)), description="localizing"):
-                done.append(localize_image(source, index, **options))
-                if pictures:
-                    draw_image(find, scene, done[-1], output / "pictures")
-        finally:
-            write_localized(output, done, settings)
-    out.print(localized_table(done))
-    out.print(summary(done), highlight=False, soft_wrap=True)
-    say(f"wrote {', '.join(['results.json', 'images.txt', *['pictures/'] * pictures])} in {output}", to=out)
+    rows = []
+    for name, record in records.items():
+        error, alarms = (
+            float("nan" if record[key] is None else record[key]) for key in ("reprojection_error", "log10_false_alarms")
+        )
+        cells = (
+            str(record["view"]),
+            str(record["inlier_count"]),
+            number(error),
+            f"{alarms:.0f}",
+            number(record["seconds"]),
+        )
+        rows.append((Text(name), [Text(record["verdict"], VERDICTS[record["verdict"]]), *map(Text, cells)]))
+    return FittedTable("", COLUMNS, [rows])

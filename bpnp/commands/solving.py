@@ -1,12 +1,18 @@
 """`bpnp solve`: the pose of a camera from a file of image points and a file of scene points."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from rich import box
 from rich.console import Console
+from rich.table import Table
+from rich.text import Text
 
 from bpnp.commands.output import console, progress, say
 from bpnp.files import write_text
+
+if TYPE_CHECKING:
+    from bpnp.solving.solution import Solution
 
 
 def solve(
@@ -67,9 +73,8 @@ def solve(
         device: such as cuda; cpu by default.
     """
     from bpnp.cameras import camera_from
-    from bpnp.localization.point_files import read_camera, read_image, read_prior, read_scene
-    from bpnp.localization.solved import solution_table
     from bpnp.search.starts import GravityPrior
+    from bpnp.solving.point_files import read_camera, read_points2d, read_points3d, read_prior
     from bpnp.solving.solve import solve as find_pose
 
     if (up_camera is None) != (up_scene is None):
@@ -90,8 +95,8 @@ def solve(
     known: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
     if up_camera is not None and up_scene is not None:
         known = GravityPrior(up_camera, up_scene, up_degrees)
-    image_points, labels2d = read_image(points2d)
-    scene_points, normals3d, labels3d = read_scene(points3d, surface=surface, seed=seed)
+    image_points, labels2d = read_points2d(points2d)
+    scene_points, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
     lens = None if camera is None else read_camera(camera, image)
     under = None if photo is None or picture is None else read_photo(photo)
     if under is not None:
@@ -131,3 +136,35 @@ def solve(
     if colmap is not None:
         written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)
         say(f"wrote {written}", to=said)
+
+
+def solution_table(solution: "Solution") -> Table:
+    """Verdict, pose and matches; the next candidates, and how long it took."""
+    from bpnp.report.palette import VERDICTS
+
+    table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
+    table.add_column(no_wrap=True, style="dim")
+    table.add_column(overflow="fold")
+    table.add_row("verdict", Text.assemble((solution.verdict, VERDICTS[solution.verdict]), f": {solution.reason}"))
+    if solution.found:
+        for name, row in zip(("rotation", "", ""), solution.rotation, strict=True):
+            table.add_row(name, _numbers(row))
+        table.add_row("translation", _numbers(solution.translation))
+        table.add_row("camera centre", _numbers(solution.centre))
+        smaller = min(len(solution.points2d), len(solution.points3d))
+        table.add_row("inliers", f"{solution.inlier_count} of {smaller} ({100 * solution.inlier_ratio:.1f} %)")
+        table.add_row(
+            "reprojection",
+            f"{solution.reprojection_error:.3g} {solution.unit} ({solution.reprojection_error_deg:.3g} deg), "
+            f"inliers up to {solution.inlier_threshold:.3g} {solution.unit}",
+        )
+        others = [f"{c.inlier_count} inliers, score {c.score:.3f}" for c in solution.candidates[1:4]]
+        table.add_row("next candidates", "; ".join(others) or "none")
+    if solution.stats.dropped2d:
+        table.add_row("left out", f"{solution.stats.dropped2d} 2D points that could not be undistorted")
+    table.add_row("seconds", f"{solution.seconds:.2f}")
+    return table
+
+
+def _numbers(values: Any) -> str:
+    return "  ".join(f"{value:12.6g}" for value in values)

@@ -1,4 +1,4 @@
-"""The pose of a photo in a map, from its keypoints without descriptors."""
+"""The pose of a photo from its keypoints without descriptors, near one view of a map after the other."""
 
 import math
 import time
@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from torch import nn
 
 from bpnp.cameras import camera_from
-from bpnp.maps.regions import Region, covering_regions, regions_of_views
-from bpnp.maps.views import ViewedPoints
+from bpnp.maps.views import Region
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import checked_prior, source_from
@@ -22,7 +21,7 @@ from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
 MOST_KEYPOINTS = (
-    2048  # the strongest; of the 2,000 largest SIFT keypoints half have a point, of the next 2,000 an eighth
+    2048  # the strongest; half of the 2,000 largest SIFT keypoints have a point, an eighth of the next 2,000
 )
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
 BRIEF = replace(DEFAULT, max_batches=1, beside_poses=0, anywhere=())  # one batch that is looked up
@@ -32,35 +31,17 @@ RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 
 def localize(
-    scene: ViewedPoints,
+    regions: Iterable[Region],
     keypoints: Any,
     camera: Any,
     *,
-    views: Iterable[str] | None = None,
     scores: Any = None,
     prior: PosePrior | None = None,
     solver: str | Path | nn.Module = "auto",
     seed: int = 0,
     time_limit: float | int | None = None,
 ) -> Solution:
-    """The pose of a photo in a map, from its keypoints alone.
-
-    keypoints: (m, 2) pixels. camera: as for `bpnp.solve`.
-    views: names of views of the map that may show the same place, best first, from any image retrieval (`read_pairs`
-        reads hloc's): the points that any of them sees are used near each; None to try the points of one view of the
-        whole map after the other, those first that together see most of it.
-    scores: (m,) strength of the keypoints; the strongest are used first.
-    prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
-    solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the view
-        that is tried, or of the prior.
-    time_limit: seconds for all views together, after which no search begins; None for no limit.
-
-    Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the pose
-    with the fewest false alarms is returned. `solution.view` is the view near which it was found.
-    `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
-    with the ids `solution.point_ids` are the points that were tried.
-    Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
-    """
+    """The best pose of a photo near any of these regions of a map; arguments and answer as `SceneMap.localize`."""
     start = time.monotonic()
     if time_limit is not None and not 0 < time_limit < math.inf:
         raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
@@ -71,44 +52,43 @@ def localize(
     strongest = None if scores is None else np.sort(np.argsort(-np.asarray(scores), kind="stable")[:MOST_KEYPOINTS])
     used = keypoints if strongest is None else np.asarray(keypoints)[strongest]
     module = source_from(solver)
-    regions = covering_regions(scene) if views is None else regions_of_views(scene, views)
-    found: list[tuple[Region, Solution]] = []
-    chosen, tries, over = regions, 0, False
+    best: list[tuple[Region, Solution]] = []  # the most promising first
+    tries, over = 0, False
     for settings in (BRIEF, LONGER):
-        for region in chosen:
-            left = None if time_limit is None else time_limit - (time.monotonic() - start)
-            over = over or (bool(found) and left is not None and left <= 0)
+        for region in regions:
+            remaining = None if time_limit is None else time_limit - (time.monotonic() - start)
+            over = over or (bool(best) and remaining is not None and remaining <= 0)
             if over:
                 break
             tries += 1
-            limit = None if left is None else max(left, 1e-3)
+            limit = None if remaining is None else max(remaining, 1e-3)
             asks = solver == "auto" and settings is LONGER  # not of every view of the map
             options = Options(module, asks, seed=seed, time_limit=limit, settings=settings)
-            found.append((region, counted(_tried(scene, region, used, camera, prior, options), tries)))
-            over = found[-1][1].verdict == "confident"
-        found.sort(key=lambda item: _rank(item[1]), reverse=True)
-        chosen = [region for region, _ in found[:PROMISING]]
-    if not found:
+            solution = counted(_tried(region, used, camera, prior, options), tries)
+            best = sorted([*best, (region, solution)], key=lambda item: _rank(item[1]), reverse=True)[:PROMISING]
+            over = solution.verdict == "confident"
+        regions = [region for region, _ in best]
+    if not best:
         raise ValueError("expected a map with views that see 4 or more points, got none")
-    best = found[0][1]
+    solution = best[0][1]
     if strongest is not None:
-        best = _with_all_keypoints(best, strongest, keypoints, camera)
-    return replace(best, seconds=time.monotonic() - start)
+        solution = _with_all_keypoints(solution, strongest, keypoints, camera)
+    return replace(solution, seconds=time.monotonic() - start)
 
 
-def _tried(
-    scene: ViewedPoints, region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options
-) -> Solution:
+def _tried(region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options) -> Solution:
     """The best pose of the photo among the points of one region."""
-    known = checked_prior(region.prior(scene) if prior is None else prior)
     problem = problem_from(
-        keypoints, scene.points3d[region.points], camera_from(camera), normals3d=scene.cones.axes[region.points],
-        cosines3d=scene.cones.cosines[region.points], prior=known,
-    )  # fmt: skip
-    found = solutions_of({0: problem}, options)[0]
-    ids = scene.point_ids[region.points]
-    matches = np.column_stack([found.matches[:, 0], ids[found.matches[:, 1]]])
-    return replace(found, matches=matches, view=region.view.name, point_ids=ids)
+        keypoints,
+        region.points3d,
+        camera_from(camera),
+        normals3d=region.cones.axes,
+        cosines3d=region.cones.cosines,
+        prior=checked_prior(region.prior() if prior is None else prior),
+    )
+    solution = solutions_of({0: problem}, options)[0]
+    matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
+    return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)
 
 
 def counted(solution: Solution, tries: int) -> Solution:

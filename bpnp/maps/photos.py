@@ -1,55 +1,222 @@
-"""What the file of a photo says about its camera."""
+"""What is read of a photo: which files there are, what they say about the camera, and the keypoints."""
 
+import importlib
+import sqlite3
+from collections.abc import Iterable
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.cameras import same_shape
+
+Array = NDArray[np.float64]
+Size = tuple[int, int]  # width and height, pixels
+# The last four are found too although Pillow may not read them, so that the error names the photo.
+SUFFIXES = {".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", ".heic", ".heif", ".avif", ".dng"}
 IFD_EXIF = 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35MM = 0x920A, 0xA405
 RESOLUTION_X, RESOLUTION_UNIT = 0xA20E, 0xA210
+PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
 MILLIMETRES = {2: 25.4, 3: 10.0}  # of the resolution's unit, by its EXIF number: inch, centimetre
+CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
+MOST_DETECTED = 8192
+CONTRAST = 0.02  # of three layers together, of 1: COLMAP's peak_threshold of 0.02 / 3; half of OpenCV's default
+SQLITE = b"SQLite format 3\0"
+# x, y; and scale, orientation; or and a 2x2 matrix of the local shape. https://colmap.github.io/database.html
+COLUMNS = (2, 4, 6)
+QUERY = """SELECT rows, cols, data, width, height FROM images
+    LEFT JOIN keypoints USING (image_id) LEFT JOIN cameras USING (camera_id) WHERE name = ?"""
 
-ColmapCamera = tuple[str, int, int, tuple[float, float, float]]
+
+class Keypoints(NamedTuple):
+    """pixels: (m, 2) in COLMAP's coordinates, (0.5, 0.5) the centre of the first pixel. scores: (m,) strength.
+
+    size: width and height of the photo, pixels; None where it is not known.
+    """
+
+    pixels: Array
+    scores: Array
+    size: Size | None
 
 
-def photo_size(photo: Path) -> tuple[int, int]:
+def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str, Path]:
+    """Photos by name: the files given, and those in given folders and folders within, named by their path in these.
+
+    besides: a folder within a given one whose files are no photos, such as that of the results.
+    Raises ValueError for none, or one name twice.
+    """
+    files: dict[str, Path] = {}
+    for path in paths:
+        if not path.exists():
+            raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
+        for file in _photos_in(path, besides) if path.is_dir() else [path]:
+            name = file.relative_to(path).as_posix() if path.is_dir() else file.name
+            if files.setdefault(name, file) != file:
+                raise ValueError(f"expected photos of different names, got {files[name]} and {file}")
+    if not files:
+        raise ValueError("expected one or more photos, or folders with some, got none")
+    return files
+
+
+def _photos_in(folder: Path, besides: Path | None) -> list[Path]:
+    left_out = None if besides is None else besides.resolve()
+    inside = (file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES)
+    return sorted(file for file in inside if left_out not in file.resolve().parents)
+
+
+def photo_size(photo: Path) -> Size:
     """Width and height of a photo in pixels. Raises ValueError if it cannot be read."""
+    return _opened(photo)[0]
+
+
+def focal_from_exif(photo: Path) -> float | None:
+    """The focal length in pixels of the photo as it is, from EXIF; None where it has none that holds for its size.
+
+    From the equivalent at 35 mm film, which does not change when a photo is scaled; else from the millimetres and the
+    resolution of the sensor, scaled by the size that EXIF has of the photo as it was taken. A photo of another shape
+    than that was cropped, and no one knows from where. (pycolmap's `infer_camera_from_image` takes the resolution of
+    the sensor for that of a scaled photo too.) Raises ValueError for a photo that cannot be read.
+    """
+    size, tags = _opened(photo)
+    taken = int(tags.get(PIXELS_X, 0)), int(tags.get(PIXELS_Y, 0))
+    if all(taken) and not same_shape((max(taken), min(taken)), (max(size), min(size))):
+        return None
+    equivalent = float(tags.get(FOCAL_LENGTH_35MM, 0))
+    if equivalent > 0:
+        return float(equivalent * np.hypot(*size) / DIAGONAL_35MM)
+    millimetres, resolution = float(tags.get(FOCAL_LENGTH, 0)), float(tags.get(RESOLUTION_X, 0))
+    unit = MILLIMETRES.get(int(tags.get(RESOLUTION_UNIT, 2)))
+    if not (millimetres > 0 and resolution > 0 and unit and all(taken)):
+        return None
+    return millimetres * resolution / unit * max(size) / max(taken)
+
+
+def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
+    """Size of a photo, and its EXIF tags."""
     from PIL import Image
 
     try:
         with Image.open(photo) as image:
-            return image.size
+            return image.size, image.getexif().get_ifd(IFD_EXIF)
     except OSError as error:
         raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
 
 
-def camera_from_exif(photo: Path) -> ColmapCamera:
-    """("SIMPLE_PINHOLE", width, height, (f, cx, cy)), f in pixels from EXIF, the principal point in the centre.
+def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:
+    """The keypoints of a photo: those that a file, hloc's or COLMAP's, has of its `name`; without a file detected."""
+    if file is None:
+        return detected_keypoints(photo)
+    path, size = Path(file), photo_size(photo)
+    with path.open("rb") as content:
+        head = content.read(len(SQLITE))
+    if not head:
+        raise ValueError(f"expected hloc's HDF5 file of keypoints or a database of COLMAP, got the empty file {path}")
+    return (read_database if head == SQLITE else read_features)(path, name, size)
 
-    From the focal length in millimetres and the resolution of the sensor, or from the equivalent at 35 mm film.
-    Raises ValueError for a photo that cannot be read or does not have either.
+
+def detected_keypoints(photo: Path, *, most: int = MOST_DETECTED) -> Keypoints:
+    """SIFT keypoints of a photo (Lowe 2004, OpenCV's), one for each place, the score its scale in pixels.
+
+    As faint as COLMAP's, and the `most` largest, of which COLMAP's maps are made too. Large ones are seen again from
+    other sides and triangulated, so that the scale tells better than the response which have a partner in a map.
+    Raises ValueError for a photo that cannot be read or has no keypoints.
     """
-    from PIL import Image
+    import cv2
 
+    as_stored = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION  # as COLMAP reads photos
+    image = cv2.imread(str(photo), as_stored)
+    if image is None:
+        raise ValueError(f"expected a photo that OpenCV can read, got {photo}")
+    points = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True).detect(image)
+    rows = np.array([(*point.pt, point.size) for point in points], np.float64).reshape(-1, 3)
+    rows = rows[np.argsort(-rows[:, 2], kind="stable")[:most]]
+    pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)
+    if not len(pixels):
+        raise ValueError(f"expected a photo with keypoints, got none in {photo}")
+    return Keypoints(pixels + CENTRE, rows[first, 2], (image.shape[1], image.shape[0]))
+
+
+def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints:
+    """The keypoints of a photo in an HDF5 file of hloc: `<photo>/keypoints` (m, 2), `scores` (m,) if there are some.
+
+    size: of the photo in pixels, to check them by; by default `<photo>/image_size`, if the file has it.
+    Raises ValueError, naming file and photo, if it is not in the file, of another size, or a keypoint lies outside it.
+    """
+    h5py = _h5py()
     try:
-        with Image.open(photo) as image:
-            (width, height), tags = image.size, image.getexif().get_ifd(IFD_EXIF)
+        with h5py.File(file, "r") as content:
+            if photo not in content or "keypoints" not in content[photo]:
+                some = ", ".join(list(content)[:5])
+                raise ValueError(f"expected keypoints of {photo} in {file}, got {some or 'an empty file'}")
+            group = content[photo]
+            pixels = np.asarray(group["keypoints"], np.float64)
+            scores = np.asarray(group["scores"], np.float64) if "scores" in group else np.ones(len(pixels))
+            stored = tuple(int(value) for value in group["image_size"]) if "image_size" in group else None
     except OSError as error:
-        raise ValueError(f"expected a photo that can be read, got {photo}: {error}") from error
-    focal = _focal(tags, width, height)
-    if focal is None:
+        raise ValueError(f"expected an HDF5 file of keypoints or a database of COLMAP, got {file}: {error}") from error
+    if pixels.ndim != 2 or pixels.shape[1] != 2 or scores.shape != (len(pixels),):
         raise ValueError(
-            f"expected a focal length in the EXIF data of {photo}, got none; try --camera, such as "
-            f"SIMPLE_PINHOLE,{1.2 * max(width, height):.0f},{width / 2:g},{height / 2:g}"
+            f"expected keypoints (m, 2) and scores (m,) of {photo} in {file}, got {pixels.shape} and {scores.shape}"
         )
-    return "SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2)
+    return _checked(Keypoints(pixels + CENTRE, scores, stored), size, f"{photo} in {file}")  # type: ignore[arg-type]
 
 
-def _focal(tags: dict[int, Any], width: int, height: int) -> float | None:
-    """Pixels."""
-    own, resolution = float(tags.get(FOCAL_LENGTH, 0)), float(tags.get(RESOLUTION_X, 0))
-    unit = MILLIMETRES.get(int(tags.get(RESOLUTION_UNIT, 2)))
-    if own > 0 and resolution > 0 and unit is not None:
-        return own * resolution / unit
-    equivalent = float(tags.get(FOCAL_LENGTH_35MM, 0))
-    return equivalent * (width**2 + height**2) ** 0.5 / DIAGONAL_35MM if equivalent > 0 else None
+def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints:
+    """The keypoints of a photo in a database of COLMAP, one for each place, the score its scale if the database has it.
+
+    size: of the photo in pixels, to compare with that of the image's camera.
+    Raises ValueError, naming file and photo, if it is not in the database, has no keypoints or such of another size, or
+    if these are damaged or lie outside the photo. (`pycolmap.Database` writes to every file that it opens.)
+    """
+    try:
+        mode = (
+            "mode=ro" if file.with_name(f"{file.name}-wal").exists() else "immutable=1"
+        )  # which leaves no file beside
+        with closing(sqlite3.connect(f"{file.absolute().as_uri()}?{mode}", uri=True)) as content:
+            row = content.execute(QUERY, (photo,)).fetchone()
+            names = ", ".join(str(name) for (name,) in content.execute("SELECT name FROM images LIMIT 5"))
+    except sqlite3.Error as error:
+        raise ValueError(f"expected a database of COLMAP, got {file}: {error}") from error
+    if row is None or not row[0]:
+        others = "" if row else f", but {names}" if names else ": it has no images"
+        raise ValueError(f"expected keypoints of {photo} in {file}, got none{others}")
+    count, columns, data, *stored = row
+    length, where = len(data) if isinstance(data, bytes) else 0, f"{photo} in {file}"
+    if columns not in COLUMNS or not isinstance(count, int) or length != 4 * count * columns:
+        expected = "rows of 2, 4 or 6 numbers of 4 bytes"
+        raise ValueError(f"expected {expected} for {where}, got {count} rows of {columns} in {length} bytes")
+    rows = np.frombuffer(data, "<f4").reshape(count, columns).astype(np.float64)
+    if not np.isfinite(rows).all():
+        raise ValueError(f"expected finite keypoints of {where}, got {(~np.isfinite(rows)).any(1).sum()} that are not")
+    scores = rows[:, 2] if columns == 4 else np.ones(count)
+    if columns == 6:  # the mean length of the columns of the shape
+        scores = np.linalg.norm(rows[:, 2:].reshape(-1, 2, 2), axis=1).mean(1)
+    pixels, first = np.unique(rows[:, :2], axis=0, return_index=True)
+    known = None if None in stored else (int(stored[0]), int(stored[1]))
+    return _checked(Keypoints(pixels, scores[first], known), size, where)
+
+
+def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
+    """The keypoints of a photo of this size. Raises ValueError if theirs is another one, or one lies outside it."""
+    if None not in (keypoints.size, size) and keypoints.size != size:
+        raise ValueError(f"expected keypoints of {where} at the size {size} of the photo, got them at {keypoints.size}")
+    known = size or keypoints.size
+    outside = ((keypoints.pixels < 0) | (keypoints.pixels > np.array(known or np.inf))).any(-1)
+    if known is not None and outside.any():
+        raise ValueError(
+            f"expected keypoints inside the {known[0]} x {known[1]} pixels of {where}, got {int(outside.sum())} "
+            f"outside, such as {keypoints.pixels[outside][0].round(1).tolist()}; try features of this size"
+        )
+    return keypoints._replace(size=known)
+
+
+def _h5py() -> ModuleType:
+    try:
+        return importlib.import_module("h5py")  # optional
+    except ImportError as error:
+        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error

@@ -1,37 +1,46 @@
-"""A map to localise photos in, read from a COLMAP reconstruction."""
+"""A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
-import logging
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from torch import nn
 
-from bpnp.cameras import Camera
-from bpnp.datamodules.colmap.model_files import ColmapError, ModelRecords, read_records
-from bpnp.datamodules.colmap.reconstruction import camera_of
+from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape, scaled_camera
+from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.maps.localize import localize
-from bpnp.maps.views import View, ViewedPoints
+from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size
+from bpnp.maps.views import Array, Cones, Region, View, covering_order, viewing_cones
 from bpnp.search.starts import PosePrior
 from bpnp.solving.solution import Solution
 
-logger = logging.getLogger(__name__)
+LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
+SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera is taken for that of a photo
 
 
-@dataclass(frozen=True, eq=False)
-class SceneMap(ViewedPoints):
-    """A COLMAP reconstruction as a map: its points, its views, and which view sees which point.
+@dataclass(frozen=True, eq=False, repr=False)
+class SceneMap:
+    """A COLMAP reconstruction as a map: n points, and the views that see them.
 
-    Fields and the choice of views: `bpnp.maps.views.ViewedPoints`.
+    points3d: (n, 3) scene units, in the order of their ids. point_ids: (n,) ids in the COLMAP model.
+    track_lengths: (n,) views that see each point. views: in the order of their names.
 
     >>> from bpnp import SceneMap
     >>> scene = SceneMap.from_colmap("sparse/0")  # doctest: +SKIP
-    >>> solution = scene.localize(keypoints, ("SIMPLE_PINHOLE", (1380, 768, 512)))  # doctest: +SKIP
+    >>> solution = scene.localize_photo("photo.jpg")  # doctest: +SKIP
     >>> solution.verdict, solution.view, solution.matches  # doctest: +SKIP
     """
+
+    points3d: Array
+    point_ids: NDArray[np.int64]
+    track_lengths: NDArray[np.int32]
+    views: tuple[View, ...]
 
     @classmethod
     def from_colmap(cls, path: str | Path) -> "SceneMap":
@@ -41,8 +50,87 @@ class SceneMap(ViewedPoints):
         points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB.
         Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
         """
-        folder = Path(path)
-        return _scene_map(folder, read_records(folder))
+        model = read_reconstruction(path, keypoints=False)
+        views = tuple(
+            View(image.name, image.camera, image.rotation, image.translation, image.observed.astype(np.int32))
+            for image in model.images
+        )
+        if not any(len(view.points) for view in views):
+            raise ColmapError(
+                f"expected a map with views that see points in {path}, got {len(views)} views and "
+                f"{len(model.point_ids)} points; try a model with registered images"
+            )
+        return cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
+
+    def __repr__(self) -> str:
+        return f"SceneMap({len(self.views):,} views, {len(self.points3d):,} points)"
+
+    @cached_property
+    def visibility(self) -> csr_array:
+        """(views, n) with 1 where a view sees a point."""
+        counts = [len(view.points) for view in self.views]
+        columns = np.concatenate([view.points for view in self.views])
+        entries = np.ones(len(columns), np.int32), columns, np.concatenate([[0], np.cumsum(counts)])
+        return csr_array(entries, shape=(len(self.views), len(self.points3d)))
+
+    @cached_property
+    def cones(self) -> Cones:
+        """From where each point is seen."""
+        return viewing_cones(self.points3d, ((view.centre, view.points) for view in self.views))
+
+    @cached_property
+    def view_numbers(self) -> dict[str, int]:
+        """Places in `views` by name."""
+        return {view.name: i for i, view in enumerate(self.views)}
+
+    def named(self, names: Iterable[str]) -> list[View]:
+        """The views of these names. Raises ValueError for one that the map does not have."""
+        wanted = list(names)
+        if unknown := [name for name in wanted if name not in self.view_numbers]:
+            some = ", ".join(view.name for view in self.views[:5])
+            raise ValueError(f"expected names of views of the map, got {', '.join(unknown[:5])}; try {some}, ...")
+        return [self.views[self.view_numbers[name]] for name in wanted]
+
+    def without(self, names: Collection[str]) -> "SceneMap":
+        """The map as it would be without these views: also points that then fewer than two views see are left out.
+
+        Raises ValueError for a name that the map does not have, or if no view that sees a point is left.
+        """
+        left_out = {view.name for view in self.named(names)}
+        views = tuple(view for view in self.views if view.name not in left_out)
+        return replace(self, views=views).seen_by(LEAST_TRACK)
+
+    def seen_by(self, least: int) -> "SceneMap":
+        """Only such points as `least` or more of the views see. Raises ValueError if none is left."""
+        tracks = np.zeros(len(self.points3d), np.int32)
+        for view in self.views:
+            tracks[view.points] += 1
+        enough = tracks >= least
+        if not enough.any():
+            raise ValueError(f"expected points that {least} or more views see, got none in {len(self.views)} views")
+        place = np.cumsum(enough, dtype=np.int32) - 1
+        views = tuple(replace(view, points=place[view.points[enough[view.points]]]) for view in self.views)
+        return SceneMap(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
+
+    def regions(self, views: Iterable[str] | None = None) -> Iterator[Region]:
+        """What to look near: each of the given views, in their order, with the points that any of them sees, since they
+        show one place; or each view of the map with its own points, those first that together see most of the map.
+
+        Raises ValueError for unknown names, or if there is none.
+        """
+        if views is None:
+            return (self._region(view, view.points) for view in covering_order(self.views, self.visibility))
+        named = self.named(views)
+        if not named:
+            raise ValueError("expected names of views to try, got none; try views=None for all of the map")
+        points = np.unique(np.concatenate([view.points for view in named]))
+        return (self._region(view, points) for view in named if len(view.points))
+
+    def _region(self, view: View, points: NDArray[np.int32]) -> Region:
+        in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
+        distance = float(np.median(np.linalg.norm(in_camera, axis=-1)))
+        cones = Cones(self.cones.axes[points], self.cones.cosines[points])
+        return Region(view, self.points3d[points], self.point_ids[points], cones, distance)
 
     def localize(
         self,
@@ -56,46 +144,111 @@ class SceneMap(ViewedPoints):
         seed: int = 0,
         time_limit: float | int | None = None,
     ) -> Solution:
-        """The pose of a photo from its keypoints alone; see `bpnp.maps.localize.localize`."""
+        """The pose of a photo in the map, from its keypoints alone.
+
+        keypoints: (m, 2) pixels, COLMAP's: (0.5, 0.5) is the centre of the first one; or a list of cv2.KeyPoint, which
+            OpenCV counts from (0, 0).
+        camera: as for `bpnp.solve`. With OpenCV's (K, distortion) pixels count as OpenCV's do, those in an array too.
+        views: names of views of the map that may show the same place, best first, from any image retrieval: the points
+            that any of them sees are used near each; None to try the points of one view of the whole map after the
+            other, those first that together see most of it.
+        scores: (m,) strength of the keypoints; the strongest are used first.
+        prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
+        solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
+            view that is tried, or of the prior.
+        seed: of the search.
+        time_limit: seconds for all views together, after which no search begins; None for no limit.
+
+        Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the
+        pose with the fewest false alarms is returned. `solution.view` is the view near which it was found.
+        `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
+        with the ids `solution.point_ids` are the points that were tried.
+        Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
+        """
+        if isinstance(keypoints, (list, tuple)) and keypoints and all(hasattr(point, "pt") for point in keypoints):
+            keypoints = np.array([point.pt for point in keypoints]) + (0.0 if is_opencv(camera) else CENTRE)
+        regions = self.regions(views)
         return localize(
-            self, keypoints, camera, views=views, scores=scores, prior=prior, solver=solver, seed=seed,
+            regions, keypoints, camera, scores=scores, prior=prior, solver=solver, seed=seed, time_limit=time_limit
+        )
+
+    def localize_photo(
+        self,
+        photo: str | Path,
+        camera: Any = None,
+        *,
+        keypoints: str | Path | None = None,
+        name: str | None = None,
+        views: Iterable[str] | None = None,
+        prior: PosePrior | None = None,
+        solver: str | Path | nn.Module = "auto",
+        seed: int = 0,
+        time_limit: float | int | None = None,
+    ) -> Solution:
+        """The pose of a photo from its file, as `bpnp localize` finds it.
+
+        camera: as for `localize`; None for the one that `camera_for` finds, that of the EXIF data, else of views of the
+            photo's size; a SceneMap for that of its views, scaled to the photo's size.
+        keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
+            that of the file; None to detect SIFT keypoints.
+        views, prior, solver, seed, time_limit: as for `localize`.
+        Raises ValueError for a photo that cannot be read, or of another size than its camera or keypoints, and as
+        `localize`.
+        """
+        path = Path(photo)
+        if camera is None or isinstance(camera, SceneMap):
+            camera = (camera or self).camera_for(path, exif=camera is None)[0]
+        size = photo_size(path)
+        if (known := image_size(camera_from(camera))) not in (None, size):
+            raise ValueError(
+                f"expected photos of {known[0]} x {known[1]} pixels as the camera has, got {path.name} of {size[0]} x "
+                f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
+            )
+        points = photo_keypoints(path, keypoints, path.name if name is None else name)
+        pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
+        return self.localize(
+            pixels,
+            camera,
+            views=views,
+            scores=points.scores,
+            prior=prior,
+            solver=solver,
+            seed=seed,
             time_limit=time_limit,
-        )  # fmt: skip
+        )
 
+    def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera, str]:
+        """The camera of a photo, and in words where it is from.
 
-def _scene_map(folder: Path, records: ModelRecords) -> SceneMap:
-    order = np.argsort(records.point_ids)
-    finite = np.isfinite(records.points3d[order]).all(-1)
-    order = order[finite]
-    ids, points3d = records.point_ids[order], records.points3d[order]
-    cameras: dict[int, Camera] = {}
-    views, broken = [], 0
-    for record in sorted(records.images, key=lambda image: image.name):
-        if not np.isfinite([*record.quaternion, *record.translation]).all() or not record.quaternion.any():
-            broken += 1
-            continue
-        if record.camera_id not in cameras:
-            cameras[record.camera_id] = camera_of(
-                records.cameras.get(record.camera_id), f"camera {record.camera_id} of an image in {folder}"
+        With the focal length of its EXIF data, the principal point in the middle; else that of views with images of its
+        size. Without `exif` that of views with images of its shape, scaled to its size.
+        Raises ValueError if there is none, or the focal lengths of such views differ by more than a twentieth.
+        """
+        size = width, height = photo_size(photo)
+        if exif and (focal := focal_from_exif(photo)) is not None:
+            return camera_from(("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))), "EXIF"
+        owners = {id(view.camera): view for view in reversed(self.views)}
+        sizes = {key: image_size(view.camera) for key, view in owners.items()}
+        fitting = [
+            (scaled_camera(owners[key].camera, size), owners[key].name)
+            for key, known in sizes.items()
+            if known == size or (not exif and known is not None and same_shape(known, size))
+        ]
+        fitting.sort(key=lambda item: item[0].focal)
+        if not fitting:
+            others = ", ".join(sorted({"{} x {}".format(*known) for known in sizes.values() if known})[:4])
+            scalable = exif and any(known and same_shape(known, size) for known in sizes.values())
+            wanted = "a focal length in the EXIF data" if exif else "views of the shape"
+            raise ValueError(
+                f"expected {wanted} of {photo} of {width} x {height} pixels{', or views of this size' * exif}, got "
+                f"{'neither' if exif else 'none'}: the map's are of {others}; try --camera with the camera of the photo"
+                f"{', or MAP for that of the views, scaled' * scalable}"
             )
-        observed = np.unique(record.point_ids[record.point_ids >= 0])
-        place = np.minimum(np.searchsorted(ids, observed), max(len(ids) - 1, 0))
-        views.append(
-            View(
-                name=record.name,
-                camera=cameras[record.camera_id],
-                rotation=Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix(),
-                translation=record.translation,
-                points=place[ids[place] == observed].astype(np.int32) if len(ids) else np.empty(0, np.int32),
+        low, high = fitting[0][0].focal, fitting[-1][0].focal
+        if high > SAME_FOCAL * low:
+            raise ValueError(
+                f"expected views of {width} x {height} pixels with one focal length, as {photo} has none in its EXIF "
+                f"data, got {len(fitting)} of {low:.0f} to {high:.0f} pixels; try --camera with the camera of the photo"
             )
-        )
-    if broken or not finite.all():
-        logger.warning(
-            "not used in %s: %d images with a broken pose, %d points not finite", folder, broken, (~finite).sum()
-        )
-    if not any(len(view.points) for view in views):
-        raise ColmapError(
-            f"expected a map with views that see points in {folder}, got {len(views)} views and {len(ids)} points; "
-            "try a model with registered images"
-        )
-    return SceneMap(points3d, ids, np.zeros(len(ids), np.int32), tuple(views)).seen_by(1)
+        camera, name = fitting[len(fitting) // 2]
+        return camera, f"view {name} of the map"

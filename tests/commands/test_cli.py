@@ -60,7 +60,7 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
         (["bogus"], "expected a command, got 'bogus'; try fit"),
         (["prepare", "megadpth", "."], "did you mean megadepth?"),
         (["prepare", "megadepth", ".", "--min_points=3"], "min_points"),
-        (["localize", "--modle=x"], "did you mean --model?"),
+        (["localize", "--veiws=x"], "did you mean --views?"),
         (["fit", *MESHES, "--trainer.max_epoch=3"], "did you mean --trainer.max_epochs?"),
         (["fit"], "expected --data, got none; try: bpnp fit --help"),
         (["table"], "expected --data, --methods, got none; try: bpnp table --help"),

@@ -1,4 +1,4 @@
-"""`bpnp localize MAP PHOTO...`: photos that are taken out of their map are found again; bad ones do not stop others."""
+"""`bpnp localize`: photos that are taken out of their map are found again; bad ones do not stop others."""
 
 import json
 import shutil
@@ -18,7 +18,7 @@ import bpnp
 from bpnp import SceneMap, Solution
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.localization import in_maps
+from bpnp.maps.photos import photo_files
 
 CAMERA = "PINHOLE,1379.7,1382.1,760.3,503.4"
 
@@ -60,20 +60,20 @@ def test_photos_left_out_of_their_map_are_found_and_a_broken_one_is_named(
         assert set(solution.matches[:, 1].tolist()) <= set(scene.point_ids.tolist())
         assert (output / "pictures" / f"{name}.png").stat().st_size > 20000
 
-    # Another run goes on where this one was: nothing is solved again, and other settings are refused.
     before = (output / "solutions/0004.jpg.json").stat().st_mtime_ns
     fails(*command, "--leave-one-out")
     assert (output / "solutions/0004.jpg.json").stat().st_mtime_ns == before
-    error = fails(*command, "--leave-one-out", "--seed", "1")
-    assert "without results of other settings, got other seed; try another --output" in error
+    # A photo whose file is no photo any more keeps no pose.
+    (folder / "0004.jpg").write_text("no photo")
+    assert "2 of 3 photos could not be tried" in fails(*command, "--leave-one-out")
+    assert [line.split()[0] for line in (output / "poses.txt").read_text().splitlines()[1:]] == ["0006.jpg"]
 
 
 def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]) -> None:
     model, photos = place
     out = ("--output", str(tmp_path / "out"))
-    assert "expected MAP PHOTO... or --model MODEL, got neither" in fails("localize")
-    assert "got both" in fails("localize", str(model), "--model", str(model))
-    assert "expected one or more photos" in fails("localize", str(model), *out)
+    assert "expected map, photos, got none" in fails("localize")
+    assert "expected photos, got none" in fails("localize", str(model), *out)
     assert "a.jpg, which does not exist" in fails("localize", str(model), "a.jpg", *out)
     Image.new("RGB", (64, 48)).save(tmp_path / "plain.jpg")
     plain = ("localize", str(model), str(tmp_path / "plain.jpg"))
@@ -82,17 +82,21 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--camera", "PINHOLE,1"), "expected 4 parameters of a PINHOLE camera, got [1.0]"),
         (("--keypoints", "nothing.h5"), "of keypoints, got nothing.h5, which is no file"),
         (("--solver", "nothing"), "or packaged weights"),
-        (("--points", "all", "--image", "a"), "expected --image, --points with --model only"),
+        (("--model", str(model)), "nrecognized arguments: --model"),
+        (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), "expected a folder to write to, got"),
     ):
         error = fails(*plain, *out, *given)
         assert message in error
         assert "could not be tried" not in error
-    error = fails("localize", "--model", str(model), "--keypoints", "a.h5", "--leave-one-out")
-    assert "expected --keypoints, --leave-one-out with MAP PHOTO... only" in error
-    assert "focal length in the EXIF data" in fails(*plain, *out)
-    error = fails(*plain, "--camera", "SIMPLE_PINHOLE,128,96,80,64,48", *out)
-    assert "expected photos of 128 x 96 pixels as --camera says, got plain.jpg of 64 x 48" in error
+    error = fails("localize", str(tmp_path / "plain.jpg"), str(model), *out)
+    assert error.rstrip().endswith("got the file " + str(tmp_path / "plain.jpg") + "; are MAP and PHOTO swapped?")
+    error = fails(*plain, *out)
+    assert "focal length in the EXIF data" in error
+    assert "or views of this size, got neither: the map's are of 3072 x 2048; try --camera with the camera" in error
+    for size, parameters in (("128 x 96", "128,96,80,64,48"), ("64 x 36", "64,36,80,32,18")):
+        error = fails(*plain, "--camera", f"SIMPLE_PINHOLE,{parameters}", *out)
+        assert f"expected photos of {size} pixels as the camera has, got plain.jpg of 64 x 48" in error
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")
     error = fails(
@@ -100,7 +104,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         "--output", str(tmp_path / "views"),
     )  # fmt: skip
     assert "expected names of views of the map, got nowhere.jpg" in error
-    assert json.loads((tmp_path / "views/settings.json").read_text())["leave_one_out"] is False
+    assert json.loads((tmp_path / "views/results.json").read_text())["photos"] == {}
 
 
 def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_photos(
@@ -123,7 +127,7 @@ def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_pho
     shutil.copy(photos / "0005.jpg", folder / "found/pictures")
     assert "1 of 2 photos" in fails(*command, "--output", str(folder / "found"))
     given = folder / "found/pictures/0005.jpg"  # by itself it is a photo, wherever it lies
-    assert in_maps.photo_files([given], besides=folder / "found") == {"0005.jpg": given}
+    assert photo_files([given], besides=folder / "found") == {"0005.jpg": given}
 
 
 def test_a_photo_of_a_format_that_cannot_be_read_is_named(
@@ -142,7 +146,7 @@ def test_a_photo_of_a_format_that_cannot_be_read_is_named(
 
 
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Matplotlib's C++ code converts boxes by this method and takes any exception in it for a box that is invalid."""
     converted = BboxBase.__array__
@@ -156,19 +160,22 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
         Image.new("RGB", (64, 48)).save(tmp_path / f"{name}.png")
     example = load("mesh")
     solution = bpnp.solve(example.points2d, example.points3d, example.camera)
-    monkeypatch.setattr(in_maps, "localize_photo", lambda *_: solution)
+    monkeypatch.setattr(SceneMap, "localize_photo", lambda *_, **__: solution)
     monkeypatch.setattr(BboxBase, "__array__", interrupted)
     with pytest.raises(SystemExit) as stop:
         main(
             [
                 "localize",
                 *(str(tmp_path / part) for part in ("map", "a.png", "b.png")),
+                "--camera",
+                "SIMPLE_PINHOLE,80,32,24",
                 "--output",
                 str(tmp_path / "out"),
             ]
         )
     assert stop.value.code == 130
+    assert capsys.readouterr().err.splitlines()[-1] == "bpnp: interrupted; run it again to go on"
     kept = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
-    assert sorted(map(str, kept)) == ["pictures/a.png.png", "poses.txt", "settings.json", "solutions/a.png.json"]
+    assert sorted(map(str, kept)) == ["pictures/a.png.png", "poses.txt", "results.json", "solutions/a.png.json"]
     assert "a.png" in (tmp_path / "out/poses.txt").read_text()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bpnp.localization.point_files import read_camera, read_image, read_scene
+from bpnp.solving.point_files import read_camera, read_points2d, read_points3d
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 
@@ -16,7 +16,7 @@ def rows(points: np.ndarray, separator: str) -> str:
 
 
 def points_of(path: Path, **options: int) -> np.ndarray:
-    return read_scene(path, **options)[0]
+    return read_points3d(path, **options)[0]
 
 
 @pytest.mark.parametrize(
@@ -33,7 +33,7 @@ def points_of(path: Path, **options: int) -> np.ndarray:
 def test_columns_of_text(name: str, text: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(text, encoding="utf-8")
     np.testing.assert_array_equal(points_of(tmp_path / name), POINTS)
-    np.testing.assert_array_equal(read_image(tmp_path / name)[0], POINTS)
+    np.testing.assert_array_equal(read_points2d(tmp_path / name)[0], POINTS)
 
 
 def test_arrays_of_numpy(tmp_path: Path) -> None:
@@ -43,7 +43,7 @@ def test_arrays_of_numpy(tmp_path: Path) -> None:
         np.testing.assert_array_equal(points_of(path), POINTS.astype(dtype).astype(np.float64))
     for shape in ((20, 2), (20, 1, 2)):  # OpenCV's
         np.save(path, POINTS[:, :2].reshape(shape))
-        np.testing.assert_array_equal(read_image(path)[0], POINTS[:, :2])
+        np.testing.assert_array_equal(read_points2d(path)[0], POINTS[:, :2])
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
@@ -58,7 +58,9 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
     path = tmp_path / f"box{suffix}"
     trimesh.creation.box(extents=(2, 4, 6)).export(path)
     corners = points_of(path)
-    assert {tuple(own) for own in corners.tolist()} == {(x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)}
+    assert {tuple(corner) for corner in corners.tolist()} == {
+        (x, y, z) for x in (-1, 1) for y in (-2, 2) for z in (-3, 3)
+    }
     assert len(corners) == 8
     surface = points_of(path, surface=500, seed=1)
     assert surface.shape == (500, 3)
@@ -69,9 +71,9 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.csv", b"1,2,3\n4,5\n", "3 numbers in line 2 of .*a.csv, got 2"),
-        ("a.csv", b"1,2,3\n4,,6\n", "numbers in line 2"),
-        ("a.csv", b"1,2,3\nx,y,z\n", "numbers in line 2"),
+        ("a.csv", b"1,2,3\n4,5\n", "rows of 3 numbers in .*a.csv, got '4,5'"),
+        ("a.csv", b"1,2,3\n4,,6\n", "rows of 3 numbers in .*, got '4,,6'"),
+        ("a.csv", b"1,2,3\nx,y,z\n", "rows of 3 numbers in .*, got 'x,y,z'"),
         ("a.csv", b"", "lines of numbers in .*a.csv, got none"),
         ("a.csv", b"x,y,z\n", "lines of numbers"),
         ("a.csv", b"1,2\n3,4\n", r"3 to 4 or .*got shape \(2, 2\) \(are the two files swapped\?\)"),
@@ -92,26 +94,26 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
 def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=message):
-        read_scene(tmp_path / name)
+        read_points3d(tmp_path / name)
 
 
 def test_what_is_no_file_of_points_is_named(tmp_path: Path) -> None:
     path = tmp_path / "a.npy"
     with pytest.raises(ValueError, match="got no file .*nowhere.npy"):
-        read_scene(tmp_path / "nowhere.npy")
+        read_points3d(tmp_path / "nowhere.npy")
     for content in (np.array([{"a": 1}], dtype=object), np.zeros(3), np.zeros((4, 3, 3))):
         np.save(path, content)
         with pytest.raises(ValueError, match="rows of numbers"):
-            read_scene(path)
+            read_points3d(path)
     np.save(path, POINTS)
     with pytest.raises(ValueError, match="a mesh to draw 9 points from"):
-        read_scene(path, surface=9)
+        read_points3d(path, surface=9)
     np.save(path, POINTS[:, :1])
     with pytest.raises(ValueError, match=r"2 or 3 columns in .*, got shape \(20, 1\)"):
-        read_image(path)
+        read_points2d(path)
     trimesh.creation.box().export(tmp_path / "a.ply")
     with pytest.raises(ValueError, match="ends in .npy, .csv, .txt, .xyz, got"):
-        read_image(tmp_path / "a.ply")
+        read_points2d(tmp_path / "a.ply")
 
 
 def test_cameras_by_file_and_by_name(tmp_path: Path) -> None:
@@ -151,11 +153,20 @@ def test_columns_of_normals_and_labels_by_name_and_by_place(tmp_path: Path) -> N
     named.write_text("label,x,y,z,nx,ny,nz\n7,1,2,3,0,0,1\n-1,4,5,6,1,0,0\n")
     plain.write_text("1 2 3 0 0 1 7\n4 5 6 1 0 0 -1\n")
     for path in (named, plain):
-        points, normals, labels = read_scene(path)
+        points, normals, labels = read_points3d(path)
         np.testing.assert_array_equal(points, [[1, 2, 3], [4, 5, 6]])
         np.testing.assert_array_equal(normals, [[0, 0, 1], [1, 0, 0]])
         np.testing.assert_array_equal(labels, [7, -1])
     image.write_text("x;y;label\n10;20;7\n30;40;8\n")
-    points, labels = read_image(image)
+    points, labels = read_points2d(image)
     np.testing.assert_array_equal(points, [[10, 20], [30, 40]])
     np.testing.assert_array_equal(labels, [7, 8])
+
+
+def test_a_header_without_x_and_y_is_no_point(tmp_path: Path) -> None:
+    """Its first two columns would be solved as if they were pixels."""
+    (tmp_path / "a.csv").write_text("id,u,v\n1,10,20\n2,30,40\n")
+    with pytest.raises(ValueError, match=r"expected columns x, y in .*a\.csv, got id, u, v"):
+        read_points2d(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("id,y,x,scale\n1,10,20,3\n2,30,40,5\n")
+    np.testing.assert_array_equal(read_points2d(tmp_path / "a.csv")[0], [[20, 10], [40, 30]])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from bpnp.maps.cones import MARGIN_DEG, seen_again, viewing_cones
+from bpnp.maps.views import MARGIN_DEG, viewing_cones
 from bpnp.search.point_sets import faces
 
 
@@ -37,8 +37,3 @@ def test_a_point_is_seen_from_both_sides_of_its_track_and_one_without_a_track_fr
     assert cosines[0] == pytest.approx(np.cos(np.pi / 2 - np.arctan(0.1) + np.radians(MARGIN_DEG)))
     assert cosines[1] == -1
     np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1)
-
-
-def test_a_long_track_is_seen_again() -> None:
-    chance = seen_again(np.array([2, 6, 18]))
-    np.testing.assert_allclose(chance, [0.25, 0.5, 0.75])

@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import gaussian_filter
 
-from bpnp.maps.keypoints import detected_keypoints, read_features
-from bpnp.maps.photos import camera_from_exif, photo_size
+from bpnp.maps.photos import detected_keypoints, focal_from_exif, photo_size, read_features
 
 
 @pytest.fixture
@@ -65,33 +64,12 @@ def test_keypoints_are_as_faint_as_those_of_colmap_and_the_largest(tmp_path: Pat
 
 def test_what_is_no_photo_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "a.jpg").write_text("no photo")
-    for read in (detected_keypoints, camera_from_exif, photo_size):
+    for read in (detected_keypoints, focal_from_exif, photo_size):
         with pytest.raises(ValueError, match=r"expected a photo that .* got .*a\.jpg"):
             read(tmp_path / "a.jpg")
     Image.new("L", (64, 64)).save(tmp_path / "black.png")
     with pytest.raises(ValueError, match=r"expected a photo with keypoints, got none in .*black\.png"):
         detected_keypoints(tmp_path / "black.png")
-
-
-def photo_with(path: Path, **tags: float) -> Path:
-    names = {"FocalLength": 0x920A, "FocalLengthIn35mmFilm": 0xA405, "FocalPlaneXResolution": 0xA20E}
-    image = Image.new("RGB", (400, 300))
-    exif = image.getexif()
-    exif.get_ifd(0x8769).update({names[name]: value for name, value in tags.items()})
-    image.save(path, exif=exif)
-    return path
-
-
-def test_the_focal_length_comes_from_exif(tmp_path: Path) -> None:
-    # 5 mm on a sensor of 4 mm x 3 mm: 100 pixels a mm, so 500 pixels; the same as 43.27 mm on a diagonal of 43.27 mm.
-    camera = camera_from_exif(photo_with(tmp_path / "a.jpg", FocalLength=5.0, FocalPlaneXResolution=2540.0))
-    assert camera == ("SIMPLE_PINHOLE", 400, 300, (pytest.approx(500.0), 200.0, 150.0))
-    equivalent = camera_from_exif(photo_with(tmp_path / "b.jpg", FocalLengthIn35mmFilm=43))
-    assert equivalent[3][0] == pytest.approx(500, rel=0.01)
-    with pytest.raises(
-        ValueError, match=r"expected a focal length in the EXIF data of .*c\.jpg, got none; try --camera"
-    ):
-        camera_from_exif(photo_with(tmp_path / "c.jpg"))
 
 
 def test_features_of_hloc(tmp_path: Path) -> None:
@@ -106,7 +84,7 @@ def test_features_of_hloc(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.scores, [0.25, 0.5])
     with pytest.raises(ValueError, match=r"expected keypoints of b\.jpg in .*features\.h5, got query"):
         read_features(path, "b.jpg")
-    with pytest.raises(ValueError, match=r"at its size \(200, 100\) in .*, got them at \(100, 50\)"):
+    with pytest.raises(ValueError, match=r"at the size \(200, 100\) of the photo, got them at \(100, 50\)"):
         read_features(path, "query/a.jpg", (200, 100))
     with h5py.File(path, "a") as file:
         del file["query/a.jpg/image_size"]

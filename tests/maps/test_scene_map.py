@@ -1,5 +1,6 @@
 """Maps are read with the points, tracks and views that the model has, whichever its form."""
 
+import inspect
 import struct
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import pytest
 from planted_model import OPENCV, Planted, plant_model
 
 from bpnp import SceneMap
-from bpnp.maps.regions import covering_regions, read_pairs, regions_of_views
+from bpnp.maps.many_photos import read_views
 
 
 @pytest.fixture(scope="module")
@@ -38,12 +39,6 @@ def test_the_planted_map_comes_back(tmp_path: Path, text: bool) -> None:
         assert view.camera.focal == pytest.approx(np.mean(OPENCV[1][:2]))
 
 
-def test_covisibility_counts_the_common_points(planted: tuple[Path, Planted]) -> None:
-    scene, truth = SceneMap.from_colmap(planted[0]), planted[1]
-    expected = [[len(np.intersect1d(a, b)) for b in truth.seen] for a in truth.seen]
-    np.testing.assert_array_equal(scene.covisibility.toarray(), expected)
-
-
 def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -> None:
     scene, truth = SceneMap.from_colmap(planted[0]), planted[1]
     rest = scene.without(["photo 1.jpg"])
@@ -58,41 +53,44 @@ def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -
 
 def test_regions_cover_the_map_and_the_largest_gain_comes_first(planted: tuple[Path, Planted]) -> None:
     scene, _ = SceneMap.from_colmap(planted[0]), planted[1]
-    regions = list(covering_regions(scene))
+    regions = list(scene.regions())
     assert sorted(region.view.name for region in regions) == [view.name for view in scene.views]
+    for region in regions:
+        np.testing.assert_array_equal(region.point_ids, scene.point_ids[region.view.points])
+        np.testing.assert_array_equal(region.points3d, scene.points3d[region.view.points])
+        np.testing.assert_array_equal(region.cones.axes, scene.cones.axes[region.view.points])
     covered: set[int] = set()
     left = list(scene.views)
     for region in regions:
-        gain = len(set(region.points.tolist()) - covered)
+        gain = len(set(region.view.points.tolist()) - covered)
         assert gain == max(len(set(view.points.tolist()) - covered) for view in left)
-        covered |= set(region.points.tolist())
+        covered |= set(region.view.points.tolist())
         left.remove(region.view)
     assert len(covered) == len(scene.points3d)
 
 
 def test_views_are_found_by_their_names(planted: tuple[Path, Planted]) -> None:
     scene = SceneMap.from_colmap(planted[0])
-    assert [region.view.name for region in regions_of_views(scene, ["photo 2.jpg", "photo 0.jpg"])] == [
-        "photo 2.jpg", "photo 0.jpg",
-    ]  # fmt: skip
+    regions = list(scene.regions(["photo 2.jpg", "photo 0.jpg"]))
+    assert [region.view.name for region in regions] == ["photo 2.jpg", "photo 0.jpg"]
     shown = np.union1d(scene.views[2].points, scene.views[0].points)
-    for region in regions_of_views(scene, ["photo 2.jpg", "photo 0.jpg"]):
-        np.testing.assert_array_equal(region.points, shown)
+    for region in regions:
+        np.testing.assert_array_equal(region.point_ids, scene.point_ids[shown])
     with pytest.raises(ValueError, match=r"expected names of views of the map, got a\.jpg; try photo 0\.jpg"):
-        regions_of_views(scene, ["photo 0.jpg", "a.jpg"])
+        scene.regions(["photo 0.jpg", "a.jpg"])
     with pytest.raises(ValueError, match="got none; try views=None"):
-        regions_of_views(scene, [])
+        scene.regions([])
 
 
-def test_pairs_of_a_retrieval(tmp_path: Path) -> None:
+def test_views_of_a_retrieval(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     path.write_text("q1.jpg db/a.jpg\nq2.jpg db/b.jpg\n\nq1.jpg db/c.jpg\n")
-    assert read_pairs(path) == {"q1.jpg": ["db/a.jpg", "db/c.jpg"], "q2.jpg": ["db/b.jpg"]}
+    assert read_views(path) == {"q1.jpg": ["db/a.jpg", "db/c.jpg"], "q2.jpg": ["db/b.jpg"]}
     path.write_text("q1.jpg db/a.jpg 0.3\n")
     with pytest.raises(ValueError, match=r"expected two names.* got 'q1.jpg db/a.jpg 0.3' at line 1"):
-        read_pairs(path)
-    with pytest.raises(ValueError, match="expected a text file of pairs"):
-        read_pairs(tmp_path / "none.txt")
+        read_views(path)
+    with pytest.raises(ValueError, match="expected a text file of lines `photo view`"):
+        read_views(tmp_path / "none.txt")
 
 
 def test_a_map_without_views_is_one_clear_error(tmp_path: Path) -> None:
@@ -125,3 +123,11 @@ def test_a_real_map_is_that_of_pycolmap(shared_data: Path) -> None:
         np.testing.assert_allclose(view.centre, image.projection_center(), atol=1e-9)
         seen = {point.point3D_id for point in image.points2D if point.has_point3D()}
         assert set(scene.point_ids[view.points].tolist()) == seen
+
+
+def test_a_map_says_how_large_it_is_and_what_localize_takes(planted: tuple[Path, Planted]) -> None:
+    scene = SceneMap.from_colmap(planted[0])
+    assert repr(scene) == f"SceneMap(4 views, {len(scene.points3d)} points)"
+    told = SceneMap.localize.__doc__ or ""
+    for name in inspect.signature(SceneMap.localize).parameters:
+        assert name == "self" or f"{name}:" in told

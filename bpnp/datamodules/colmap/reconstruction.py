@@ -3,7 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -23,7 +23,8 @@ class ImagePoints:
     """One registered image; camera = rotation p + translation (cam_from_world), 2D points normalised and undistorted.
 
     points2d (k, 2) sees the scene's points3d[seen], seen (k,) without repetition. clutter2d (c, 2): the keypoints
-    without a 3D point. observed: every 3D point the image has a keypoint of, `seen` and those that were dropped.
+    without a 3D point. All three are empty where keypoints were not read. observed: every 3D point the image has a
+    keypoint of, ascending: `seen` and those that were dropped.
     image_id, camera_id: of the model.
     """
 
@@ -43,13 +44,14 @@ class ImagePoints:
 class Reconstruction:
     """A COLMAP model: points3d (n, 3) in scene units in the order of their ids, images in the order of their names.
 
-    lost: how many keypoints, points and images could not be used, by reason.
+    point_ids: (n,) of the points. lost: how many keypoints, points and images could not be used, by reason.
     """
 
     name: str
     points3d: NDArray[np.float64]
     images: tuple[ImagePoints, ...]
     lost: Mapping[str, int]
+    point_ids: NDArray[np.int64]
 
     @property
     def notable(self) -> str:
@@ -57,8 +59,10 @@ class Reconstruction:
         return ", ".join(f"{count} {reason}" for reason, count in self.lost.items() if reason != "repeated keypoints")
 
 
-def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Reconstruction:
-    """Read the COLMAP model in `folder`, undistort its keypoints and pair them with their 3D points.
+def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoints: bool = True) -> Reconstruction:
+    """Read the COLMAP model in `folder`, undistort its keypoints and match them with their 3D points.
+
+    keypoints: whether to read them at all; without, images know the points that they observe, in a tenth of the time.
 
     Not used, and counted in `lost`: keypoints whose undistortion does not project back to within 0.01 pixels (outside
     the field of view of the camera model); pairs with a point that is not finite, missing from points3D, behind the
@@ -87,10 +91,12 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None) -> Recon
         if record.camera_id not in cameras:
             where = f"camera {record.camera_id} of image {record.name!r} in {path}"
             cameras[record.camera_id] = camera_of(records.cameras.get(record.camera_id), where)
-        images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost))
+        camera = cameras[record.camera_id]
+        image = _registered(record, camera, ids)
+        images.append(_with_keypoints(image, record, ids, points3d, lost) if keypoints else image)
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
-    found = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost))
+    found = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost), ids)
     if found.notable:
         logger.warning("not used in %s: %s", path, found.notable)
     return found
@@ -123,16 +129,34 @@ def camera_of(record: CameraRecord | None, where: str) -> Camera:
     if record is None:
         raise ColmapError(f"expected {where}, got no such camera; try another model")
     try:
-        return colmap_camera(record.model, record.params)
+        return colmap_camera(record.model, record.params, record.size)
     except ValueError as error:
         raise ColmapError(f"{where}: {error}; try another model") from error
 
 
-def _image_points(
-    record: ImageRecord, camera: Camera, ids: NDArray[np.int64], points3d: NDArray[np.float64], lost: Counter[str]
+def _registered(record: ImageRecord, camera: Camera, ids: NDArray[np.int64]) -> ImagePoints:
+    """The image without its keypoints."""
+    observed = np.unique(record.point_ids[record.point_ids >= 0])
+    place = np.minimum(np.searchsorted(ids, observed), len(ids) - 1)
+    none = np.empty((0, 2), np.float32)
+    return ImagePoints(
+        name=record.name,
+        image_id=record.image_id,
+        camera_id=record.camera_id,
+        points2d=none,
+        seen=place[:0],
+        clutter2d=none,
+        observed=place[ids[place] == observed],
+        rotation=Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix(),
+        translation=record.translation,
+        camera=camera,
+    )
+
+
+def _with_keypoints(
+    image: ImagePoints, record: ImageRecord, ids: NDArray[np.int64], points3d: NDArray[np.float64], lost: Counter[str]
 ) -> ImagePoints:
-    rotation = Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix()
-    undistorted = camera.normalise(record.keypoints)
+    undistorted = image.camera.normalise(record.keypoints)
     usable = np.isfinite(undistorted).all(-1)
     lost["keypoints that could not be undistorted"] += int((~usable).sum())
 
@@ -141,26 +165,20 @@ def _image_points(
     known = has_point & (ids[place] == record.point_ids)
     lost["keypoints of a point that is missing"] += int((has_point & ~known).sum())
 
-    pair = np.flatnonzero(known & usable)
-    camera_points = points3d[place[pair]] @ rotation.T + record.translation
+    matched = np.flatnonzero(known & usable)
+    camera_points = points3d[place[matched]] @ image.rotation.T + image.translation
     depth = camera_points[:, 2]
     in_front = depth > (NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else 0)
     lost["pairs with the point behind or in the camera"] += int((~in_front).sum())
-    pair, camera_points = pair[in_front], camera_points[in_front]
+    matched, camera_points = matched[in_front], camera_points[in_front]
 
-    error = np.linalg.norm(camera_points[:, :2] / camera_points[:, 2:] - undistorted[pair], axis=-1)
+    error = np.linalg.norm(camera_points[:, :2] / camera_points[:, 2:] - undistorted[matched], axis=-1)
     by_error = np.argsort(error, kind="stable")
-    seen, first = np.unique(place[pair[by_error]], return_index=True)
-    lost["repeated keypoints"] += len(pair) - len(seen)
-    return ImagePoints(
-        name=record.name,
-        image_id=record.image_id,
-        camera_id=record.camera_id,
-        points2d=undistorted[pair[by_error[first]]].astype(np.float32),
+    seen, first = np.unique(place[matched[by_error]], return_index=True)
+    lost["repeated keypoints"] += len(matched) - len(seen)
+    return replace(
+        image,
+        points2d=undistorted[matched[by_error[first]]].astype(np.float32),
         seen=seen,
         clutter2d=undistorted[~has_point & usable].astype(np.float32),
-        observed=np.unique(place[known]),
-        rotation=rotation,
-        translation=record.translation,
-        camera=camera,
     )

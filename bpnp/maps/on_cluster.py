@@ -1,15 +1,13 @@
 """Photos localised by the workers of a Dask cluster; needs the extra `cluster`."""
 
 import uuid
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import islice
-from pathlib import Path
 
 from distributed import Client, Future, LocalCluster, WorkerPlugin, as_completed, get_worker
 
-from bpnp.localization.in_maps import Attempt, PhotoOptions, attempt
+from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
 from bpnp.solving.solution import Solution
 
@@ -24,9 +22,7 @@ class MapOfWorker(WorkerPlugin):
         self.scene, self.name = scene, f"bpnp-{uuid.uuid4().hex}"
 
 
-def attempts_on_cluster(
-    scene: SceneMap, files: Mapping[str, Path], options: PhotoOptions, cluster: str
-) -> Iterator[Attempt]:
+def attempts_on_cluster(scene: SceneMap, tasks: Iterable[PhotoTask], cluster: str) -> Iterator[Attempt]:
     """The photos in the order in which they are finished.
 
     cluster: address of a scheduler, such as tcp://10.0.0.1:8786, or how many processes to start on this machine.
@@ -36,20 +32,20 @@ def attempts_on_cluster(
     plugin = MapOfWorker(scene)
     with connected(cluster) as client:
         client.register_plugin(plugin)
-        names: dict[object, str] = {}
+        running: dict[object, PhotoTask] = {}
 
-        def submitted(photos: Iterable[tuple[str, Path]]) -> Iterator[Future]:
-            for name, photo in photos:
-                own = options if options.pairs is None else replace(options, pairs={name: options.pairs.get(name, ())})
-                future = client.submit(_attempt, plugin.name, name, photo.absolute(), own, pure=False)
-                names[future.key] = name
+        def submitted() -> Iterator[Future]:
+            for task in tasks:
+                future = client.submit(_attempt, plugin.name, task, pure=False)
+                running[future.key] = task
                 yield future
 
-        left = submitted(files.items())
-        done = as_completed(islice(left, QUEUED * max(sum(client.nthreads().values()), 1)))
+        waiting = submitted()
+        done = as_completed(islice(waiting, QUEUED * max(sum(client.nthreads().values()), 1)))
         for future in done:
-            yield names.pop(future.key), str(future.exception()) if future.status == "error" else future.result()
-            done.update(islice(left, 1))
+            task = running.pop(future.key)
+            yield task, str(future.exception()) if future.status == "error" else future.result()
+            done.update(islice(waiting, 1))
         client.unregister_worker_plugin(plugin.name)
 
 
@@ -59,19 +55,19 @@ def connected(cluster: str) -> Iterator[Client]:
     if cluster.isdecimal():
         if int(cluster) < 1:
             raise ValueError(f"expected one or more processes, got {cluster}")
-        own = LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None)
-        with own, Client(own) as client:
+        processes = LocalCluster(n_workers=int(cluster), threads_per_worker=1, dashboard_address=None)
+        with processes, Client(processes) as client:
             yield client
         return
     try:
-        found = Client(cluster, timeout=PATIENCE)
+        scheduler = Client(cluster, timeout=PATIENCE)
     except (OSError, ValueError) as error:
         raise ValueError(f"expected the address of a Dask scheduler or a number, got {cluster}: {error}") from error
-    with found as client:
+    with scheduler as client:
         yield client
 
 
-def _attempt(plugin: str, name: str, photo: Path, options: PhotoOptions) -> Solution | str:
+def _attempt(plugin: str, task: PhotoTask) -> Solution | str:
     holder = get_worker().plugins[plugin]
     assert isinstance(holder, MapOfWorker)
-    return attempt(holder.scene, name, photo, options)
+    return attempt(holder.scene, task)

@@ -6,8 +6,9 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+from PIL import Image
 
-from bpnp.maps.colmap_database import is_database, read_database
+from bpnp.maps.photos import photo_keypoints, read_database
 
 ROWS = np.array([[0.5, 0.5, 2.0, 0.1], [99.25, 49.75, 4.0, 0.2], [0.5, 0.5, 2.0, 1.7]], np.float32)
 
@@ -23,6 +24,11 @@ def write_database(path: Path, keypoints: dict[str, np.ndarray]) -> Path:
     return path
 
 
+def photo_of(folder: Path) -> Path:
+    Image.new("L", (100, 50)).save(folder / "photo.png")
+    return folder / "photo.png"
+
+
 @pytest.fixture
 def database(tmp_path: Path) -> Path:
     shapes = np.column_stack([ROWS[:2, :2], [[0, -3, 3, 0], [2, 0, 0, 4]]]).astype(np.float32)
@@ -33,7 +39,6 @@ def database(tmp_path: Path) -> Path:
 
 
 def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
-    assert is_database(database)
     found = read_database(database, "a.jpg", (100, 50))
     np.testing.assert_array_equal(found.pixels, [[0.5, 0.5], [99.25, 49.75]])
     np.testing.assert_array_equal(found.scores, [2, 4])
@@ -42,23 +47,39 @@ def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
     np.testing.assert_array_equal(read_database(database, "c.jpg").scores, [3, 3])  # a turn by 90 deg times 3; 2 and 4
 
 
+def test_a_database_is_left_as_it_was(database: Path, tmp_path: Path) -> None:
+    before, files = database.read_bytes(), sorted(tmp_path.iterdir())
+    assert len(photo_keypoints(photo_of(tmp_path), database, "a.jpg").pixels) == 2
+    assert (database.read_bytes(), sorted({*tmp_path.iterdir()} - {tmp_path / "photo.png"})) == (before, files)
+
+
 def test_what_is_wrong_is_one_clear_error(database: Path, tmp_path: Path) -> None:
     for photo, size, message in (
         ("d.jpg", None, r"expected keypoints of d\.jpg in .*database\.db, got none, but a\.jpg, b\.jpg"),
         ("none.jpg", None, r"expected keypoints of none\.jpg in .*, got none$"),
-        ("a.jpg", (200, 100), r"at its size \(200, 100\) in .*, got them at \(100, 50\)"),
+        (
+            "a.jpg",
+            (200, 100),
+            r"a\.jpg in .*database\.db at the size \(200, 100\) of the photo, got them at \(100, 50\)",
+        ),
         ("out.jpg", None, r"inside the 100 x 50 pixels of out\.jpg .*, got 2 outside"),
     ):
         with pytest.raises(ValueError, match=message):
             read_database(database, photo, size)
     other = tmp_path / "other.db"
     other.write_bytes(b"something else, longer than the header of a database")
-    assert not is_database(other)
     with pytest.raises(ValueError, match=r"expected a database of COLMAP, got .*other\.db: file is not a database"):
         read_database(other, "a.jpg")
     (tmp_path / "cut.db").write_bytes(database.read_bytes()[:5000])
     with pytest.raises(ValueError, match=r"expected a database of COLMAP, got .*cut\.db"):
         read_database(tmp_path / "cut.db", "a.jpg")
+    (tmp_path / "nothing.db").touch()
+    with pytest.raises(ValueError, match=r"database of COLMAP, got the empty file .*nothing\.db"):
+        photo_keypoints(photo_of(tmp_path), tmp_path / "nothing.db", "a.jpg")
+    assert (tmp_path / "nothing.db").stat().st_size == 0  # pycolmap would make a database of it
+    write_database(tmp_path / "no images.db", {})
+    with pytest.raises(ValueError, match=r"keypoints of a\.jpg in .*no images\.db, got none: it has no images"):
+        photo_keypoints(photo_of(tmp_path), tmp_path / "no images.db", "a.jpg")
     with sqlite3.connect(tmp_path / "empty.db") as content:
         content.execute("CREATE TABLE other (number INTEGER)")
     with pytest.raises(ValueError, match="no such table: images"):

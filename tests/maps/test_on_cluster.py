@@ -3,7 +3,9 @@
 import os
 import signal
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -15,12 +17,13 @@ from planted_model import HEIGHT, WIDTH, plant_model
 
 from bpnp import SceneMap, Solution
 from bpnp.cli import main
-from bpnp.localization.in_maps import PhotoOptions, attempts, photo_files
-from bpnp.localization.on_cluster import attempts_on_cluster
+from bpnp.maps.many_photos import PhotoOptions, PhotoTask, attempts, photo_task
+from bpnp.maps.on_cluster import attempts_on_cluster
+from bpnp.maps.photos import photo_files
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 PHOTOS = 6
-PAIRS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}
+VIEWS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}
 
 
 @pytest.fixture(scope="module")
@@ -49,21 +52,27 @@ def cluster() -> Iterator[LocalCluster]:
         yield own
 
 
+def tasks(place: tuple[Path, Path, Path], scene: SceneMap, **options: Any) -> list[PhotoTask]:
+    _, photos, database = place
+    chosen = PhotoOptions(camera=CAMERA, keypoints=database, **options)
+    return [photo_task(scene, "", name, photo, chosen) for name, photo in photo_files([photos]).items()]
+
+
 def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: LocalCluster) -> None:
-    model, photos, database = place
-    scene, options = SceneMap.from_colmap(model), PhotoOptions(camera=CAMERA, features=database, pairs=PAIRS)
-    files = photo_files([photos]) | {"lost.png": photos / "lost.png"}
-    alone = dict(attempts(scene, files, options))
+    scene = SceneMap.from_colmap(place[0])
+    photos = tasks(place, scene, views=VIEWS)
+    photos.append(replace(photos[0], name="lost.png", photo=place[1] / "lost.png"))
+    alone = {task.name: solution for task, solution in attempts(scene, photos)}
 
     with Client(cluster) as client:
         workers = client.run(os.getpid)
-        found = attempts_on_cluster(scene, files, options, cluster.scheduler_address)
-        results = dict([next(found)])
+        found = attempts_on_cluster(scene, photos, cluster.scheduler_address)
+        results = {task.name: solution for task, solution in [next(found)]}
         os.kill(min(workers.values()), signal.SIGKILL)
-        results |= dict(found)
+        results |= {task.name: solution for task, solution in found}
         assert set(client.run(os.getpid).values()) != set(workers.values())
 
-    assert set(results) == set(alone) == set(files)
+    assert set(results) == set(alone) == {task.name for task in photos}
     assert "expected a photo that can be read" in str(results.pop("lost.png"))
     for name, solution in results.items():
         assert isinstance(solution, Solution)
@@ -74,25 +83,20 @@ def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: Lo
 
 def test_each_worker_is_sent_the_map_once(place: tuple[Path, Path, Path], cluster: LocalCluster, monkeypatch) -> None:
     """It is pickled for the workers, not for each of the photos."""
-    model, photos, database = place
-    scene = SceneMap.from_colmap(model)
+    scene = SceneMap.from_colmap(place[0])
     pickled = []
     monkeypatch.setattr(SceneMap, "__getstate__", lambda self: pickled.append(1) or self.__dict__, raising=False)
-    pairs = PAIRS | {"new5.png": []}
-    options = PhotoOptions(camera=CAMERA, features=database, pairs=pairs)
-    results = dict(attempts_on_cluster(scene, photo_files([photos]), options, cluster.scheduler_address))
+    results = list(attempts_on_cluster(scene, tasks(place, scene, views=VIEWS), cluster.scheduler_address))
     assert len(results) == PHOTOS
     assert len(pickled) == 1
-    assert "expected views for new5.png" in str(results["new5.png"])
 
 
 def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> None:
-    model, photos, database = place
     before = set(psutil.Process().children(recursive=True))
-    options = PhotoOptions(camera=CAMERA, features=database)
-    lost = {"lost.png": photos / "lost.png"}
-    ((name, reason),) = attempts_on_cluster(SceneMap.from_colmap(model), lost, options, "1")
-    assert (name, "expected a photo that can be read" in str(reason)) == ("lost.png", True)
+    scene = SceneMap.from_colmap(place[0])
+    lost = replace(tasks(place, scene)[0], name="lost.png", photo=place[1] / "lost.png")
+    ((task, reason),) = attempts_on_cluster(scene, [lost], "1")
+    assert (task.name, "expected a photo that can be read" in str(reason)) == ("lost.png", True)
     assert set(psutil.Process().children(recursive=True)) <= before
 
 
@@ -129,7 +133,6 @@ def _poses(output: Path) -> tuple[list[str], np.ndarray]:
 
 @pytest.mark.parametrize(("cluster_name", "got"), [("0", "got 0"), ("nowhere", "got nowhere"), ("tcp://[", "got tcp")])
 def test_no_scheduler_is_one_clear_error(place: tuple[Path, Path, Path], cluster_name: str, got: str) -> None:
-    model, photos, database = place
-    options = PhotoOptions(camera=CAMERA, features=database)
+    scene = SceneMap.from_colmap(place[0])
     with pytest.raises(ValueError, match=f"expected .*{got}".replace("[", r"\[")):
-        next(attempts_on_cluster(SceneMap.from_colmap(model), photo_files([photos]), options, cluster_name))
+        next(attempts_on_cluster(scene, tasks(place, scene), cluster_name))

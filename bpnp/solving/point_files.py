@@ -19,23 +19,25 @@ NORMAL, LABEL = ("nx", "ny", "nz"), "label"
 COLUMNS: dict[int, tuple[str, ...]] = {3: (), 4: (LABEL,), 6: NORMAL, 7: (*NORMAL, LABEL)}
 
 
-def read_image(path: Path) -> tuple[Array, Labels | None]:
+def read_points2d(path: Path) -> tuple[Array, Labels | None]:
     """Image points (m, 2) or unit bearings (m, 3), and labels (m,) where a column is named label.
 
-    path: .npy or text as for `read_scene`. Of four and more columns the first two are taken: a detector's rows go on
-    with scale and angle. Raises ValueError as `read_scene`.
+    path: .npy or text as for `read_points3d`. The columns x and y are taken, and z if there is one, or the first two
+    where they have no names: a detector's rows go on with scale and angle. Raises ValueError as `read_points3d`.
     """
     _check_suffix(path, ARRAYS)
     values, names = _columns(path)
-    if LABEL in names:
-        points, _, labels = _annotated(path, values, names, ("x", "y"))
+    if names:
+        points, _, labels = _annotated(path, values, names, ("x", "y", "z") if "z" in names else ("x", "y"))
         return points, labels
     if values.shape[1] < 2:
         raise ValueError(f"expected points with 2 or 3 columns in {path}, got shape {values.shape}")
     return values if values.shape[1] == 3 else values[:, :2], None
 
 
-def read_scene(path: Path, *, surface: int | None = None, seed: int = 0) -> tuple[Array, Array | None, Labels | None]:
+def read_points3d(
+    path: Path, *, surface: int | None = None, seed: int = 0
+) -> tuple[Array, Array | None, Labels | None]:
     """Points (n, 3) of a file, and their outward normals (n, 3) and labels (n,) where it has them.
 
     path: .npy; .csv, .txt, .xyz with numbers in columns, separated by commas, semicolons, tabs or spaces; the first
@@ -111,7 +113,7 @@ def _check_suffix(path: Path, known: tuple[str, ...]) -> None:
 
 def _annotated(
     path: Path, values: Array, names: list[str], coordinates: tuple[str, ...]
-) -> tuple[Array, Array | None, Labels | None]:  # fmt: skip
+) -> tuple[Array, Array | None, Labels | None]:
     hint = " (are the two files swapped?)" if values.shape[1] == 2 else ""
     if not names and values.shape[1] not in COLUMNS:
         known = "3 to 4 or 6 to 7 columns (x, y, z, normal, label)"
@@ -139,7 +141,7 @@ def _colmap(path: Path) -> "ModelRecords":
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     """The camera of an image of a COLMAP model, or the only one that it has."""
     model = _colmap(path)
-    used = {own.name: own.camera_id for own in sorted(model.images, key=lambda own: own.name)}
+    used = {record.name: record.camera_id for record in sorted(model.images, key=lambda record: record.name)}
     some = ", ".join([*used][:8])
     if image is not None and used.get(image) not in model.cameras:
         raise ValueError(f"expected an image of {path}, got {image!r}; try one of {some}")
@@ -161,23 +163,28 @@ def _columns(path: Path) -> tuple[Array, list[str]]:
         text = path.read_text(encoding="utf-8-sig")
     except (ValueError, OSError, EOFError) as error:
         raise ValueError(f"expected rows of numbers in {path}, got {error}") from error
-    rows: list[list[float]] = []
-    names: list[str] = []
-    for place, line in enumerate(text.splitlines(), 1):
-        content = line.partition("#")[0].strip()
-        words = content.split(next((mark for mark in ",;" if mark in content), None)) if content else []
-        numbers = [number for word in words if (number := _number(word)) is not None]
-        if words and not numbers and not rows:
-            names = [word.strip().lower() for word in words]
-        elif len(numbers) < len(words):
-            raise ValueError(f"expected numbers in line {place} of {path}, got {line[:60]!r}")
-        elif rows and words and len(numbers) != len(rows[0]):
-            raise ValueError(f"expected {len(rows[0])} numbers in line {place} of {path}, got {len(numbers)}")
-        elif words:
-            rows.append(numbers)
+    lines = [content for line in text.splitlines() if (content := line.partition("#")[0].strip())]
+    names = _words(lines[0]) if lines else []
+    names = [] if any(_number(name) is not None for name in names) else names
+    rows = lines[1:] if names else lines
     if not rows:
         raise ValueError(f"expected lines of numbers in {path}, got none")
-    return np.array(rows), names if len(names) == len(rows[0]) else []
+    try:
+        values = np.loadtxt(rows, np.float64, delimiter=_mark(rows[0]), ndmin=2)
+    except ValueError as error:
+        count = len(_words(rows[0]))
+        wrong = (row for row in rows if len(_words(row)) != count or None in map(_number, _words(row)))
+        raise ValueError(f"expected rows of {count} numbers in {path}, got {next(wrong, rows[0])[:60]!r}") from error
+    return values, names if len(names) == values.shape[1] else []
+
+
+def _mark(line: str) -> str | None:
+    """What separates the words of a line; None for spaces and tabs."""
+    return next((mark for mark in ",;" if mark in line), None)
+
+
+def _words(line: str) -> list[str]:
+    return [word.strip().lower() for word in line.split(_mark(line))]
 
 
 def _number(word: str) -> float | None:

@@ -1,1 +1,0 @@
-"""What `bpnp solve` and `bpnp localize` are made of: files of points and cameras, images of COLMAP models."""

@@ -1,0 +1,202 @@
+"""Many photos in a map: what each is localised with, and the folder of their solutions, which a later run goes on with.
+
+A solution is known by the content of all that it was made with, not by names: a photo, a map or a file of views that
+was replaced under its name is another one.
+"""
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bpnp.cameras import camera_from, plain_camera
+from bpnp.datamodules.colmap.model_files import FILES, model_format
+from bpnp.files import fingerprint, write_text
+from bpnp.maps.photos import photo_keypoints
+from bpnp.maps.scene_map import SceneMap
+from bpnp.solving.pictures import pose_text
+from bpnp.solving.solution import Solution
+
+MADE_WITH = "made_with"  # beside the fields of a solution in its file
+REPORTED = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold", "log10_false_alarms",
+            "seconds", "rotation", "translation", "camera", MADE_WITH)  # fmt: skip
+POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
+Record = dict[str, Any]  # what results.json has of a photo
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """What applies to all photos.
+
+    camera, keypoints: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for the
+    whole map. leave_one_out: the photos are views of the map and are taken out of it.
+    """
+
+    camera: Any = None
+    views: Mapping[str, Sequence[str]] | None = None
+    keypoints: Path | None = None
+    leave_one_out: bool = False
+    solver: str = "auto"
+    seed: int = 0
+    time_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class PhotoTask:
+    """A photo to localise: arguments of `SceneMap.localize_photo`, and the content of what it is localised with."""
+
+    name: str
+    photo: Path
+    arguments: Mapping[str, Any]
+    made_with: Mapping[str, Any]
+    leave_one_out: bool = False
+
+
+Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or why it could not be tried
+
+
+def photo_task(scene: SceneMap, map_content: str, name: str, photo: Path, options: PhotoOptions) -> PhotoTask:
+    """What to localise a photo with. Raises ValueError for what is wrong with it, its camera, keypoints or views."""
+    content = content_of(photo)
+    chosen, source = options.camera, "--camera"
+    if chosen is None or isinstance(chosen, SceneMap):
+        chosen, source = (chosen or scene).camera_for(photo, exif=chosen is None)
+    views = None if options.views is None else list(options.views.get(name, ()))
+    if views is not None and not views:
+        raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
+    detected = "detected"
+    if options.keypoints is not None:
+        points = photo_keypoints(photo, options.keypoints, name)
+        detected = fingerprint([points.pixels.tolist(), points.scores.tolist()])
+    solver = content_of(Path(options.solver)) if Path(options.solver).is_file() else options.solver
+    shared = {"views": views, "seed": options.seed, "time_limit": options.time_limit}
+    camera = plain_camera(camera_from(chosen))
+    return PhotoTask(
+        name,
+        photo.absolute(),
+        {"camera": camera, "keypoints": options.keypoints, "name": name, "solver": options.solver, **shared},
+        {
+            "photo": content, "map": map_content, "keypoints": detected, "camera": fingerprint(camera),
+            "camera_from": source, "solver": solver, "leave_one_out": options.leave_one_out, **shared,
+        },
+        options.leave_one_out,
+    )  # fmt: skip
+
+
+def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:
+    """The solution of a photo, or why it could not be tried."""
+    try:
+        place = scene.without([task.name]) if task.leave_one_out else scene
+        return place.localize_photo(task.photo, **task.arguments)
+    except (ValueError, OSError) as error:
+        return str(error)
+
+
+def attempts(scene: SceneMap, tasks: Iterable[PhotoTask]) -> Iterator[Attempt]:
+    """The photos one after the other."""
+    return ((task, attempt(scene, task)) for task in tasks)
+
+
+def read_views(path: str | Path) -> dict[str, list[str]]:
+    """The views to try for each photo, from a text file of lines `photo view`, as hloc's retrieval writes its pairs.
+
+    Raises ValueError for a file that cannot be read or a line without two names.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected a text file of lines `photo view`, got {error}") from error
+    views: dict[str, list[str]] = {}
+    for number, line in enumerate(lines, 1):
+        if not (names := line.split()):
+            continue
+        if len(names) != 2:
+            raise ValueError(f"expected two names, a photo's and a view's, got {line!r} at line {number} of {path}")
+        views.setdefault(names[0], []).append(names[1])
+    return views
+
+
+def content_of(*files: Path) -> str:
+    """Sizes and a hash of what is in files."""
+    digest, sizes = hashlib.blake2b(digest_size=16), []
+    for file in files:
+        with file.open("rb") as content:
+            digest.update(hashlib.file_digest(content, "blake2b").digest())
+        sizes.append(str(file.stat().st_size))
+    return f"{'+'.join(sizes)} bytes, {digest.hexdigest()}"
+
+
+def content_of_map(folder: Path) -> str:
+    """The same of the files of a COLMAP model."""
+    return content_of(*(folder / f"{name}.{model_format(folder)}" for name in FILES))
+
+
+@dataclass
+class SolutionFolder:
+    """solutions/<photo>.json, and of all of them together results.json and poses.txt, in the frame of one map."""
+
+    path: Path
+    map_content: str
+    records: dict[str, Record] = field(default_factory=dict)  # by photo
+
+    def __post_init__(self) -> None:
+        folder = self.path / "solutions"
+        for file in sorted(folder.rglob("*.json")):
+            try:
+                self._record(file.relative_to(folder).as_posix().removesuffix(".json"), file.read_text("utf-8"))
+            except (OSError, ValueError, KeyError, TypeError):  # not whole, or of another version
+                continue
+
+    def changes(self, task: PhotoTask) -> list[str] | None:
+        """What of the photo's solution was made with something else; None if there is no solution."""
+        if task.name not in self.records:
+            return None
+        before = self.records[task.name][MADE_WITH]
+        return [key for key, value in task.made_with.items() if before.get(key) != value]
+
+    def keep(self, task: PhotoTask, solution: Solution) -> None:
+        """Write the solution of a photo, and what it was made with."""
+        text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
+        write_text(self._file("solutions", task.name, "json"), text + "\n")
+        self._record(task.name, text)
+
+    def forget_replaced(self, name: str, photo: Path) -> None:
+        """Delete solution and picture of a photo if they are of another one of that name."""
+        try:
+            content = content_of(photo)
+        except OSError:
+            return
+        if name in self.records and self.records[name][MADE_WITH]["photo"] != content:
+            del self.records[name]
+            self._file("solutions", name, "json").unlink()
+            self.picture(name).unlink(missing_ok=True)
+
+    def picture(self, name: str) -> Path:
+        """Where the picture of a photo is."""
+        return self._file("pictures", name, "png")
+
+    def of_other_maps(self) -> list[str]:
+        """Photos whose solutions are of another map, so that their poses have another frame."""
+        return [name for name, record in self.records.items() if record[MADE_WITH]["map"] != self.map_content]
+
+    def write(self) -> None:
+        """results.json; and poses.txt, a line for each confident photo of this map, whenever it was solved."""
+        photos = dict(sorted(self.records.items()))
+        write_text(self.path / "results.json", json.dumps({"map": self.map_content, "photos": photos}, indent=1) + "\n")
+        others = self.of_other_maps()
+        lines = [POSES_HEADER]
+        for name, record in photos.items():
+            if record["verdict"] == "confident" and name not in others:
+                lines.append(f"{name} {pose_text(*(np.array(record[key]) for key in ('rotation', 'translation')))}\n")
+        write_text(self.path / "poses.txt", "".join(lines))
+
+    def _record(self, name: str, text: str) -> None:
+        content = json.loads(text)
+        self.records[name] = {key: content[key] for key in REPORTED} | {"matches": len(content["matches"])}
+
+    def _file(self, folder: str, name: str, suffix: str) -> Path:
+        return self.path / folder / f"{name}.{suffix}"

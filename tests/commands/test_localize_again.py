@@ -1,0 +1,184 @@
+"""What `bpnp localize` finds in its output folder is kept only where photo, map, views, keypoints and options are those
+of before; the planted poses are the answer."""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+from PIL import Image
+from planted_model import HEIGHT, WIDTH, Planted, plant_model
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap
+from bpnp.cli import main
+
+CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
+
+
+@dataclass
+class Place:
+    """A map, photos without content named by the view near which they were taken, and the database of keypoints."""
+
+    folder: Path
+    truth: Planted
+
+    def run(self, *photos: str, more: tuple[str, ...] = ()) -> None:
+        main(self.command(*photos, more=more))
+
+    def command(self, *photos: str, more: tuple[str, ...] = ()) -> list[str]:
+        files = [str(self.folder / photo) for photo in photos]
+        keypoints, output = str(self.folder / "database.db"), str(self.folder / "out")
+        fixed = ["--keypoints", keypoints, "--output", output, "--no-pictures", "--solver", "search"]
+        return ["localize", str(self.folder / "map"), *files, *fixed, *more]
+
+    def poses(self) -> dict[str, np.ndarray]:
+        """Rotations of poses.txt by photo."""
+        lines = (self.folder / "out/poses.txt").read_text().splitlines()
+        rows = [line.split() for line in lines if not line.startswith("#")]
+        return {row[0]: Rotation.from_quat(np.roll(np.array(row[1:5], float), -1)).as_matrix() for row in rows}
+
+    def is_right(self, photo: str, view: int) -> bool:
+        return bool(np.allclose(self.poses()[photo], self.truth.rotations[view], atol=5e-3))
+
+    def write(self, views: dict[str, int]) -> None:
+        """The database anew: the photo was taken where this view of the map was."""
+        (self.folder / "database.db").unlink(missing_ok=True)
+        rng = np.random.default_rng(0)
+        with pycolmap.Database.open(self.folder / "database.db") as content:
+            lens = pycolmap.Camera(camera_id=0, model=CAMERA[0], width=WIDTH, height=HEIGHT, params=CAMERA[1])
+            camera = content.write_camera(lens)
+            for name, k in views.items():
+                points = self.truth.points3d[self.truth.seen[k]]
+                seen = points @ self.truth.rotations[k].T + self.truth.translations[k]
+                pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300] + 0.3 * rng.normal(size=(len(seen), 2))
+                number = content.write_image(pycolmap.Image(name=name, camera_id=camera))
+                content.write_keypoints(number, pixels.astype(np.float32))
+
+
+def shot(path: Path, shade: int) -> None:
+    Image.new("L", (WIDTH, HEIGHT), shade).save(path)
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Place:
+    truth = plant_model(tmp_path / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    made = Place(tmp_path, truth)
+    made.write({"a.png": 0, "b.png": 1})
+    shot(tmp_path / "a.png", 0)
+    shot(tmp_path / "b.png", 1)
+    return made
+
+
+def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    place.run("a.png", "b.png")
+    assert place.is_right("a.png", 0)
+    assert place.is_right("b.png", 1)
+    file = place.folder / "out/solutions/a.png.json"
+    before, poses = file.stat().st_mtime_ns, (place.folder / "out/poses.txt").read_text()
+    assert "kept 2" not in capsys.readouterr().out
+    place.run("a.png", "b.png")
+    assert "kept 2 of 2 photos, solved before with the same content and options" in capsys.readouterr().out
+    assert file.stat().st_mtime_ns == before
+    assert (place.folder / "out/poses.txt").read_text() == poses
+
+
+def test_a_photo_that_was_overwritten_is_another_one(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    """As of every camera that writes frame.jpg; its keypoints were extracted anew too."""
+    place.run("a.png", "b.png")
+    shot(place.folder / "a.png", 7)
+    place.write({"a.png": 2, "b.png": 1})
+    place.run("a.png", "b.png")
+    shown = capsys.readouterr().out
+    assert "solved again, with another photo, other keypoints: a.png" in shown
+    assert "kept 1 of 2 photos" in shown
+    assert place.is_right("a.png", 2)
+    shot(place.folder / "b.png", 8)
+    place.run("b.png")
+    assert "solved again, with another photo: b.png" in capsys.readouterr().out
+
+
+def test_another_photo_of_that_name_in_another_folder(place: Place) -> None:
+    place.run("a.png")
+    (place.folder / "other").mkdir()
+    shot(place.folder / "other/a.png", 9)
+    place.write({"a.png": 1})
+    place.run("other/a.png")
+    assert place.is_right("a.png", 1)
+
+
+def test_a_map_that_was_rebuilt_has_another_frame(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    place.run("a.png", "b.png")
+    place.truth = plant_model(place.folder / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15, seed=5)
+    place.write({"a.png": 0})
+    place.run("a.png")
+    shown = capsys.readouterr().out
+    assert "solved again, with another map, other keypoints: a.png" in shown
+    assert "not in poses.txt: 1 solutions in another map, such as b.png" in shown
+    assert list(place.poses()) == ["a.png"]
+    assert place.is_right("a.png", 0)
+
+
+def test_other_views_and_options_are_solved_again(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    views = place.folder / "views.txt"
+    views.write_text("a.png nowhere\n")
+    place.run("a.png", "b.png")
+    with pytest.raises(SystemExit):
+        place.run("a.png", more=("--views", str(views)))
+    assert "expected names of views of the map, got nowhere" in capsys.readouterr().err
+    place.run("a.png", more=("--seed", "3"))
+    assert "solved again, with other options: a.png" in capsys.readouterr().out
+    content = json.loads((place.folder / "out/results.json").read_text())["photos"]
+    assert [content[name]["made_with"]["seed"] for name in ("a.png", "b.png")] == [3, 0]
+
+
+def test_poses_are_those_of_all_runs_also_after_a_photo_that_failed(place: Place, fails: Callable[..., str]) -> None:
+    place.run("a.png")
+    place.run("b.png", more=("--time-limit", "60"))
+    assert list(place.poses()) == ["a.png", "b.png"]
+    (place.folder / "c.png").write_text("no photo")
+    assert "c.png" in fails(*place.command("c.png"))
+    assert list(place.poses()) == ["a.png", "b.png"]
+    content = json.loads((place.folder / "out/results.json").read_text())["photos"]
+    assert sorted(content) == ["a.png", "b.png"]
+    made = content["b.png"]["made_with"]
+    assert (made["solver"], made["time_limit"], made["camera_from"]) == ("search", 60.0, "view photo 0.jpg of the map")
+    assert content["b.png"]["verdict"] == "confident"
+    assert content["b.png"]["inlier_threshold"] > 0
+
+
+def test_a_folder_and_an_underscore_are_different_photos(place: Place) -> None:
+    (place.folder / "photos/cam").mkdir(parents=True)
+    shot(place.folder / "photos/cam/1.png", 3)
+    shot(place.folder / "photos/cam_1.png", 4)
+    place.write({"cam/1.png": 0, "cam_1.png": 1})
+    command = place.command("photos")
+    command.remove("--no-pictures")
+    main(command)
+    assert place.is_right("cam/1.png", 0)
+    assert place.is_right("cam_1.png", 1)
+    pictures = (place.folder / "out/pictures").rglob("*.png")
+    names = [path.relative_to(place.folder / "out/pictures").as_posix() for path in pictures]
+    assert sorted(names) == ["cam/1.png.png", "cam_1.png.png"]
+
+
+def test_the_camera_of_views_of_the_same_size_is_taken_and_named(
+    place: Place, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]
+) -> None:
+    place.run("a.png")
+    assert "camera: view photo 0.jpg of the map (1)" in capsys.readouterr().out
+    scene = SceneMap.from_colmap(place.folder / "map")
+    solution = scene.localize_photo(place.folder / "a.png", keypoints=place.folder / "database.db", solver="search")
+    np.testing.assert_allclose(solution.rotation, place.poses()["a.png"], atol=1e-12)
+    assert solution.camera.focal == 520
+    Image.new("L", (WIDTH // 2, HEIGHT // 2)).save(place.folder / "half.png")
+    error = fails(*place.command("half.png"))
+    assert "or views of this size, got neither: the map's are of 800 x 600; try --camera with the camera" in error
+    assert error.rstrip().endswith("of the photo, or MAP for that of the views, scaled")
+    for given in ("MAP", str(place.folder / "map"), str(place.folder / "map/cameras.bin")):
+        camera, source = scene.camera_for(place.folder / "half.png", exif=False)
+        assert (camera.focal, source) == (260, "view photo 0.jpg of the map")
+        assert "expected keypoints of half.png" in fails(*place.command("half.png", more=("--camera", given)))
