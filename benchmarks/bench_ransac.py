@@ -27,8 +27,7 @@ from scipy.spatial.transform import Rotation
 from timing import machine, write_json
 
 from bpnp.geometry import rotation_angle
-from bpnp.robust.consensus import consensus
-from bpnp.robust.scoring import Pairs, normalised
+from bpnp.robust.consensus import Pairs, consensus, normalised
 
 NOISE, THRESHOLD, POINTS, FOCAL = 0.0025, 0.01, 1000, 1000.0
 CAMERA = {"model": "SIMPLE_PINHOLE", "width": 1000, "height": 1000, "params": [FOCAL, 0.0, 0.0]}

@@ -24,7 +24,7 @@ from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.loader import PairDataset
 from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
-from bpnp.metrics.errors import rotation_error, translation_error
+from bpnp.metrics import rotation_error, translation_error
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings

@@ -12,7 +12,7 @@ import torch
 from bench_search import source
 
 from bpnp import solve
-from bpnp.metrics.errors import rotation_error
+from bpnp.metrics import rotation_error
 from bpnp.report.figures import save_figure
 from bpnp.solving.pictures import solution_picture
 

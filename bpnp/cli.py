@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import first_line, parsed_arguments
-from bpnp.commands.training_help import LIGHTNING, group_asked_for, short_help
+from bpnp.commands.parser import LIGHTNING, first_line, group_asked_for, parsed_arguments, short_help
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system

@@ -18,11 +18,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import bpnp.datamodules
 from bpnp.commands.output import say
-from bpnp.commands.parser import OneLineParser, plain
-from bpnp.commands.training_help import GROUPS
+from bpnp.commands.parser import GROUPS, OneLineParser, plain
 from bpnp.files import claimed
-from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
-from bpnp.training.monitor import OfflineWandbLogger
+from bpnp.training.callbacks import InterruptedCheckpoint, OfflineWandbLogger, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 

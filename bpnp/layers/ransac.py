@@ -10,8 +10,7 @@ from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.backends import BACKENDS
-from bpnp.robust.sampling import take
-from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals
+from bpnp.robust.consensus import Pairs, in_scene, normalised, residuals, take
 from bpnp.types import SolveStats, unpadded
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
-from bpnp.robust.consensus import consensus
-from bpnp.robust.scoring import Pairs, residuals
+from bpnp.robust.consensus import Pairs, consensus, residuals
 
 FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
@@ -75,7 +74,7 @@ def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> 
     return int(residuals(torch.as_tensor(pose)[None, None], pairs, threshold**2).inlier.sum())
 
 
-# Pairs as `bpnp.robust.scoring.normalised` gives them, most probable first, threshold, most hypotheses, seed -> poses
+# Pairs as `bpnp.robust.consensus.normalised` gives them, most probable first, threshold, most hypotheses, seed -> poses
 # [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
 BACKENDS: dict[str, Estimator] = {
     "poselib": partial(_each, _poselib),

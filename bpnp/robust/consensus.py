@@ -1,16 +1,142 @@
-"""Random sample consensus on candidate pairs and its local refinement, for a whole batch at once, in fixed work.
+"""Random sample consensus on candidate matches for a whole batch at once: sampling, scoring and local refinement.
 
-No shape, loop or branch depends on the data, so nothing waits for the device.
+The random numbers are a hash of a seed and a counter, the same on every device and for every sample of a batch, so that
+a pose depends neither on the other samples nor on padding. No shape, loop or branch depends on the data, so nothing
+waits for the device.
 """
+
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.geometry import bearings, retract
-from bpnp.robust.p3p import poses_of_triples
-from bpnp.robust.sampling import distinct_triples, growing_pool, take
-from bpnp.robust.scoring import Pairs, residuals, truncated_scores
+from bpnp.geometry import bearings, retract, transform
+from bpnp.robust.p3p import poses_of_triples, take
+
+SMALLEST_POOL = 16  # pairs of largest weight, from which the first triples of a growing pool are drawn
+
+
+def growing_pool(count: Int[Tensor, " b"], draws: int) -> Float[Tensor, "b d"]:
+    """Size of the pool of each draw: it grows geometrically from SMALLEST_POOL to `count`.
+
+    The order of growth is that of PROSAC (Chum, Matas, CVPR 2005): pairs of large weight are tried first.
+    """
+    progress = (torch.arange(draws, device=count.device, dtype=torch.float64) + 0.5) / draws
+    last = count.clamp(min=3).unsqueeze(-1).double()
+    first = last.clamp(max=SMALLEST_POOL)
+    return (first * (last / first) ** progress).ceil()
+
+
+def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:
+    """Three different indices below the pool size of each draw, uniform and in random order.
+
+    skip: draws of earlier calls with this seed; their random numbers are not used again.
+    """
+    draws = pool.shape[1]
+    uniform = hashed_uniform(3 * draws, seed, pool.device, skip=3 * skip).view(3, draws)
+    first, second, third = ((uniform[i] * (pool - i)).long() for i in range(3))
+    # A draw from pool - i numbers skips the i numbers already taken.
+    second = second + (second >= first)
+    third = third + (third >= torch.minimum(first, second))
+    third = third + (third >= torch.maximum(first, second))
+    return torch.stack([first, second, third], -1)
+
+
+def weighted_draws(weights: Float[Tensor, "b k"], count: int, seed: int) -> Int[Tensor, "b c"]:
+    """Indices drawn with replacement in proportion to the weights, which are not negative and not all zero."""
+    total = weights.double().cumsum(-1)
+    uniform = hashed_uniform(count, seed, weights.device)
+    # The first sum above the number drawn: never an index of weight zero.
+    return torch.searchsorted(total, uniform * total[:, -1:], right=True).clamp(max=weights.shape[1] - 1)
+
+
+def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0) -> Float[Tensor, " k"]:
+    """float64 in (0, 1): a 32-bit integer hash (two multiplications and shifts) of the counter and the seed."""
+    state = torch.arange(skip, skip + size, device=device)
+    for salt in (0, (seed * 0x9E3779B1 + 1) & 0xFFFFFFFF):
+        state = (state + salt) & 0xFFFFFFFF
+        for shift, factor in ((16, 0x21F0AAAD), (15, 0x735A2D97)):
+            state = ((state ^ (state >> shift)) * factor) & 0xFFFFFFFF
+        state = state ^ (state >> 15)
+    return (state + 0.5) / 2.0**32
+
+
+CHUNK = 2**18  # residuals scored at a time: 1 MiB in float32, which stays in the cache of a core
+
+
+class Pairs(NamedTuple):
+    """Candidate pairs of a 2D and a 3D point; `real` is False for padding, whose points are zero."""
+
+    points2d: Float[Tensor, "b k 2"]
+    points3d: Float[Tensor, "b k 3"]
+    real: Bool[Tensor, "b k"]
+
+
+class Residuals(NamedTuple):
+    """Of c poses on k pairs. inlier: real, in front of the camera and with a reprojection error below the threshold."""
+
+    squared: Float[Tensor, "b c k"]
+    inlier: Bool[Tensor, "b c k"]
+    residual: Float[Tensor, "b c k 2"]
+    camera: Float[Tensor, "b c k 3"]
+
+
+def normalised(pairs: Pairs) -> tuple[Pairs, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
+    """The pairs in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
+
+    A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
+    """
+    usable = pairs.real & pairs.points2d.isfinite().all(-1) & pairs.points3d.isfinite().all(-1)
+    real = usable.unsqueeze(-1)
+    image, scene = (torch.where(real, points, 0).double() for points in pairs[:2])
+    count = usable.sum(-1, keepdim=True).clamp(min=1)
+    centre = scene.sum(1) / count
+    scene = torch.where(real, scene - centre.unsqueeze(1), 0)
+    scale = (scene.square().sum((1, 2)).unsqueeze(-1) / count).sqrt().clamp(min=1e-300)
+    return Pairs(image, scene / scale.unsqueeze(-1), usable), centre, scale
+
+
+def in_scene(
+    poses: Float[Tensor, "b c 3 4"], centre: Float[Tensor, "b 3"], scale: Float[Tensor, "b 1"]
+) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
+    """Rotation and translation, in the scene's own coordinates, of poses that were found on normalised pairs."""
+    rotation = poses[..., :3]
+    return rotation, scale.unsqueeze(1) * poses[..., 3] - (rotation @ centre[:, None, :, None]).squeeze(-1)
+
+
+def truncated_scores(
+    poses: Float[Tensor, "b c 3 4"], pairs: Pairs, threshold2: float | Float[Tensor, "b 1 1"]
+) -> Float[Tensor, "b c"]:
+    """sum_i min(r_i^2, threshold2) over the real pairs, r_i the reprojection error, infinite behind the camera.
+
+    Computed in float32. NaN for a pose that is NaN.
+    """
+    x, y = pairs.points2d.float().unsqueeze(1).unbind(-1)
+    scene = torch.cat([pairs.points3d.float(), torch.ones_like(x).mT], -1).mT
+    real = pairs.real.unsqueeze(1).float()
+    # x' - x = (row_0 - x row_2) [p; 1] / depth: one product for the numerator, and the depth is only squared.
+    along_x, along_y = torch.cat([scene, -x * scene], 1), torch.cat([scene, -y * scene], 1)
+    scores = []
+    for part in poses.float().split(max(1, CHUNK // (x.shape[0] * x.shape[2])), dim=1):
+        row0, row1, row2 = part.unbind(2)
+        squared = (torch.cat([row0, row2], -1) @ along_x).square_()
+        squared += (torch.cat([row1, row2], -1) @ along_y).square_()
+        depth = (row2 @ scene).clamp_(min=1e-12)  # behind the camera: an infinite residual
+        squared.div_(depth.square_()).clamp_(max=threshold2)
+        scores.append((squared @ real.mT).squeeze(-1))
+    return torch.cat(scores, 1)
+
+
+def residuals(poses: Float[Tensor, "b c 3 4"], pairs: Pairs, threshold2: float) -> Residuals:
+    """Reprojection error of every pair under every pose, in the type of the points."""
+    points3d = pairs.points3d.unsqueeze(1).expand(-1, poses.shape[1], -1, -1)
+    camera = transform(poses[..., :3], poses[..., 3], points3d)
+    residual = camera[..., :2] / camera[..., 2:] - pairs.points2d.unsqueeze(1)
+    squared = residual.square().sum(-1)
+    inlier = (squared < threshold2) & (camera[..., 2] > 0) & pairs.real.unsqueeze(1)
+    return Residuals(squared, inlier, residual, camera)
+
 
 SUBSET = 512  # pairs of largest weight, on which all hypotheses are scored; with 256, poses are lost at 10 % inliers
 SHORTLIST = 256  # hypotheses that are then scored on all pairs
@@ -24,7 +150,7 @@ def consensus(
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
     """Pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2), and `hypotheses`.
 
-    pairs: as `bpnp.robust.scoring.normalised` gives them, most probable first. A point may be in many pairs.
+    pairs: as `bpnp.robust.consensus.normalised` gives them, most probable first. A point may be in many pairs.
     hypotheses: triples for each sample. They come from a pool of the most probable pairs that grows to all pairs
     (PROSAC; Chum, Matas, CVPR 2005), `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an
     outlier), and the best are refined. A last fit uses Cauchy's loss with a scale of four times the median squared

@@ -8,13 +8,17 @@ matrix is given by its six components xx, xy, xw, yy, yw, ww.
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from bpnp.robust.sampling import take
 
 NEWTON_STEPS = 2  # on the depths
 TOLERANCE = 1e-6  # of the squared sides, relative to the longest
+
+
+def take(values: Tensor, index: Int[Tensor, "b k"]) -> Tensor:
+    """values[b, index[b, i], ...] for every sample b."""
+    trailing = values.shape[2:]
+    return values.gather(1, index.view(*index.shape, *(1 for _ in trailing)).expand(*index.shape, *trailing))
 
 
 class P3P(NamedTuple):

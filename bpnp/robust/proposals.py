@@ -13,9 +13,8 @@ from bpnp.checks import check_positive, checked_shapes
 from bpnp.distinct_poses import distinct
 from bpnp.geometry import bearings
 from bpnp.precision import full_precision
+from bpnp.robust.consensus import Pairs, in_scene, normalised, take, truncated_scores, weighted_draws
 from bpnp.robust.p3p import poses_of_triples
-from bpnp.robust.sampling import take, weighted_draws
-from bpnp.robust.scoring import Pairs, in_scene, normalised, truncated_scores
 from bpnp.types import SolveStats
 
 TRIPLES = 1024  # solved for each sample

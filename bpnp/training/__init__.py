@@ -1,7 +1,6 @@
 """The LightningModule, its losses, and the callbacks of a training."""
 
-from bpnp.training.callbacks import PoseLossWarmup, SafeCheckpointIO
-from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor
+from bpnp.training.callbacks import OfflineWandbLogger, PoseLossWarmup, SafeCheckpointIO, TrainingMonitor
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
 

@@ -1,7 +1,9 @@
-"""What a trainer is given beside the task: the pose loss that joins later, and checkpoints read as data."""
+"""Callbacks of a training and its log: the pose loss that joins later, checkpoints read as data, and what is shown."""
 
 import io
+import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,11 +12,19 @@ from typing import Any
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
+from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from lightning.pytorch.utilities.rank_zero import rank_zero_info
+from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
+from torch import Tensor, nn
 
 from bpnp.files import written_whole
+from bpnp.models.evaluation import refinement_enabled
+from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import read_checkpoint
+from bpnp.report.dashboards import image
+from bpnp.report.figures import plot_pair, save_figure
+from bpnp.report.samples import PairView, views_from
+from bpnp.types import Batch, Prediction
 
 
 class PoseLossWarmup(Callback):
@@ -81,3 +91,135 @@ def interruptible(trainer: Trainer) -> Iterator[None]:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             raise KeyboardInterrupt from None
         raise
+
+
+COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
+
+
+class OfflineWandbLogger(WandbLogger):
+    """Lightning's W&B logger that sends nothing unless asked: offline where WANDB_MODE is not set.
+
+    Args:
+        project, name: of the run.
+        save_dir: where the folder of an offline run goes, for `wandb sync`; none for the run's folder in `bpnp fit`,
+            else the working directory.
+    """
+
+    def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str | None = None) -> None:
+        mode = os.environ.get("WANDB_MODE") or "offline"  # as an argument too: wandb reads its variables only once
+        super().__init__(project=project, name=name, offline=mode == "offline", mode=mode)
+        self._placed = save_dir is not None
+        if save_dir is not None:
+            self._place(save_dir)
+
+    def keep_in(self, folder: str) -> None:
+        """Put the run that is to begin below `folder`, unless a `save_dir` was given."""
+        if not self._placed:
+            self._place(folder)
+
+    def _place(self, folder: str) -> None:
+        os.makedirs(folder, exist_ok=True)
+        self._save_dir = self._wandb_init["dir"] = folder
+
+
+class TrainingMonitor(Callback):
+    """Logs "train/pairs_per_second" per epoch and, of the first few validation pairs, "val/true_match_mass", the
+    probability that the assignment gives to their true matches, "val/<estimate>_iterations" of each pose, and
+    "val/feature_spread_2d" and "_3d" (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a
+    set have the same feature the assignment is uniform, and the loss stays where it is.
+
+    Every `every` epochs the same pairs are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
+    of the trainer's default_root_dir.
+
+    Args:
+        pairs: how many validation pairs are watched.
+        every: epochs between pictures; 0 for none.
+    """
+
+    def __init__(self, pairs: int = 4, every: int = 10) -> None:
+        if pairs < 1 or every < 0:
+            raise ValueError(f"expected pairs >= 1 and every >= 0, got {pairs} and {every}")
+        self.pairs, self.every = pairs, every
+        self.watched: Batch | None = None
+        self.started = 0.0
+        self.seen = 0
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.started, self.seen = time.perf_counter(), 0
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        self.seen += len(batch)
+        if trainer.is_last_batch:
+            # Before the validation that ends the epoch, which is no training.
+            seconds = time.perf_counter() - self.started
+            pairs = self.seen * trainer.world_size
+            pl_module.log("train/pairs_per_second", pairs / seconds, on_step=False, on_epoch=True, batch_size=1)
+
+    def on_validation_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        if batch_idx == 0 and self.watched is None:
+            self.watched = first_pairs(batch, self.pairs)
+
+    def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self.watched is None or trainer.sanity_checking:
+            return
+        batch = self.watched.to(pl_module.device)
+        with torch.no_grad(), refinement_enabled(pl_module, False):
+            prediction = pl_module(batch)
+            spreads = feature_spreads(getattr(pl_module, "solver", pl_module), batch)
+        values = {f"val/{key}": value for key, value in (watched_values(prediction, batch) | spreads).items()}
+        pl_module.log_dict(values, batch_size=len(batch), sync_dist=True)
+        if any(spread < COLLAPSED for spread in spreads.values()):
+            rank_zero_warn(
+                f"expected features that differ from point to point, got spreads of {min(spreads.values()):.2g} and "
+                f"{max(spreads.values()):.2g} at step {trainer.global_step}: the features have collapsed; try a lower "
+                "model.learning_rate, a warm-up, or `centre` of the solver's features"
+            )
+        if self.every and trainer.current_epoch % self.every == 0 and trainer.is_global_zero:
+            _draw(trainer, views_from(prediction, batch))
+
+
+def first_pairs(batch: Batch, count: int) -> Batch:
+    """The first pairs of a batch, on the CPU."""
+    parts: dict[str, Any] = {
+        name: value[:count].cpu() if isinstance(value, Tensor) else value and value[:count]
+        for name, value in vars(batch).items()
+    }
+    return Batch(**parts)
+
+
+def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
+    """Mean distance of the unit features of each set from their mean: 1 for vectors in all directions, 0 for one
+    vector; empty for a solver without a method `features`."""
+    features = solver.features(batch) if hasattr(solver, "features") else ()  # type: ignore[operator]
+    spreads = {}
+    for side, z, mask in zip(("2d", "3d"), features, (batch.mask2d, batch.mask3d), strict=False):
+        away = torch.linalg.vector_norm(centred(nn.functional.normalize(z, dim=-1), mask), dim=-1) * mask
+        spreads[f"feature_spread_{side}"] = (away.sum(1) / mask.sum(1)).mean()
+    return spreads
+
+
+def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
+    """Mean over the pairs of the probability on true matches, and of the iterations of each pose."""
+    values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
+    if prediction.assignment is not None and batch.match3d is not None:
+        matched = batch.match3d >= 0
+        mass = prediction.assignment.gather(1, batch.match3d.clamp(min=0)[:, None]).squeeze(1)
+        values["true_match_mass"] = mass.where(matched, 0).sum(-1).mean()
+    return values
+
+
+def _draw(trainer: Trainer, views: list[PairView]) -> None:
+    for logger in trainer.loggers:
+        if isinstance(logger, WandbLogger):
+            logger.log_image("val/pairs", [image(plot_pair(view), caption=view.id) for view in views])
+        elif isinstance(logger, TensorBoardLogger):
+            for number, view in enumerate(views):
+                logger.experiment.add_figure(f"val/pair{number}", plot_pair(view), trainer.global_step)
+    if trainer.loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in trainer.loggers):
+        folder = os.path.join(trainer.default_root_dir, "pictures", f"epoch_{trainer.current_epoch:04d}")
+        for number, view in enumerate(views):
+            save_figure(plot_pair(view), os.path.join(folder, f"pair{number}.png"))

@@ -15,7 +15,7 @@ from small_data import SMALL_MESHES, SMALL_NET
 from torch import Tensor, nn
 
 import bpnp.cli as cli
-import bpnp.commands.training_help as training_help
+import bpnp.commands.parser as parser
 from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
 from bpnp.files import CONFIGS
@@ -76,7 +76,7 @@ def options_of(text: str) -> set[str]:
     return set(re.findall(r"^  (?:-\w [A-Z_]+, |-h, )?(--[\w.]+)", text, re.MULTILINE))
 
 
-@pytest.mark.parametrize("command", training_help.LIGHTNING)
+@pytest.mark.parametrize("command", parser.LIGHTNING)
 def test_help_is_short(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     main([command, "--help"])
     lines = capsys.readouterr().out.splitlines()
@@ -87,7 +87,7 @@ def test_help_is_short(command: str, capsys: pytest.CaptureFixture[str]) -> None
 
 def test_groups_list_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:
     listed = {}
-    for group in training_help.GROUPS:
+    for group in parser.GROUPS:
         with pytest.raises(SystemExit):
             main(["fit", "--help", group])
         listed[group] = options_of(capsys.readouterr().out)
@@ -95,7 +95,7 @@ def test_groups_list_every_option_once(capsys: pytest.CaptureFixture[str]) -> No
     of_no_group = {"--help", "--config", "--print_config", "--seed_everything", "--ckpt_path", "--weights_only"}
     assert set().union(*listed.values()) == everything - of_no_group
     assert sum(map(len, listed.values())) == len(set().union(*listed.values()))
-    told = {option.split()[0] for option in training_help.OPTIONS if not option.startswith("--data.")}
+    told = {option.split()[0] for option in parser.OPTIONS if not option.startswith("--data.")}
     assert told <= everything
 
 

@@ -12,8 +12,8 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust import scoring
-from bpnp.robust.scoring import Pairs, residuals, truncated_scores
+from bpnp.robust import consensus as scoring
+from bpnp.robust.consensus import Pairs, residuals, truncated_scores
 from bpnp.types import SolveStats
 
 THRESHOLD = 0.01

@@ -6,7 +6,7 @@ import torch
 from scipy.stats import chisquare, kstest
 from torch import Tensor
 
-from bpnp.robust.sampling import distinct_triples, growing_pool, hashed_uniform, take, weighted_draws
+from bpnp.robust.consensus import distinct_triples, growing_pool, hashed_uniform, take, weighted_draws
 
 CPU = torch.device("cpu")
 

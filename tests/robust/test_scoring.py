@@ -9,9 +9,8 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import rotation_angle
-from bpnp.robust import scoring
-from bpnp.robust.consensus import refine_locally
-from bpnp.robust.scoring import Pairs, in_scene, normalised, residuals, truncated_scores
+from bpnp.robust import consensus as scoring
+from bpnp.robust.consensus import Pairs, in_scene, normalised, refine_locally, residuals, truncated_scores
 
 
 def problem(noise: float = 0.002) -> tuple[Pairs, torch.Tensor]:

@@ -50,8 +50,8 @@ READS = {
     "layers/transport.py:_solve": 2,  # the end, and which samples go on
     "layers/transport.py:solve_plan": 2,  # which samples need float64
     "layers/transport.py:sweep": 1,
-    "models/nets/context_norm.py:norm_gradient": 1,  # on the CPU only
-    "models/nets/context_norm.py:normalise": 1,  # on the CPU only
+    "models/nets/pointwise.py:norm_gradient": 1,  # on the CPU only
+    "models/nets/pointwise.py:normalise": 1,  # on the CPU only
     "models/nets/normalisation.py:_of_real_points": 1,  # on the CPU only
     "types.py:unpadded": 1,  # on the CPU only
 }

@@ -15,7 +15,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.monitor import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_pairs, watched_values
+from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_pairs, watched_values
 
 
 class PlantedModule(LightningModule):

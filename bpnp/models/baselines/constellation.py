@@ -11,9 +11,8 @@ from bpnp.checks import check_positive
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement
-from bpnp.robust.consensus import refine_locally
+from bpnp.robust.consensus import Pairs, refine_locally
 from bpnp.robust.p3p import p3p
-from bpnp.robust.scoring import Pairs
 
 CHUNK = 2**14  # triples solved at a time
 SHORTLIST = 64  # poses that are matched one to one and refined

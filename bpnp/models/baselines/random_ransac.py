@@ -8,8 +8,8 @@ from torch import Tensor
 from bpnp.geometry import MIN_POINTS, bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, agreement, pair_seed
+from bpnp.robust.consensus import distinct_triples
 from bpnp.robust.p3p import p3p
-from bpnp.robust.sampling import distinct_triples
 
 TRIPLES = 256  # solved at a time
 PREVIEW = 32  # 2D points on which every hypothesis is scored
