@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 from bpnp import solve
+from bpnp.examples import load
+from bpnp.search.evidence.partners import OUTLIERS
 from bpnp.search.evidence.uncertainty import (
-    OUTLIERS,
     centre_bound,
     centre_covariance,
     linearised,
@@ -190,15 +191,25 @@ def test_the_misfit_says_how_far_off_the_pose_is(wrong: str) -> None:
     turn, shift, scale = fitted(image)
     misfit = systematic_misfit(linearised(PointSets(image, POINTS), turn.as_matrix(), shift, scale), 40.0)
     if wrong == "nothing":
-        assert misfit == (0.0, 0.0)
+        assert misfit == (0.0, 0.0, 1.0)
         return
     moved = np.linalg.norm(turn.apply(np.median(POINTS, 0)) + shift - TURN.apply(np.median(POINTS, 0)) - MOVED)
     off = (TURN.inv() * turn).magnitude(), moved / np.linalg.norm(MOVED)
     if wrong == "focal length":
-        assert misfit == pytest.approx(off, rel=0.3, abs=2e-3)
+        assert (misfit.turn, misfit.shift) == pytest.approx(off, rel=0.3, abs=2e-3)
+        assert misfit.zoom == pytest.approx(1.04, abs=0.01)
     else:  # another focal length is a worse explanation, by which the pose were farther off
         assert misfit.turn > 0.7 * off[0]
         assert misfit.shift > 0.7 * off[1]
+
+
+@pytest.mark.parametrize("factor", [0.8, 1.0, 1.25])
+def test_the_focal_length_that_a_photo_was_taken_with_is_met(factor: float) -> None:
+    """At a wrong one other points match, and their residuals alone do not tell: 0.8 was believed."""
+    example = load("photo", seed=3)
+    assert isinstance(example.camera, np.ndarray)
+    solution = solve(example.points2d, example.points3d, example.camera * [[factor], [factor], [1.0]])
+    assert (solution.verdict == "confident") == (factor == 1)
 
 
 @pytest.mark.parametrize("focal", [0.6, 1.5])

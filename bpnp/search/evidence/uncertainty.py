@@ -6,18 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import fdtrc, fdtri, stdtrit
 
-from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.evidence.partners import across, at_other_focal_length, facing, partners
+from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
-FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
-DENSE = 4096  # possible matches up to which all distances are computed
-OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
 EXCEEDED = 1e-3  # probability that a pose is farther off than its bound, and of a test
 ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
 
@@ -33,6 +29,7 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # numbers that are fitted with every pose
+ZOOMED_FROM = 24  # matches from which another focal length is looked for; with fewer the linear fit decides
 
 
 def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
@@ -120,8 +117,7 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     """
     if linear is None:
         return None
-    sets, probability = linear.sets, linear.probability
-    chosen = sets.image.chosen
+    sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
     rows = (np.sqrt(probability)[:, None, None] * linear.jacobian).reshape(-1, POSE)
     complete = rows.T @ rows
@@ -148,74 +144,43 @@ class Linearised(NamedTuple):
     image: (k,) places among the chosen image points. probability: (k,) of the match. seen: (k, 3) direction in which
     the pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from the middle of the scene.
     residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle; in scales.
-    scale: standard deviation of the residuals, radians. middle: (3,) of the scene, seen from the camera, in its axes.
+    scale: standard deviation of the residuals, radians.
     """
 
     sets: PointSets
     rotation: Array
-    image: NDArray[np.int64]
+    translation: Array
+    image: Labels
     probability: Array
     seen: Array
     points: Array
     residual: Array
     jacobian: Array
     scale: float
-    middle: Array
+
+    @property
+    def middle(self) -> Array:
+        """(3,) of the scene, seen from the camera, in its axes."""
+        return np.asarray(self.rotation @ self.sets.middle + self.translation)
 
 
 def linearised(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Linearised | None:
     """A pose with the matches that are within a few scales, radians, of each other; None if there is none."""
-    turned = sets.points3d @ rotation.T
-    camera = turned + translation
-    depth = np.linalg.norm(camera, axis=-1)
-    used = depth > 0
-    if sets.normals3d is not None:
-        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
-    places = np.flatnonzero(used)
+    camera = sets.points3d @ rotation.T + translation
+    places = facing(sets, camera, rotation)
     if not len(places):
         return None
-    turned, depth, seen = turned[places], depth[places], camera[places] / depth[places, None]
-    i, j, probability = _partners(sets, seen, places, scale)
+    camera = camera[places]
+    depth = np.linalg.norm(camera, axis=-1, keepdims=True)
+    seen = camera / depth
+    i, j, density, every = partners(sets, seen, places, sets.image.chosen, scale)
     if not len(i):
         return None
-    middle = rotation @ sets.middle
-    p, u = turned[j] - middle, seen[j]
-    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / depth[j, None, None]
-    jacobian = np.concatenate([np.cross(p[:, None], across, axisb=2, axisc=2), across], -1) / scale
+    p, u = camera[j] - rotation @ sets.middle - translation, seen[j]
+    by_shift = across(u) / depth[j, None]
+    jacobian = np.concatenate([np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift], -1) / scale
     residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
-    return Linearised(sets, rotation, i, probability, u, p, residual, jacobian, scale, middle + translation)
-
-
-def _partners(
-    sets: PointSets, seen: Array, places: Labels, scale: float
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
-    """Matches (k,) of a chosen image point and a scene point near it, and the probability of each.
-
-    seen: (n, 3) directions of the scene points at `places`.
-    """
-    bearings, reach = sets.bearings[sets.image.chosen], FARTHEST * scale
-    if len(bearings) * len(seen) <= DENSE:
-        squared = ((bearings[:, None] - seen) ** 2).sum(-1)
-        i, j = np.nonzero(squared < reach**2)
-        squared = squared[i, j]
-    else:
-        tree, counts = cKDTree(seen), range(1, min(NEIGHBOURS, len(seen)) + 1)
-        for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
-            distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
-            if not np.isfinite(distance[:, -1]).any():
-                break
-        i, nth = np.nonzero(np.isfinite(distance))
-        j, squared = nearest[i, nth], distance[i, nth] ** 2
-    j, candidates = j.astype(np.int64), np.full(len(bearings), len(seen))
-    if sets.labels2d is not None and sets.labels3d is not None:
-        label, others = sets.labels2d[sets.image.chosen], sets.labels3d[places]
-        agree = (label[i] == others[j]) | (label[i] < 0) | (others[j] < 0)
-        i, j, squared = i[agree], j[agree], squared[agree]
-        counts = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
-        candidates = np.where(label < 0, len(seen), counts[label + 1] + counts[0])
-    density = np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
-    every = np.bincount(i, density, len(bearings)) + OUTLIERS / sets.image.solid_angle
-    return i, j, density / every[i]
+    return Linearised(sets, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
 
 
 def _known(linear: Linearised) -> Array:
@@ -239,18 +204,26 @@ def _crossed(vector: Array) -> Array:
 
 
 class Misfit(NamedTuple):
-    """How far the pose would be if the camera and the scene were free: radians, and share of the distance."""
+    """How far the pose would be if the camera and the scene were free.
+
+    turn: radians. shift: of the middle of the scene, in distances from the camera. zoom: the focal length over the
+    given one, 1 if not that is wrong.
+    """
 
     turn: float
     shift: float
+    zoom: float = 1.0
 
 
 def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
-    """What is significant in the residuals of a pose, `linearised`, with `count` matches.
+    """What is significant in the residuals of a pose, `linearised`, with `count` matches: the largest step of three.
 
-    Beside the pose, the log of the focal length, or five strains of the scene, are fitted to the residuals, weighed
-    with the probabilities of the partners. Of their principal directions, the pose eliminated, those count whose F
-    statistic chance exceeds once in a thousand. Zero if there is none, else the larger step of the two.
+    - Beside the pose, five strains of the scene are fitted to the residuals, weighed with the probabilities of the
+      partners. Of their principal directions, the pose eliminated, those count whose F statistic chance exceeds once in
+      a thousand.
+    - The same with the log of the focal length.
+    - Pose and focal length that explain the points better, with other partners, of `ZOOMED_FROM` matches or more:
+      `at_other_focal_length`.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -258,39 +231,54 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
     >>> seen = points + [0, 0, 5] + 1e-3 * rng.standard_normal((40, 3))
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
     >>> systematic_misfit(linearised(sets, np.eye(3), np.array([0, 0, 5.0]), 2e-4), 40.0)
-    Misfit(turn=0.0, shift=0.0)
+    Misfit(turn=0.0, shift=0.0, zoom=1.0)
     """
     if linear is None:
         return Misfit(0.0, 0.0)
     free = 2 * min(count, float(linear.probability.sum())) - POSE
-    zoomed = linear.seen * (1, 1, 0) / linear.scale
-    zoomed -= (zoomed * linear.seen).sum(1, keepdims=True) * linear.seen
+    zoomed = (across(linear.seen) @ (linear.seen * (1, 1, 0))[..., None]) / linear.scale
     strained = linear.jacobian[:, :, 3:] @ (linear.points @ STRAINS).transpose(1, 2, 0)
-    columns = np.concatenate([linear.jacobian, zoomed[..., None], strained, linear.residual[..., None]], -1)
+    columns = np.concatenate([linear.jacobian, zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
     products = weighed.T @ weighed
-    pose = np.linalg.pinv(products[:6, :6], hermitian=True)
-    parts = slice(6, 7), slice(7, 7 + len(STRAINS))
-    moved = np.stack([_moved(products, pose, part, free) for part in parts])
-    turn, shift = (float(np.linalg.norm(part, axis=-1).max()) for part in (moved[:, :3], moved[:, 3:]))
-    return Misfit(turn, shift / max(float(np.linalg.norm(linear.middle)), 1e-300))
+    pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
+    distance = max(float(np.linalg.norm(linear.middle)), 1e-300)
+    found = []
+    for fitted in (slice(POSE, POSE + 1), slice(POSE + 1, POSE + 1 + len(STRAINS))):
+        moved, step = _moved(products, pose, fitted, free)
+        zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
+        found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
+    other = (
+        at_other_focal_length(linear.sets, linear.rotation, linear.middle, linear.scale)
+        if count >= ZOOMED_FROM
+        else None
+    )
+    if other is not None:
+        turn = math.acos(min(1.0, (float(np.trace(other.rotation @ linear.rotation.T)) - 1) / 2))
+        found.append(Misfit(turn, float(np.linalg.norm(other.middle - linear.middle)) / distance, other.zoom))
+    return Misfit(
+        max(each.turn for each in found),
+        max(each.shift for each in found),
+        max((each.zoom for each in found), key=lambda zoom: abs(math.log(zoom))),
+    )
 
 
-def _moved(products: Array, pose: Array, fitted: slice, free: float) -> Array:
-    """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it.
+def _moved(products: Array, pose: Array, fitted: slice, free: float) -> tuple[Array, Array]:
+    """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it, and that of these.
 
     products: of the columns with each other; the first six are the pose's, the last one holds the residuals. pose:
     (6, 6), the inverse of those of the pose. free: numbers that were measured, less those of the pose.
     """
-    across = pose @ products[:6, fitted]
-    values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :6] @ across)
+    across = pose @ products[:POSE, fitted]
+    values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :POSE] @ across)
     known = values > 1e-9 * float(np.diag(products)[fitted].max())
     if not 0 < known.sum() < free:
-        return np.zeros(6)
+        return np.zeros(POSE), np.zeros(len(values))
     values, directions = values[known], directions[:, known]
     free -= len(values)
-    step = (products[fitted, -1] - across.T @ products[:6, -1]) @ directions / values
+    step = (products[fitted, -1] - across.T @ products[:POSE, -1]) @ directions / values
     gain = step**2 * values
-    rest = products[-1, -1] - float(products[-1, :6] @ pose @ products[:6, -1]) - float(gain.sum())
+    rest = products[-1, -1] - float(products[-1, :POSE] @ pose @ products[:POSE, -1]) - float(gain.sum())
     significant = fdtrc(1, free, gain * free / max(rest, 1e-300)) < EXCEEDED / len(values)
-    return np.asarray(across @ directions @ np.where(significant, step, 0.0))
+    step = directions @ np.where(significant, step, 0.0)
+    return np.asarray(across @ step), step

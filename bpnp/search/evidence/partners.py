@@ -1,0 +1,170 @@
+"""Which scene points may be the partners of image points under a pose, and whether another focal length explains the
+image points better than the given one."""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.point_sets import PointSets, faces
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+FARTHEST = 4.0  # scales from an image point within which scene points may be its partner
+FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
+DENSE = 4096  # possible matches up to which all distances are computed
+OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
+# Of the search for another focal length.
+ZOOMS = (1.0, 0.8, 1.25)  # to start from, over the given one
+ZOOMED = 256  # image points
+FEW_PARTNERS = 2  # scene points that may be the partner of each
+WIDTHS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # of the residuals, in scales of the pose, one after the other
+STEPS = 2  # at each width
+CHECKED = 4.0  # width at which a way is left along which the points fit worse than they did
+MOST_ZOOM, SAME_ZOOM = 0.2, 0.01  # step of the logarithm, at most; change that is none
+BLOCKS = 8  # of the image, along a side
+MOST_NATS = 2.0  # that a block says
+CHANCE = 1e-3  # of a better fit
+
+
+def facing(sets: PointSets, camera: Array, rotation: Array) -> Labels:
+    """Places of the scene points (n, 3), in the camera's frame, that it may see."""
+    used = np.einsum("ki,ki->k", camera, camera) > 0
+    if sets.normals3d is not None:
+        used &= faces(sets.normals3d, sets.cosines3d, camera, rotation)
+    return np.flatnonzero(used)
+
+
+def across(seen: Array) -> Array:
+    """Projections (k, 3, 3) to the planes that directions (k, 3) are perpendicular to."""
+    return np.asarray(np.eye(3) - seen[:, :, None] * seen[:, None, :])
+
+
+def partners(
+    sets: PointSets, seen: Array, places: Labels, chosen: Labels, scale: float, most: int = NEIGHBOURS
+) -> tuple[Any, Any, Array, Array]:
+    """Possible matches (k,) of a chosen image point and a scene point near it, and the density (k,) of each; and the
+    density (m,) of the image points, with that of having no partner.
+
+    seen: (n, 3) directions of the scene points at `places`. Points of different labels are no match. most: neighbours
+    of an image point that are looked up.
+    """
+    bearings, reach = sets.bearings[chosen], FARTHEST * scale
+    if len(bearings) * len(seen) <= DENSE:
+        squared = ((bearings[:, None] - seen) ** 2).sum(-1)
+        i, j = np.nonzero(squared < reach**2)
+        squared = squared[i, j]
+    else:
+        tree, counts = cKDTree(seen), range(1, min(most, len(seen)) + 1)
+        for count in (counts[:FEW_NEIGHBOURS][-1], counts[-1]):  # few are enough unless all of them are near
+            distance, nearest = tree.query(bearings, counts[:count], distance_upper_bound=reach)
+            if count == len(counts) or not np.isfinite(distance[:, -1]).any():
+                break
+        i, nth = np.nonzero(np.isfinite(distance))
+        j, squared = nearest[i, nth].astype(np.int64), distance[i, nth] ** 2
+    candidates = np.full(len(bearings), len(seen))
+    if sets.labels2d is not None and sets.labels3d is not None:
+        label, others = sets.labels2d[chosen], sets.labels3d[places]
+        agree = (label[i] == others[j]) | (label[i] < 0) | (others[j] < 0)
+        i, j, squared = i[agree], j[agree], squared[agree]
+        of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
+        candidates = np.where(label < 0, len(seen), of_label[label + 1] + of_label[0])
+    density = np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
+    every = np.bincount(i, density, len(bearings)) + OUTLIERS / sets.image.solid_angle
+    return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
+
+
+class Zoomed(NamedTuple):
+    """A pose with a focal length, `zoom` over the given one, that some image points are compared with.
+
+    density: (k,) of these. products: (7, 7), gradient: (7,) of a Gauss-Newton step of turn, shift and log zoom.
+    """
+
+    rotation: Array
+    middle: Array
+    zoom: float
+    density: Array
+    products: Array
+    gradient: Array
+
+
+def _zoomed(
+    sets: PointSets, chosen: Labels, scale: float, rotation: Array, middle: Array, zoom: float
+) -> Zoomed | None:
+    """middle: (3,) of the scene, seen from the camera. None without a match."""
+    turned = (sets.points3d - sets.middle) @ rotation.T
+    places = facing(sets, turned + middle, rotation)
+    turned, stretch = turned[places], np.array([zoom, zoom, 1.0])
+    seen = (turned + middle) * stretch
+    length = np.sqrt(np.einsum("ki,ki->k", seen, seen))
+    seen /= length[:, None]
+    i, j, density, every = partners(sets, seen, places, chosen, scale, FEW_PARTNERS)
+    if not len(i):
+        return None
+    probability = density / every[i]
+    weights = np.bincount(j, probability, len(seen))
+    used = np.flatnonzero(weights)
+    seen_as = np.stack([np.bincount(j, probability * axis, len(seen)) for axis in sets.bearings[chosen[i]].T], -1)
+    p, u, weights = turned[used], seen[used], weights[used]
+    by_shift = across(u) * (stretch / length[used, None, None])
+    by_zoom = by_shift[:, :, :2] @ (p + middle)[:, :2, None]
+    jacobian = np.concatenate([np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift, by_zoom], -1)
+    products = np.tensordot(jacobian * weights[:, None, None], jacobian, ((0, 1), (0, 1)))
+    gradient = np.tensordot(jacobian, seen_as[used] - weights[:, None] * u, ((0, 1), (0, 1)))
+    return Zoomed(rotation, middle, zoom, every, products, gradient)
+
+
+def at_other_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:
+    """A pose and a focal length that explain the image points significantly better, None if none is met.
+
+    middle: (3,) of the scene, seen from the camera. Gauss-Newton steps of both, from the pose itself, and from other
+    focal lengths with the scene at the distance where it is seen as large, with wide scales first; a way along which
+    the points fit worse than they did is left.
+    Significant is a ratio of likelihoods of 1000, in which neighbouring image points, whose places in the scene may be
+    wrong together, are one observation: the logarithm is summed up over means in blocks, of at most `MOST_NATS` each.
+    """
+    count = len(sets.image.chosen)
+    chosen = sets.image.chosen[np.linspace(0, count - 1, min(count, ZOOMED)).astype(np.int64)]
+    blocks = _blocks(sets.bearings[chosen] @ sets.image.axes)
+    size, pose = np.bincount(blocks), (rotation, middle)
+    here, wide = (_zoomed(sets, chosen, width * scale, *pose, 1.0) for width in (1.0, CHECKED))
+    if here is None or wide is None:
+        return None
+    best, gained = None, -math.log(CHANCE)
+    for zoom in ZOOMS:
+        step = _zoomed(sets, chosen, WIDTHS[0] * scale, rotation, middle * (1, 1, zoom), zoom)
+        for width in WIDTHS if zoom != 1 else WIDTHS[WIDTHS.index(1.0) :]:
+            for _ in range(STEPS):
+                step = None if step is None else _stepped(sets, chosen, width * scale, step)
+            if step is None or (width == CHECKED and np.log(step.density / wide.density).sum() < 0):
+                break
+            if width <= 1:
+                if abs(math.log(step.zoom)) < SAME_ZOOM:
+                    break
+                gain = np.bincount(blocks, np.log(step.density / here.density)) / size
+                total = float(np.clip(gain, -MOST_NATS, MOST_NATS).sum())
+                if total > gained:
+                    best, gained = step, total
+    return best
+
+
+def _stepped(sets: PointSets, chosen: Labels, scale: float, at: Zoomed) -> Zoomed | None:
+    """After a Gauss-Newton step of pose and focal length, with the matches of some scale."""
+    damped = at.products + np.diag(1e-6 * np.diag(at.products) + 1e-15)
+    step = np.linalg.solve(damped, at.gradient)
+    turn = Rotation.from_rotvec(step[:3]).as_matrix()
+    zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))
+    return _zoomed(sets, chosen, scale, turn @ at.rotation, at.middle + step[3:6], zoom)
+
+
+def _blocks(places: Array) -> Labels:
+    """The block of each place (m, 2) in the image: in strips, and along them, of equal counts."""
+    count = min(BLOCKS, max(1, math.isqrt(len(places))))
+    blocks = np.empty(len(places), np.int64)
+    for number, strip in enumerate(np.array_split(np.argsort(places[:, 0], kind="stable"), count)):
+        for place, block in enumerate(np.array_split(strip[np.argsort(places[strip, 1], kind="stable")], count)):
+            blocks[block] = number * count + place
+    return blocks
