@@ -11,7 +11,7 @@ import numpy as np
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import run_batch
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.search import is_crowd, is_few, search_few
+from bpnp.search.enumeration.search import is_crowd, is_few, search_few
 from bpnp.search.looks.nearby import cooled, drawn_around, is_near, nearby_batch
 from bpnp.search.looks.sequence import Proposals, beside_best, from_looks, proposed
 from bpnp.search.point_sets import PointSets
@@ -43,7 +43,7 @@ def search_poses(
     p(f_i) = (1 - w)/n sum_j exp((f_i . g(R p_j + t) - 1)/s^2) / 2 pi s^2 + w/A, g(y) = y/|y|, over pose and scale s,
     A the solid angle of the view, by annealing s from starts over all rotations, or around `sets.prior`.
 
-    Few points (`bpnp.search.few`) are enumerated first, and annealed only if that leaves a doubt.
+    Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if that leaves a doubt.
 
     around: a guess from the same points, such as a network's pose: the first `settings.around` batches start there, and
         that they end alike is no evidence. proposals: gives poses to start from, such as those that a network finds

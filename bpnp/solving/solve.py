@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from bpnp.search.few.search import is_few
+from bpnp.search.enumeration.search import is_few
 from bpnp.solving.arguments import Prior, checked_prior, device_from, each_camera, each_of, each_set, source_from
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Solution

@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from bpnp.loops.parallel import Deadline
-from bpnp.search.few.search import is_crowd
+from bpnp.search.enumeration.search import is_crowd
 from bpnp.search.many import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult

@@ -5,10 +5,10 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.few.arrays import ImageArrays, scene_arrays
-from bpnp.search.few.poses import SETTINGS
-from bpnp.search.few.priors import knowledge_of
-from bpnp.search.few.state import Enumeration
+from bpnp.search.enumeration.hypotheses import Enumeration
+from bpnp.search.enumeration.points import ImageSide, scene_side
+from bpnp.search.enumeration.priors import prior_arrays
+from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 from bpnp.solving.matches import fit_pose
 
@@ -27,17 +27,16 @@ def test_a_wrong_match_that_holds_the_pose_is_exchanged() -> None:
         rays = directions(directions(points @ rotation.T + translation) + 3e-4 * rng.standard_normal((7, 3)))
         decoy = points[:1] + [*rng.uniform(-0.15, 0.15, 2), 0]
         sets = PointSets(rays, np.concatenate([points, decoy]))
-        scene = scene_arrays(sets.points3d, None, None)
-        image = ImageArrays(rays, 6e-3, None, 2.0)
-        run = Enumeration(scene, image, knowledge_of(sets, scene, image), SETTINGS.kept, 2.0)
+        scene, image = scene_side(sets.points3d, None, None), ImageSide(rays, 6e-3, None, 2.0)
+        run = Enumeration(scene, image, prior_arrays(sets, scene, image, DEFAULT), 3, 2.0, DEFAULT)
         taken = np.concatenate([decoy, points[1:]])
         held = fit_pose(
             lambda r, t, taken=taken: directions(taken @ r.T + t), rays, rotation, translation, scale=1e-3
         )  # fmt: skip
         run.refine(run.enter(*held), 1.0)
-        if degrees_between(run.best_pose()[0], rotation) > 2:
+        if degrees_between(run.leave(run.best_pose[None])[0][0], rotation) > 2:
             wrong += 1
             run.vary_best()
-            mended += degrees_between(run.best_pose()[0], rotation) < 1.5
+            mended += degrees_between(run.leave(run.best_pose[None])[0][0], rotation) < 1.5
     assert wrong > 25
     assert mended > 0.8 * wrong

@@ -3,7 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
-from bpnp.search.few.symmetries import near_symmetries
+from bpnp.search.enumeration.symmetries import near_symmetries
 
 CAMERA = np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]])
 

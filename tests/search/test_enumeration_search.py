@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.search import search_few
+from bpnp.search.enumeration.search import search_few
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT

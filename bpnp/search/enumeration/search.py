@@ -9,24 +9,20 @@ from numpy.typing import NDArray
 
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
-from bpnp.search.few.priors import predicted_pose
+from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses, margin
+from bpnp.search.enumeration.priors import predicted_pose
+from bpnp.search.enumeration.settings import DEFAULT, EnumerationSettings
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.verdict import is_certain, weighed
 
 Array = NDArray[np.float64]
-FEW_PAIRS = 4000  # pairs of an image point and a scene point up to which near triples are enumerated: 60 x 60
-KNOWN_PAIRS = 250_000  # the same where a prior lets two pairs fix a pose
-FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels where that is a tenth of one
-RADIUS = 3e-3  # radians, where no scale is known
-NEAR_NATS = 25.0  # of evidence: a pose that has so much less than the best is no rival
 
 
-def is_few(sets: PointSets) -> bool:
+def is_few(sets: PointSets, rule: EnumerationSettings = DEFAULT) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
-    pairs = len(sets.bearings) * len(sets.points3d)
-    return pairs <= (FEW_PAIRS if sets.pairs_that_fix == 3 else KNOWN_PAIRS)
+    products = len(sets.bearings) * len(sets.points3d)
+    return products <= (rule.most_products if sets.pairs_that_fix == 3 else rule.most_products_known)
 
 
 def is_crowd(sets: PointSets) -> bool:
@@ -49,54 +45,60 @@ class Enumerated(NamedTuple):
     interrupted: bool
 
 
-def search_few(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> Enumerated:
+def search_few(
+    sets: PointSets, deadline: Deadline, settings: SearchSettings, rule: EnumerationSettings = DEFAULT
+) -> Enumerated:
     """Enumerate the poses of few points.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
     """
-
     certain: Candidates | None = None
     annotated = sets
     if sets.cosines3d is not None:
         sets = replace(sets, normals3d=None, cosines3d=None)
 
-    def is_safe(found: FewPoses) -> bool:
+    def is_safe(poses: EnumeratedPoses) -> bool:
         nonlocal certain
-        candidates = weighed(_candidates(found, annotated, settings), sets, settings.evidence)
+        candidates = weighed(_candidates(poses, annotated, settings, rule), sets, settings.evidence)
         certain = candidates if is_certain(candidates, sets, settings.evidence, exhaustive=True) else None
         return certain is not None
 
-    def ended(candidates: Candidates, found: FewPoses, solved: int) -> Enumerated:
-        exhausted, safe = found.exhausted, certain is not None
-        return Enumerated(candidates, solved, exhausted, safe, not (exhausted or safe) and deadline.passed())
+    def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
+        radius = rule.radius if sets.floor is None else rule.floors * sets.floor
+        poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
+        return poses, _candidates(poses, annotated, settings, rule) if certain is None else certain
 
-    radius = RADIUS if sets.floor is None else FLOORS * sets.floor
+    def ended(candidates: Candidates, poses: EnumeratedPoses, solved: int) -> Enumerated:
+        exhausted, interrupted = (certain is None and poses.ended == end for end in ("exhausted", "interrupted"))
+        return Enumerated(candidates, solved, exhausted, certain is not None, interrupted)
+
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
-    chosen = SETTINGS._replace(stages=()) if near else SETTINGS
-    found = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=chosen)
-    candidates = _candidates(found, annotated, settings) if certain is None else certain
-    if certain is not None or not tracked or not (near or margin(found) < 0):
-        return ended(candidates, found, found.solved)
-    free = enumerate_poses(replace(sets, prior=None), radius=radius, deadline=deadline.at, is_safe=is_safe)
-    candidates = Candidates.concatenated([candidates, _candidates(free, annotated, settings)])
+    poses, candidates = enumerated(sets, replace(rule, stages=()) if near else rule)
+    if certain is not None or not tracked or not (near or margin(poses, rule) < 0):
+        return ended(candidates, poses, poses.solved)
+    free, others = enumerated(replace(sets, prior=None), rule)
+    candidates = Candidates.concatenated([candidates, others])
     order = np.argsort(-candidates.score, kind="stable")[: settings.kept]
-    return ended(candidates[order], free, found.solved + free.solved)
+    return ended(candidates[order], free, poses.solved + free.solved)
 
 
-def _candidates(found: FewPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
+def _candidates(
+    poses: EnumeratedPoses, sets: PointSets, settings: SearchSettings, rule: EnumerationSettings
+) -> Candidates:
     """The poses that are not far less likely than the best one; scale and likelihood as the annealing defines them."""
-    rivals = found.evidence >= (found.evidence.max() if len(found.evidence) else 0.0) - NEAR_NATS
+    rivals = poses.evidence >= (poses.evidence.max() if len(poses.evidence) else 0.0) - rule.near_nats
     rivals &= np.arange(len(rivals)) < settings.kept
-    rotation, translation, residual = (x[rivals] for x in (found.rotation, found.translation, found.residual))
-    count = np.isfinite(residual).sum(-1)
-    free = np.maximum(2 * count - 2 * found.used, 1)  # numbers that were measured, less those that were fitted
-    scale = np.sqrt(np.where(np.isfinite(residual), residual, 0.0) ** 2 @ np.ones(len(sets.bearings)) / free)
+    rotation, translation, residual = (x[rivals] for x in (poses.rotation, poses.translation, poses.residual))
+    matched = np.isfinite(residual)
+    count = matched.sum(-1)
+    free = np.maximum(2 * count - 2 * poses.fixing, 1)  # numbers that were measured, less those that were fitted
+    scale = np.sqrt((np.where(matched, residual, 0.0) ** 2).sum(-1) / free)
     scale = np.maximum(scale, sets.floor or 1e-5)
     score = _log_likelihood(sets, rotation, translation, scale, settings)
-    matched = count / min(len(sets.bearings), len(sets.points3d))
-    return replace(Candidates.unscored(rotation, translation), score=score, matched=matched, scale=scale)
+    share = count / min(len(sets.bearings), len(sets.points3d))
+    return replace(Candidates.unscored(rotation, translation), score=score, matched=share, scale=scale)
 
 
 def _log_likelihood(

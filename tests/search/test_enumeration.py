@@ -1,6 +1,7 @@
 import itertools
 import math
 import time
+import tracemalloc
 from collections.abc import Callable
 from typing import Any
 
@@ -11,11 +12,13 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.robust.p3p import p3p
-from bpnp.search.few.p3p import p3p_depths
-from bpnp.search.few.poses import SETTINGS, FewPoses, enumerate_poses, margin
-from bpnp.search.few.priors import p2p_turned, p2p_upright
-from bpnp.search.few.triangles import orders_of_triples, pose_of_triangle, triangle_table
+from bpnp.robust.p3p import p3p as batched_p3p
+from bpnp.search.enumeration.hypotheses import Enumeration
+from bpnp.search.enumeration.p3p import chords_between, p3p
+from bpnp.search.enumeration.points import ImageSide, nearest_of, scene_side, sets_within, triangles_of
+from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses, margin
+from bpnp.search.enumeration.priors import p2p, prior_arrays
+from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -38,7 +41,9 @@ def planted(
     return directions(np.concatenate([rays, lights]))[order], points, rotation, translation, match
 
 
-def solved(rays: Array, points: Array, *, is_safe: Any = None, deadline: float = math.inf, **known: Any) -> FewPoses:
+def solved(
+    rays: Array, points: Array, *, is_safe: Any = None, deadline: float = math.inf, **known: Any
+) -> EnumeratedPoses:
     sets = PointSets(rays, points, **known)
     return enumerate_poses(sets, radius=RADIUS, is_safe=is_safe, deadline=deadline)
 
@@ -48,17 +53,13 @@ def compiled_p3p(entry: Any) -> Callable[[Array, Array], list[Array]]:
     """Poses (12,) of one triple."""
 
     def solve(rays: Array, points: Array) -> list[Array]:
-        orders, chords, _ = orders_of_triples(rays, np.array([[0, 1, 2]]))
-        triples, sides, frames, middles, _ = triangle_table(points, np.empty((0, 3)), orders[:1])
-        if not len(triples):
+        triangles = triangles_of(points, np.empty((0, 3)), np.array([[0, 1, 2]]))
+        if not len(triangles.triples):
             return []
-        (turn,) = np.flatnonzero((orders == triples[0]).all(1))
-        depths, poses = np.empty((4, 3)), []
-        for s in range(entry(p3p_depths)(*chords[turn], sides[0, 0], sides[0, 1], depths)):
-            pose, axes = np.empty(12), np.empty((3, 3))
-            entry(pose_of_triangle)(rays, *triples[0], depths[s], sides[0, 2], frames[0], middles[0], axes, pose)
-            poses.append(pose)
-        return poses
+        seen, poses = tuple(triangles.triples[0]), np.empty((4, 4, 3))
+        chords = entry(chords_between)(rays, *seen)
+        count = entry(p3p)(rays, seen, chords, triangles, 0, np.empty((4, 3)), np.empty((3, 3)), poses)
+        return [pose.ravel() for pose in poses[:count]]
 
     return solve
 
@@ -69,7 +70,7 @@ def test_compiled_p3p_has_the_poses_of_the_batched_one(compiled_p3p: Any) -> Non
     for i in range(2000):
         rotation = Rotation.random(random_state=i).as_matrix()
         rays[i] = directions(points[i] @ rotation.T + [0.3, -0.2, 4])
-    batched = p3p(torch.tensor(rays), torch.tensor(points))
+    batched = batched_p3p(torch.tensor(rays), torch.tensor(points))
     different = 0
     for i in range(2000):
         found = compiled_p3p(rays[i], points[i])
@@ -143,7 +144,7 @@ def brute_force(rays: Array, points: Array, radius: float) -> int:
     """Most one-to-one matches of any pose that P3P gives for any three pairs."""
     triples = list(itertools.product(itertools.combinations(range(len(rays)), 3), itertools.permutations(range(5), 3)))
     rows, columns = (np.array(side) for side in zip(*triples, strict=True))
-    solution = p3p(torch.tensor(rays[rows]), torch.tensor(points[columns]))
+    solution = batched_p3p(torch.tensor(rays[rows]), torch.tensor(points[columns]))
     rotation, translation = solution.rotation[solution.valid].numpy(), solution.translation[solution.valid].numpy()
     seen = directions(points @ rotation.transpose(0, 2, 1) + translation[:, None])
     near = np.linalg.norm(rays[:, None] - seen[:, None], axis=-1) < radius
@@ -156,7 +157,7 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     rng = np.random.default_rng(seed)
     rays, points, rotation, _, _ = planted(rng, 5, background=1, noise=0.0)
     poses = solved(rays, points, is_safe=lambda _: False)
-    assert poses.exhausted
+    assert poses.ended == "exhausted"
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
     assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
@@ -213,38 +214,69 @@ def unit(rng: np.random.Generator) -> Array:
     return directions(rng.standard_normal(3))
 
 
-def test_two_pairs_and_the_vertical_give_the_pose(entry: Any) -> None:
+@pytest.mark.parametrize("kind", ["gravity", "rotation"])
+def test_two_matches_and_a_direction_give_the_pose(entry: Any, kind: str) -> None:
     rng = np.random.default_rng(11)
-    for _ in range(200):
-        angle, translation = rng.uniform(-math.pi, math.pi), rng.uniform(-2, 2, 3)
-        rotation = Rotation.from_rotvec([0, 0, angle]).as_matrix()
-        points = rng.uniform(-1, 1, (2, 3)) + [0, 4, 0] @ rotation
-        camera = points @ rotation.T + translation
-        poses = np.empty((2, 12))
-        count = entry(p2p_upright)(*directions(camera), *points, poses)
-        planted_pose = np.concatenate([rotation.ravel(), translation])
-        assert min(np.abs(pose - planted_pose).max() for pose in poses[:count]) < 1e-6
-        for pose in poses[:count]:
-            seen = points @ pose[:9].reshape(3, 3).T + pose[9:]
-            np.testing.assert_allclose(directions(seen), directions(camera), atol=1e-7)
+    for _ in range(100):
+        rays, points, rotation, translation, match = planted(rng, 5, noise=0.0)
+        up = unit(rng)
+        prior = GravityPrior(rotation @ up, up, 1.0) if kind == "gravity" else PosePrior(rotation, None, 1.0)
+        sets = PointSets(rays, points, prior=prior)
+        scene, image = scene_side(points, None, None), ImageSide(rays, RADIUS, None, 2.0)
+        run = Enumeration(scene, image, prior_arrays(sets, scene, image, DEFAULT), 2, 2.0, DEFAULT)
+        poses = np.empty((4, 4, 3))
+        count = entry(p2p)(0, 1, match[0], match[1], run.problem, poses)
+        assert 0 < count <= 2
+        rotations, translations = run.leave(poses[:count])
+        off = np.abs(rotations - rotation).max((1, 2)) + np.abs(translations - translation).max(1)
+        assert off.min() < 1e-6
+        for r, t in zip(rotations, translations, strict=True):
+            np.testing.assert_allclose(directions(points[match[:2]] @ r.T + t), rays[:2], atol=1e-7)
 
 
-def test_two_pairs_and_the_rotation_give_the_pose(entry: Any) -> None:
-    rng = np.random.default_rng(12)
-    for _ in range(200):
-        rotation, translation = Rotation.from_rotvec(3 * unit(rng)).as_matrix(), np.array([0.5, -0.3, 5.0])
-        points = rng.uniform(-1, 1, (2, 3))
-        rays, pose = directions(points @ rotation.T + translation), np.empty(12)
-        assert entry(p2p_turned)(*rays, *points, rotation.ravel(), 0.1, 1e-4, pose)
-        np.testing.assert_allclose(pose, np.concatenate([rotation.ravel(), translation]), atol=1e-6)
-        off = Rotation.from_rotvec(0.05 * unit(rng)).as_matrix() @ rotation
-        assert entry(p2p_turned)(*rays, *points, off.ravel(), 0.1, 1e-4, pose)
-        found = pose[:9].reshape(3, 3)
-        np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-9)
-        np.testing.assert_allclose(directions(points @ found.T + pose[9:]), rays, atol=1e-9)
-        way, normal = rotation @ (points[1] - points[0]), np.cross(*rays)
-        out_of_plane = Rotation.from_rotvec(0.5 * directions(np.cross(way, normal))).as_matrix()
-        assert not entry(p2p_turned)(*rays, *points, (out_of_plane @ rotation).ravel(), 0.1, 1e-4, pose)
+@pytest.mark.parametrize("size", [2, 3])
+@pytest.mark.parametrize("near", [2, 4, 11])
+def test_every_set_of_near_points_comes_once_and_wider_ones_later(size: int, near: int) -> None:
+    points = np.random.default_rng(1).normal(size=(12, 3))
+    nearest = nearest_of(points, np.empty((0, 3)))
+    sets = sets_within(nearest, near, size)
+    expected = {
+        frozenset({i, *others}) for i in range(12) for others in itertools.combinations(nearest[i, :near], size - 1)
+    }
+    assert len(sets) == len(expected)
+    assert {frozenset(members) for members in sets.tolist()} == expected
+    narrower = sets_within(nearest, near - 1, size)
+    np.testing.assert_array_equal(sets[: len(narrower)], narrower)
+
+
+def test_many_points_of_one_side_take_little_memory() -> None:
+    """Six lights and 40,000 points with gravity: the nearest of each, and no table of all with all."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (40_000, 3))
+    points[:50] = points[0]  # as many as are looked up lie in one place
+    tracemalloc.start()
+    nearest = nearest_of(points, np.empty((0, 3)))
+    sets = sets_within(nearest, 9, 2)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 400e6
+    assert (nearest != np.arange(len(points))[:, None]).all()
+    assert len(np.unique(np.sort(sets, 1), axis=0)) == len(sets)
+
+
+def test_hypotheses_are_the_same_however_a_sweep_is_interrupted() -> None:
+    rays, points, _, _, _ = planted(np.random.default_rng(2), 6, hidden=2, background=2)
+    sets, scene = PointSets(rays, points), scene_side(points, None, None)
+    image, runs = ImageSide(rays, RADIUS, None, 2.0), []
+    for budget in (7, 10**6):
+        run = Enumeration(scene, image, prior_arrays(sets, scene, image, DEFAULT), 3, 2.0, DEFAULT)
+        for stage in DEFAULT.stages[4:8]:
+            run.begin(stage)
+            while not run.ended:
+                run.sweep(budget, math.inf)
+        runs.append(run)
+    assert runs[0].solved == runs[1].solved
+    np.testing.assert_array_equal(runs[0].kept.poses, runs[1].kept.poses)
 
 
 @pytest.mark.parametrize("kind", ["gravity", "rotation", "pose"])
@@ -308,5 +340,5 @@ def test_the_deadline_ends_the_enumeration() -> None:
     rng = np.random.default_rng(10)
     rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (40, 2)), np.ones(40)]))
     poses = solved(rays, rng.standard_normal((60, 3)), deadline=time.monotonic())
-    assert not poses.exhausted
-    assert poses.solved < SETTINGS.most / 2
+    assert poses.ended == "interrupted"
+    assert poses.solved < DEFAULT.most / 2

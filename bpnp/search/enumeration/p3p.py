@@ -1,0 +1,234 @@
+"""Perspective-three-point for one triple at a time, compiled: the solver of `bpnp.robust.p3p` without a batch.
+
+The three pairs of points are 01, 12, 20. The caller puts the longest side of the scene's triangle between 1 and 2.
+A division by zero is infinite, as in C; every root is tested before it is used. Poses are (4, 3): R, and t below it.
+"""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from bpnp.loops.compilation import compiler
+from bpnp.search.enumeration.points import FLAT
+from bpnp.search.kernels.vectors import cross, rotated
+
+part = compiler(_nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
+TOLERANCE = 1e-6  # of the squared sides, in units of the longest
+ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
+
+
+@part
+def p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, depths: Any, axes: Any, poses: Any) -> int:
+    """Fill `poses` (4, 4, 3) with those under which triangle t is seen along three of the rays (m, 4); how many.
+
+    seen: the three places of the rays. chords: of `chords_between` these. depths: (4, 3), axes: (3, 3), overwritten.
+    """
+    i, j, k = seen
+    sides, frame, middle = triangles.sides[t], triangles.frames[t], triangles.middles[t]
+    count = 0
+    for s in range(p3p_depths(chords, sides[0], sides[1], depths)):
+        pose, d = poses[count], depths[s]
+        d0, d1, d2 = sides[2] * d[0], sides[2] * d[1], sides[2] * d[2]
+        x0, y0, z0 = d0 * rays[i, 0], d0 * rays[i, 1], d0 * rays[i, 2]
+        x1, y1, z1 = d1 * rays[j, 0], d1 * rays[j, 1], d1 * rays[j, 2]
+        x2, y2, z2 = d2 * rays[k, 0], d2 * rays[k, 1], d2 * rays[k, 2]
+        if not triangle_axes(x0 - x2, y0 - y2, z0 - z2, x1 - x2, y1 - y2, z1 - z2, axes):
+            continue
+        for r in range(3):
+            for c in range(3):
+                pose[r, c] = axes[0, r] * frame[0, c] + axes[1, r] * frame[1, c] + axes[2, r] * frame[2, c]
+        x, y, z = rotated(pose, middle[0], middle[1], middle[2])
+        pose[3, 0], pose[3, 1], pose[3, 2] = (x0 + x1 + x2) / 3 - x, (y0 + y1 + y2) / 3 - y, (z0 + z1 + z2) / 3 - z
+        count += 1
+    return count
+
+
+@part
+def chords_between(rays: Any, i: int, j: int, k: int) -> tuple[float, float, float]:
+    """|f_i - f_j|^2 of three unit rays, between the first and second, second and third, third and first."""
+    return _distance2(rays[i], rays[j]), _distance2(rays[j], rays[k]), _distance2(rays[k], rays[i])
+
+
+@part
+def _distance2(f: Any, g: Any) -> float:
+    x, y, z = f[0] - g[0], f[1] - g[1], f[2] - g[2]
+    return x * x + y * y + z * z
+
+
+@part
+def triangle_axes(bx: float, by: float, bz: float, ax: float, ay: float, az: float, axes: Any) -> bool:
+    """Orthonormal axes fixed to a triangle 012 with the sides b = 0 - 2 and a = 1 - 2, rows of `axes` (3, 3): along a,
+    its perpendicular, the normal. Returns False if the triangle is flat."""
+    length2 = ax * ax + ay * ay + az * az
+    if not length2 > 0:
+        return False
+    scale = 1 / math.sqrt(length2)
+    ax, ay, az = ax * scale, ay * scale, az * scale
+    nx, ny, nz = cross(ax, ay, az, bx, by, bz)
+    height2 = nx * nx + ny * ny + nz * nz
+    if not height2 > FLAT * length2:
+        return False
+    scale = 1 / math.sqrt(height2)
+    nx, ny, nz = nx * scale, ny * scale, nz * scale
+    axes[0, 0], axes[0, 1], axes[0, 2] = ax, ay, az
+    axes[1, 0], axes[1, 1], axes[1, 2] = cross(nx, ny, nz, ax, ay, az)
+    axes[2, 0], axes[2, 1], axes[2, 2] = nx, ny, nz
+    return True
+
+
+@part
+def p3p_depths(chords: Any, a: float, b: float, depths: Any) -> int:
+    """The depths d_i > 0 of three rays with |d_i f_i - d_j f_j| = |p_i - p_j|; how many solutions there are (0 to 4).
+
+    chords: of `chords_between` the rays. a, b: |p_0 - p_1|^2 and |p_2 - p_0|^2 over |p_1 - p_2|^2.
+    depths: (4, 3), written; in units of |p_1 - p_2|. With x = d_0/d_2 and y = d_1/d_2 the law of cosines gives two
+    conics; a root of det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at most
+    two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023).
+    """
+    m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
+    # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.
+    conics = (1.0, -m01, 0.0, 1 - a, a * m12, -a), (1.0, 0.0, -m20, -b, b * m12, 1 - b)
+    _, xy1, _, yy1, yw1, ww1 = conics[0]
+    _, _, xw2, yy2, yw2, ww2 = conics[1]
+    # Adjugates of both.
+    axx, axy, axw = yy1 * ww1 - yw1 * yw1, -xy1 * ww1, xy1 * yw1
+    ayy, ayw, aww = ww1, -yw1, yy1 - xy1 * xy1
+    bxx, bxy, bxw = yy2 * ww2 - yw2 * yw2, xw2 * yw2, -xw2 * yy2
+    byy, byw, bww = ww2 - xw2 * xw2, -yw2, yy2
+    constant = axx + axy * xy1
+    linear = axx + ayy * yy2 + aww * ww2 + 2 * (axw * xw2 + ayw * yw2)
+    quadratic = bxx + byy * yy1 + bww * ww1 + 2 * (bxy * xy1 + byw * yw1)
+    leading = bxx + bxw * xw2
+    # The larger determinant leads, so that no root runs to infinity.
+    if abs(constant) > abs(leading):
+        first, second = cubic_root(constant, linear, quadratic, leading), 1.0
+    elif leading != 0:
+        first, second = 1.0, cubic_root(leading, quadratic, linear, constant)
+    else:
+        return 0
+    xx, xy, xw = first + second, first * xy1, second * xw2
+    yy, yw, ww = first * yy1 + second * yy2, first * yw1 + second * yw2, first * ww1 + second * ww2
+    # The point p where the lines meet, from the adjugate, and D + [p]x, which has rank one.
+    pxx, pyy, pww = yw * yw - yy * ww, xw * xw - xx * ww, xy * xy - xx * yy
+    pxy, pxw, pyw = xy * ww - xw * yw, xw * yy - xy * yw, xx * yw - xy * xw
+    if pxx >= pyy and pxx >= pww:
+        px, py, pw, size = pxx, pxy, pxw, pxx
+    elif pyy >= pww:
+        px, py, pw, size = pxy, pyy, pyw, pyy
+    else:
+        px, py, pw, size = pxw, pyw, pww, pww
+    if not size > 0:
+        return 0
+    size = 1 / math.sqrt(size)
+    px, py, pw = px * size, py * size, pw * size
+    # Of D + [p]x, a row and a column through its largest entry are the two lines.
+    top, middle, bottom = (xx, xy - pw, xw + py), (xy + pw, yy, yw - px), (xw - py, yw + px, ww)
+    row = top if _size(top) >= _size(middle) and _size(top) >= _size(bottom) else bottom
+    row = middle if _size(middle) > _size(top) and _size(middle) >= _size(bottom) else row
+    left, centre, right = abs(row[0]), abs(row[1]), abs(row[2])
+    first_column = left >= centre and left >= right
+    column = (top[0], middle[0], bottom[0]) if first_column else (top[2], middle[2], bottom[2])
+    column = (top[1], middle[1], bottom[1]) if not first_column and centre >= right else column
+    count = np.int64(0)  # as a literal, `_meet` would be compiled for it
+    for line in (row, column):
+        count = _meet(line, conics, chords, a, b, depths, count)
+    return int(count)
+
+
+@part
+def _size(values: Any) -> float:
+    return max(abs(values[0]), abs(values[1]), abs(values[2]))
+
+
+@part
+def cubic_root(c0: float, c1: float, c2: float, c3: float) -> float:
+    """The real root of c_0 s^3 + c_1 s^2 + c_2 s + c_3 that lies farthest from the other two, so the best determined.
+
+    Cardano for t^3 - 3 p t - 2 q with s = t - c_1/3c_0, by the cosine where all roots are real; then Newton steps.
+    """
+    b, c, d = c1 / c0, c2 / c0, c3 / c0
+    p = b * b / 9 - c / 3
+    q = b * c / 6 - d / 2 - b * b * b / 27
+    size = abs(q)
+    discriminant = q * q - p * p * p
+    if discriminant > 0:
+        outer = (size + math.sqrt(discriminant)) ** (1 / 3)
+        root = outer + p / outer
+    else:
+        radius = math.sqrt(max(p, 0.0))
+        cube = radius * radius * radius
+        root = 2 * radius * math.cos(math.acos(min(size / cube, 1.0)) / 3) if cube > 0 else 0.0
+    root = math.copysign(root, q) - b / 3
+    for _ in range(2):
+        slope = (3 * root + 2 * b) * root + c
+        if slope != 0:
+            root -= (((root + b) * root + c) * root + d) / slope
+    return root
+
+
+@part
+def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, depths: Any, count: int) -> int:
+    """Append the depths of the points (x, y) where the line meets both conics."""
+    la, lb, lc = line
+    steep = abs(la) > abs(lb)
+    pivot = la if steep else lb
+    if pivot == 0:
+        return count
+    # The coordinate with the smaller coefficient is free: (x, y) = (slope u + offset, u) or (u, slope u + offset).
+    slope, offset = -(lb if steep else la) / pivot, -lc / pivot
+    # Both restrictions of the conics to the line have the same roots; the smaller one is less accurate.
+    q, h, k = _restricted(conics[0], steep, slope, offset)
+    other = _restricted(conics[1], steep, slope, offset)
+    if _size(other) > _size((q, h, k)):
+        q, h, k = other
+    discriminant = h * h - q * k
+    if not discriminant > -ROUNDING * (h * h + abs(q * k)):
+        return count
+    larger = -(h + math.copysign(math.sqrt(max(discriminant, 0.0)), h))
+    for root in range(2):
+        if (larger if root else q) == 0:
+            continue
+        u = k / larger if root else larger / q
+        v = slope * u + offset
+        x, y = (v, u) if steep else (u, v)
+        if not (x > 0 and y > 0 and x < math.inf and y < math.inf):
+            continue
+        d2 = 1 / math.sqrt((1 - y) * (1 - y) + y * chords[1])
+        if polished(x * d2, y * d2, d2, chords, a, b, depths[count]):
+            count += 1
+    return count
+
+
+@part
+def _restricted(conic: Any, steep: bool, slope: float, offset: float) -> tuple[float, float, float]:
+    """A conic on a line, as coefficients q, h, k of q u^2 + 2 h u + k."""
+    xx, xy, xw, yy, yw, ww = conic
+    if not steep:
+        xx, xw, yy, yw = yy, yw, xx, xw
+    inner = xx * slope + xy
+    return (inner + xy) * slope + yy, inner * offset + xw * slope + yw, (xx * offset + 2 * xw) * offset + ww
+
+
+@part
+def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, depths: Any) -> bool:
+    """Newton steps on the three equations, written to `depths` (3,); whether they hold there and all d_i > 0."""
+    (chord01, chord12, chord20), worst = chords, math.inf
+    for step in range(4):
+        e0 = (d0 - d1) * (d0 - d1) + d0 * d1 * chord01 - a
+        e1 = (d1 - d2) * (d1 - d2) + d1 * d2 * chord12 - 1
+        e2 = (d2 - d0) * (d2 - d0) + d2 * d0 * chord20 - b
+        error = max(abs(e0), abs(e1), abs(e2))
+        if not error < worst:
+            break
+        depths[0], depths[1], depths[2], worst = d0, d1, d2, error
+        if error < 1e-13 or step == 3:
+            break
+        # Row i of the Jacobian holds a_i at depth i and b_i at the next one; Cramer's rule, cyclic in i.
+        a0, a1, a2 = 2 * (d0 - d1) + d1 * chord01, 2 * (d1 - d2) + d2 * chord12, 2 * (d2 - d0) + d0 * chord20
+        b0, b1, b2 = 2 * (d1 - d0) + d0 * chord01, 2 * (d2 - d1) + d1 * chord12, 2 * (d0 - d2) + d2 * chord20
+        scale = 1 / (a0 * a1 * a2 + b0 * b1 * b2)
+        d0 -= scale * (a2 * (e0 * a1 - b0 * e1) + b0 * b1 * e2)
+        d1 -= scale * (a0 * (e1 * a2 - b1 * e2) + b1 * b2 * e0)
+        d2 -= scale * (a1 * (e2 * a0 - b2 * e0) + b2 * b0 * e1)
+    return bool(worst < TOLERANCE and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)

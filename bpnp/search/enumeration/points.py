@@ -1,0 +1,238 @@
+"""What the compiled loops read of both sides: a scene's points with tables of their triangles, and an image's points in
+a grid."""
+
+import functools
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.search.starts import turned_to
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
+OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
+CELLS = 48  # of the grid, a side
+SCENES = 8  # whose tables are remembered
+FLAT = 1e-12  # squared height of a triangle over its squared longest side
+SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
+EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
+
+
+class ScenePoints(NamedTuple):
+    """points: (n, 3) around their centre in units of their extent. normals: (n, 3), (0, 3) if every point can be seen.
+    labels: (n,), -1 fits any."""
+
+    points: Array
+    normals: Array
+    labels: Places
+
+
+class ImagePoints(NamedTuple):
+    """Bearings in a frame whose z axis is their mean, and in stereographic coordinates (x, y) / (|p| + z) about it.
+
+    A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis: `gain` turns differences near
+    an image point into units of its radius.
+    rays: (m, 4), unit vectors and one over the radius. flat: (m, 2). gain: (m,). labels: (m,), -1 fits any.
+    corner, starts, items: of `grid_of`.
+    """
+
+    rays: Array
+    flat: Array
+    gain: Array
+    labels: Places
+    corner: Array
+    starts: Places
+    items: Places
+
+
+class Triangles(NamedTuple):
+    """What P3P needs of scene triples that a camera can see.
+
+    triples: (t, 3), turned so that the longest side is 12. sides: (t, 3), |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and
+    s = |p_1 - p_2|. frames: (t, 3, 3) of `p3p.triangle_axes`. middles: (t, 3). orientation: (t,), 1 where a camera can
+    face all three points and see them in the order of their triangle's normal, 2 in the other order, 3 either.
+    """
+
+    triples: Places
+    sides: Array
+    frames: Array
+    middles: Array
+    orientation: Places
+
+
+class SceneSide:
+    """The scene of one problem, or of many: a device is seen in frame after frame. size: the extent that is the unit.
+
+    nearest: (n, k) each point's nearest.
+    """
+
+    def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
+        self.centre = points3d.mean(0)
+        local = points3d - self.centre
+        self.size = max(float(np.sqrt((local**2).sum(-1).mean())), 1e-300)
+        normals = np.empty((0, 3)) if normals3d is None else np.array(normals3d, np.float64, order="C")
+        labels = np.full(len(local), -1) if labels3d is None else np.array(labels3d, np.int64)
+        self.arrays = ScenePoints(np.ascontiguousarray(local / self.size), normals, labels)
+        self.nearest = nearest_of(self.arrays.points, normals)
+        self._triangles: dict[tuple[int, int], Triangles] = {}
+
+    def triangles(self, size: int, near: int) -> Triangles:
+        """Of a point and two, or one (`pairs`), of its `near` nearest; those of fewer are the first rows."""
+        near = min(near, self.nearest.shape[1])
+        if (size, near) not in self._triangles:
+            sets = sets_within(self.nearest, near, size)
+            self._triangles[size, near] = (
+                triangles_of(self.arrays.points, self.arrays.normals, sets) if size == 3 else pairs(sets)
+            )
+        return self._triangles[size, near]
+
+    def has_triangles(self, size: int, near: int) -> bool:
+        """Whether they are there already."""
+        return (size, min(near, self.nearest.shape[1])) in self._triangles
+
+
+class ImageSide:
+    """The image of one problem.
+
+    turn: R, f in the frame of the arrays = R f. density: the chance that one scene point falls within one radius of a
+    given image point, if it may be anywhere among them. nearest: (m, k) each point's nearest.
+    """
+
+    def __init__(self, bearings: Array, radius: float | Array, labels2d: Places | None, reach: float) -> None:
+        self.turn = turned_to(bearings.mean(0))
+        rays = bearings @ self.turn.T
+        inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
+        flat = np.ascontiguousarray(rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9))
+        gain = np.ascontiguousarray((1 + rays[:, 2]) * inverse)
+        labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
+        rays = np.ascontiguousarray(np.column_stack([rays, inverse]))
+        self.arrays = ImagePoints(rays, flat, gain, labels, *grid_of(flat, gain, reach))
+        self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
+
+    @functools.cached_property
+    def nearest(self) -> Places:
+        return nearest_of(self.arrays.rays[:, :3], np.empty((0, 3)))
+
+
+def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None) -> SceneSide:
+    """The scene; the last few are remembered."""
+    return _remembered(
+        *(None if x is None else np.ascontiguousarray(x).tobytes() for x in (points3d, normals3d, labels3d))
+    )
+
+
+@functools.lru_cache(maxsize=SCENES)
+def _remembered(points3d: bytes, normals3d: bytes | None, labels3d: bytes | None) -> SceneSide:
+    return SceneSide(
+        np.frombuffer(points3d).reshape(-1, 3),
+        None if normals3d is None else np.frombuffer(normals3d).reshape(-1, 3),
+        None if labels3d is None else np.frombuffer(labels3d, np.int64),
+    )
+
+
+def nearest_of(points: Array, normals: Array) -> Places:
+    """Each point's nearest (n, k), itself not among them. normals: (n, 3) or (0, 3).
+
+    Points whose normals no camera can face at once come last.
+    """
+    n = len(points)
+    if n > DENSE:
+        order = cKDTree(points).query(points, DENSE)[1]
+        itself_last = np.argsort(order == np.arange(n)[:, None], axis=1, kind="stable")
+        order = np.take_along_axis(order, itself_last, 1)[:, :-1]
+    else:
+        distance2 = ((points[:, None] - points[None]) ** 2).sum(-1)
+        if len(normals):
+            distance2 += np.where(normals @ normals.T < OPPOSITE, 1e6 * (distance2.max() + 1e-300), 0.0)
+        np.fill_diagonal(distance2, np.inf)
+        order = np.argsort(distance2, axis=1, kind="stable")[:, :-1]
+    return np.ascontiguousarray(order, np.int64)
+
+
+def sets_within(nearest: Places, near: int, size: int) -> Places:
+    """Sets (t, size) of a point and one or two of its `near` nearest, each set once, nearest in rank first.
+
+    >>> sets_within(np.array([[1, 2], [0, 2], [1, 0]]), 2, 2).tolist()
+    [[0, 1], [2, 1], [0, 2]]
+    """
+    n, near = len(nearest), min(near, nearest.shape[1])
+    ranks = np.arange(near)[None] if size == 2 else np.array(np.tril_indices(near, -1))[::-1]
+    members = [np.broadcast_to(np.arange(n), (ranks.shape[1], n)), *nearest.T[ranks]]
+    sets = np.stack(members, -1).reshape(-1, size)
+    key = np.sort(sets, 1) @ n ** np.arange(size)
+    return np.ascontiguousarray(sets[np.sort(np.unique(key, return_index=True)[1])])
+
+
+def triangles_of(points: Array, normals: Array, triples: Places) -> Triangles:
+    """The triangles of scene triples (t, 3) of points (n, 3). normals: (n, 3) or (0, 3)."""
+    p = points[triples]
+    opposite = ((np.roll(p, -1, 1) - np.roll(p, -2, 1)) ** 2).sum(-1)
+    turn = (opposite.argmax(1)[:, None] + np.arange(3)) % 3
+    triples, p = np.take_along_axis(triples, turn, 1), np.take_along_axis(p, turn[..., None], 1)
+    length2 = np.maximum(opposite.max(1), 1e-300)
+    along = (p[:, 1] - p[:, 2]) / np.sqrt(length2)[:, None]
+    normal = np.cross(along, p[:, 0] - p[:, 2])
+    height2 = (normal**2).sum(-1)
+    normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
+    frames = np.stack([along, np.cross(normal, along), normal], 1)
+    a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
+    orientation: Places = np.full(len(triples), 3)
+    if len(normals):
+        facing = (normals @ DIRECTIONS.T > SLACK)[triples].all(1)
+        above = normal @ DIRECTIONS.T
+        orientation = np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
+    seen = (height2 > FLAT * length2) & (orientation > 0)
+    tables = triples, np.stack([a, b, np.sqrt(length2)], -1), frames, p.mean(1), orientation
+    return Triangles(*(np.ascontiguousarray(table[seen]) for table in tables))
+
+
+def pairs(sets: Places) -> Triangles:
+    """Two points (t, 2) instead of a triangle: the second one stands for the third too."""
+    everything = np.full(len(sets), 3)
+    return Triangles(
+        np.ascontiguousarray(sets[:, [0, 1, 1]]), np.empty((0, 3)), np.empty((0, 3, 3)), np.empty((0, 3)), everything
+    )
+
+
+def sphere(count: int) -> Array:
+    """Unit vectors (count, 3) spread evenly: the golden spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = math.pi * (3 - math.sqrt(5)) * np.arange(count)
+    radius = np.sqrt(1 - z * z)
+    return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], -1)
+
+
+DIRECTIONS = sphere(192)
+
+
+def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, Places, Places]:
+    """Cells of the plane with the image points (m, 2) that lie within `reach` radii of each.
+
+    Returns the lower corner and cells a unit (3,); where the items of a cell begin (CELLS^2 + 1,), cells along the
+    second coordinate next to each other; and the items.
+    """
+    around = reach / gain[:, None]
+    low, high = (flat - around).min(0), (flat + around).max(0)
+    per_cell = CELLS / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
+    first, last = (
+        np.clip(((flat + side * around - low) * per_cell).astype(np.int64), 0, CELLS - 1) for side in (-1, 1)
+    )
+    size = last - first + 1
+    count = size.prod(1)
+    item = np.repeat(np.arange(len(flat)), count)
+    nth = np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
+    row, column = first[item].T + np.stack(np.divmod(nth, size[item, 1]))
+    cell = row * CELLS + column
+    order = np.argsort(cell, kind="stable")
+    return np.append(low, per_cell), np.searchsorted(cell[order], np.arange(CELLS**2 + 1)), item[order]
+
+
+def _area(flat: Array, radius: float) -> float:
+    """Area of the rectangle along the principal axes of the points that holds them, no side below two radii."""
+    centred = flat - flat.mean(0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    return float((np.ptp(centred @ axes, axis=0) + 2 * radius).prod())
