@@ -9,22 +9,23 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import angle_between, camera_centre
-from bpnp.models.baselines.branch_and_bound.boxes import (
+from bpnp.models.baselines.branch_and_bound import (
     Boxes,
     distance_range,
     rotation_uncertainty,
     split,
     translation_uncertainty,
 )
-from bpnp.models.baselines.branch_and_bound.gopac import best_rotation, count_inliers, maximise_inliers
-from bpnp.models.baselines.branch_and_bound.gosma import align_mixtures, polish
-from bpnp.models.baselines.branch_and_bound.mixtures import (
+from bpnp.models.baselines.gopac import best_rotation, count_inliers, maximise_inliers
+from bpnp.models.baselines.gosma import (
     RayMixture,
     SceneMixture,
+    align_mixtures,
     distance,
     log_z,
     lower_bound,
     overlap,
+    polish,
     ray_mixture,
     scene_mixture,
     squared_norm,

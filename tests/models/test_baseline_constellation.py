@@ -9,7 +9,7 @@ from bpnp import Batch
 from bpnp.geometry import project, random_rotations, transform
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import Constellation
-from bpnp.models.baselines.constellation import neighbour_triples
+from bpnp.models.baselines.blind_p3p import neighbour_triples
 
 
 def ring(seed: int, *, seen: int = 9, lights: int = 2, noise: float = 0.0004) -> Batch:

@@ -13,13 +13,13 @@ from scipy.optimize import linear_sum_assignment
 from bpnp import Batch, BPnPNet
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Constellation, Hungarian, RandomRansac, SoftPOSIT
+from bpnp.models.baselines.blind_p3p import probability_of_true_triple
 from bpnp.models.baselines.hungarian import hungarian
-from bpnp.models.baselines.random_ransac import probability_of_true_triple
-from bpnp.models.baselines.single_pairs import PairSolver, agreement
+from bpnp.models.baselines.single_problem import SingleSolver, agreement
 from bpnp.models.baselines.softposit import slack_scalings, softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 
-QUICK: dict[str, PairSolver] = {
+QUICK: dict[str, SingleSolver] = {
     "softposit": SoftPOSIT(max_steps=25, time_limit=None),
     "random_ransac": RandomRansac(max_hypotheses=512, time_limit=None),
     "gosma": GOSMA(max_boxes=400, batch=64, time_limit=None),
@@ -178,7 +178,7 @@ def test_agreement_counts_as_a_loop_would() -> None:
         close = torch.cdist(problem.points2d[0], camera[:, :2] / camera[:, 2:]) < 0.02
         assert int(counts.partnered2d[i]) == int(close.any(1).sum())
         assert int(counts.partnered3d[i]) == int(close.any(0).sum())
-    assert int(counts.pairs[0]) >= 15
+    assert int(counts.matches[0]) >= 15
 
 
 def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:
@@ -224,4 +224,4 @@ def test_every_recipe_names_a_solver_and_its_settings(path: Path) -> None:
         with pytest.raises((ValueError, OSError), match="checkpoint"):
             method.build()
     else:
-        assert isinstance(method.build(), PairSolver)
+        assert isinstance(method.build(), SingleSolver)

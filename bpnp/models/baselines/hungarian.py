@@ -12,9 +12,9 @@ from bpnp.types import Batch, Prediction
 
 
 class Hungarian(nn.Module):
-    """min(m, n) one-to-one pairs of least total feature distance, RANSAC on all of them, the weighted PnP layer.
+    """min(m, n) one-to-one matches of least total feature distance, RANSAC on all of them, the weighted PnP layer.
 
-    A variant for evaluation: the assignment has no gradient. All its pairs weigh the same.
+    A variant for evaluation: the assignment has no gradient. All its matches weigh the same.
 
     Args:
         checkpoint: of a BPnPNet, as `bpnp fit` wrote it; null for `net`.

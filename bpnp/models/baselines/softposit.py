@@ -10,17 +10,16 @@ from torch import Tensor
 
 from bpnp.geometry import random_rotations, retract
 from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.models.baselines.single_pairs import (
+from bpnp.models.baselines.single_problem import (
     Answer,
-    PairSolver,
-    SinglePair,
+    SingleProblem,
+    SingleSolver,
     agreement,
-    pair_seed,
     weak_perspective_distance,
 )
 
 Start = Literal["mean", "near_truth", "random"]
-CHUNK = 2**22  # pairs of points, times initial poses, that are annealed together
+CHUNK = 2**22  # image points times scene points times initial poses, that are annealed together
 THRESHOLD = 0.01  # distance of partners in the normalised image, to choose between starts
 FOCAL = 800.0  # pixels per unit of the normalised image, in which the other constants are
 NOISE = 2.0  # standard deviation of the image points, pixels
@@ -31,7 +30,7 @@ ENOUGH_STEPS = 20
 WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
 
 
-class SoftPOSIT(PairSolver):
+class SoftPOSIT(SingleSolver):
     """SoftPOSIT (David et al., IJCV 2004), a local solver: its result depends on its initial pose.
 
     Of several poses that under which most points have a partner is returned, an accepted one before one that is not.
@@ -43,7 +42,7 @@ class SoftPOSIT(PairSolver):
         starts: number of random starts.
         max_steps: most annealing steps; null for all.
         seed: of the random starts and disturbances.
-        time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
+        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
     """
 
     estimates = ("softposit",)
@@ -62,16 +61,15 @@ class SoftPOSIT(PairSolver):
             raise ValueError(f"expected `start` mean, near_truth or random, got {start!r}")
         self.start, self.starts, self.seed, self.max_steps = start, starts, seed, max_steps
 
-    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
-        rotation, translation = self._initial_poses(pair)
-        together = max(1, CHUNK // (len(pair.points2d) * len(pair.points3d)))
+    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        points = problem.points2d, problem.points3d
+        m, n = map(len, points)
         best, most, finished = Answer(), -1, True
-        for turned, shift in zip(rotation.split(together), translation.split(together), strict=True):
-            points = pair.points2d, pair.points3d
-            found = softposit(*points, turned, shift, max_steps=self.max_steps, deadline=deadline)
+        for start in zip(*(value.split(max(1, CHUNK // (m * n))) for value in self._starts(problem)), strict=True):
+            found = softposit(*points, *start, max_steps=self.max_steps, deadline=deadline)
             finished = found.finished
             counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
-            score = counts.points + found.accepted * (len(pair.points2d) + len(pair.points3d) + 1)
+            score = counts.points + found.accepted * (m + n + 1)
             i = int(score.argmax())
             if int(score[i]) > most:
                 most, pose = int(score[i]), (found.rotation[i], found.translation[i])
@@ -80,30 +78,25 @@ class SoftPOSIT(PairSolver):
                 break
         return best._replace(converged=best.converged and finished)
 
-    def _initial_poses(self, pair: SinglePair) -> tuple[Tensor, Tensor]:
+    def _starts(self, problem: SingleProblem) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
+        like = problem.points3d
         if self.start == "mean":  # Rz Ry Rx of 22.5 degrees each
             rotation = roma.euler_to_rotmat("xyz", torch.full((3,), 22.5, dtype=torch.float64), degrees=True)
-            return rotation.unsqueeze(0).to(pair.points3d), pair.points3d.new_tensor([[0.0, 0.0, 4.5]])
-        generator = torch.Generator().manual_seed(pair_seed(self.seed, pair.index))
-        if self.start == "near_truth":
-            return near_truth(pair, generator)
-        # The scene's centre on the viewing ray of the image's, at the weak-perspective distance.
-        rotation = random_rotations(self.starts, generator).to(pair.points3d)
-        ray = torch.nn.functional.pad(pair.points2d.mean(0), (0, 1), value=1.0)
-        centred = weak_perspective_distance(pair.points2d, pair.points3d) * ray
-        return rotation, centred - rotation @ pair.points3d.mean(0)
-
-
-def near_truth(pair: SinglePair, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """The true pose turned by up to 10 degrees about a random axis and moved by up to 0.5 in a random direction,
-    uniformly: the paper's start for MegaDepth. Raises ValueError where the true pose is not known."""
-    if pair.rotation is None or pair.translation is None:
-        raise ValueError("expected a batch with its true poses to start near them, got none; try start 'random'")
-    directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
-    amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
-    step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
-    rotation, translation = retract(step.flatten().to(pair.points3d), pair.rotation, pair.translation)
-    return rotation.unsqueeze(0), translation.unsqueeze(0)
+            return rotation.unsqueeze(0).to(like), like.new_tensor([[0.0, 0.0, 4.5]])
+        generator = torch.Generator().manual_seed(problem.seed(self.seed))
+        if self.start == "random":
+            # The scene's centre on the viewing ray of the image's, at the weak-perspective distance.
+            rotation = random_rotations(self.starts, generator).to(like)
+            ray = torch.nn.functional.pad(problem.points2d.mean(0), (0, 1), value=1.0)
+            return rotation, weak_perspective_distance(problem.points2d, like) * ray - rotation @ like.mean(0)
+        if problem.rotation is None or problem.translation is None:
+            raise ValueError("expected a batch with its true poses to start near them, got none; try start 'random'")
+        # Turned by up to 10 degrees about a random axis and moved by up to 0.5 in a random direction, uniformly.
+        directions = torch.nn.functional.normalize(torch.randn(2, 3, generator=generator, dtype=torch.float64), dim=-1)
+        amounts = 2 * torch.rand(2, generator=generator, dtype=torch.float64) - 1
+        step = (amounts * torch.tensor([math.radians(10), 0.5])).unsqueeze(-1) * directions
+        rotation, translation = retract(step.flatten().to(like), problem.rotation, problem.translation)
+        return rotation.unsqueeze(0), translation.unsqueeze(0)
 
 
 class Annealed(NamedTuple):
@@ -126,7 +119,7 @@ def softposit(
     max_steps: int | None = None,
     deadline: Deadline = NEVER,
 ) -> Annealed:
-    """Anneal every initial pose (R, t) of one pair.
+    """Anneal every initial pose (R, t) of one problem.
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
     and scene point k is d^2_jk = FOCAL^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by

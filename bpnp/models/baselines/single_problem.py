@@ -1,7 +1,6 @@
-"""What the baselines share: each pair by itself, in float64, within a limit of time; and the count of partners."""
+"""What the baselines share: each problem by itself, in float64, within a limit of time; and the count of partners."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -18,8 +17,8 @@ CHUNK = 2**22  # distances computed at a time, in float32
 
 
 @dataclass(frozen=True)
-class SinglePair:
-    """The real points of one pair, on the batch's device, and its true pose where it is known."""
+class SingleProblem:
+    """The real points of one problem, on the batch's device, and its true pose where it is known."""
 
     points2d: Float[Tensor, "m 2"]
     points3d: Float[Tensor, "n 3"]
@@ -27,9 +26,20 @@ class SinglePair:
     rotation: Float[Tensor, "3 3"] | None = None
     translation: Float[Tensor, "3"] | None = None
 
+    @classmethod
+    def of(cls, batch: Batch, i: int) -> "SingleProblem":
+        pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
+        points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
+        return cls(points2d.double().clone(), points3d.double().clone(), int(batch.index[i]), *pose)
+
+    def seed(self, seed: int) -> int:
+        """Seed of its random numbers, whatever batch it is in."""
+        mixed = torch.Generator().manual_seed(seed)
+        return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.index
+
 
 class Answer(NamedTuple):
-    """The pose of one pair, None if there is none, and how its solver ended: the fields of `SolveStats`."""
+    """The pose of one problem, None if there is none, and how its solver ended: the fields of `SolveStats`."""
 
     pose: tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]] | None = None
     iterations: int = 0
@@ -37,10 +47,10 @@ class Answer(NamedTuple):
     converged: bool = False
 
 
-class PairSolver(nn.Module):
-    """A solver of single pairs: subclasses implement `solve` and name their one estimate.
+class SingleSolver(nn.Module):
+    """A solver of one problem after the other: subclasses implement `solve` and name their one estimate.
 
-    A pair's pose depends neither on the other pairs nor on padding. A side with fewer than 4 points has no pose.
+    A problem's pose depends neither on the others nor on padding. A side with fewer than 4 points has no pose.
     """
 
     estimates: tuple[str, ...]
@@ -51,37 +61,22 @@ class PairSolver(nn.Module):
         self.time_limit = time_limit
 
     def forward(self, batch: Batch) -> Prediction:
+        like, answers = batch.points3d, []
         # The trainer's inference mode would forbid a local optimiser's gradients.
         with torch.inference_mode(False), torch.no_grad():
-            answers = [
-                self.solve(pair, Deadline.after(self.time_limit))
-                if min(len(pair.points2d), len(pair.points3d)) >= MIN_POINTS
-                else Answer()
-                for pair in _pairs(batch)
-            ]
-            like = batch.points3d
+            for i in range(len(batch)):
+                problem = SingleProblem.of(batch, i)
+                enough = min(len(problem.points2d), len(problem.points3d)) >= MIN_POINTS
+                answers.append(self.solve(problem, Deadline.after(self.time_limit)) if enough else Answer())
             missing = like.new_full((3, 3), math.nan), like.new_full((3,), math.nan)
-            poses = zip(*(missing if answer.pose is None else answer.pose for answer in answers), strict=True)
-            stats = SolveStats(*(torch.tensor(values) for values in zip(*(a[1:] for a in answers), strict=True)))
+            poses = zip(*(answer.pose or missing for answer in answers), strict=True)
             rotation, translation = (torch.stack([value.to(like) for value in values]) for values in poses)
+            stats = SolveStats(*(torch.tensor(values) for values in zip(*(a[1:] for a in answers), strict=True)))
             return Prediction(poses={self.estimates[0]: Pose(rotation, translation, stats.to(like))})
 
-    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
-        """The pose of one pair, found before the deadline."""
+    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        """The pose of one problem, found before the deadline."""
         raise NotImplementedError
-
-
-def pair_seed(seed: int, index: int) -> int:
-    """Seed of one pair's random numbers, whatever batch it is in."""
-    mixed = torch.Generator().manual_seed(seed)
-    return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + index
-
-
-def _pairs(batch: Batch) -> Iterator[SinglePair]:
-    for i, index in enumerate(batch.index.tolist()):
-        pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
-        points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
-        yield SinglePair(points2d.double().clone(), points3d.double().clone(), index, *pose)
 
 
 def weak_perspective_distance(points2d: Tensor, points3d: Tensor) -> float:
@@ -104,7 +99,7 @@ class Agreement(NamedTuple):
         return self.partnered2d + self.partnered3d
 
     @property
-    def pairs(self) -> Int[Tensor, " h"]:
+    def matches(self) -> Int[Tensor, " h"]:
         """Upper bound on the number of one-to-one matches within the threshold."""
         return torch.minimum(self.partnered2d, self.partnered3d)
 
@@ -122,12 +117,11 @@ def agreement(
     A 3D point behind the camera has none, and no point has one under a pose that is NaN.
     """
     part = max(1, CHUNK // (len(points2d) * len(points3d)))
+    x, y = points2d.float().unsqueeze(-1).unbind(1)
     counts2d, counts3d = [], []
     for turned, shift in zip(rotation.split(part), translation.split(part), strict=True):
         camera = transform(turned, shift, points3d.expand(len(turned), -1, -1))
-        front = camera[..., 2:] > 0
-        seen = torch.where(front, project(camera), torch.inf).nan_to_num(torch.inf).float()
-        x, y = points2d.float().unsqueeze(-1).unbind(1)
+        seen = torch.where(camera[..., 2:] > 0, project(camera), torch.inf).nan_to_num(torch.inf).float()
         squared = (seen[:, None, :, 0] - x).square_()
         squared += (seen[:, None, :, 1] - y).square_()
         counts2d.append((squared.amin(2) < threshold**2).sum(-1))

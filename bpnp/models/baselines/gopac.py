@@ -10,22 +10,46 @@ from bpnp.checks import check_positive
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
 from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.models.baselines.branch_and_bound.boxes import (
+from bpnp.models.baselines.branch_and_bound import (
     Boxes,
+    BranchAndBound,
     Found,
     best_first,
     rotation_uncertainty,
     split,
     translation_uncertainty,
-    unit_scene,
-    whole_domain,
 )
-from bpnp.models.baselines.single_pairs import Answer, PairSolver, SinglePair, weak_perspective_distance
 
-DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 CHUNK = 2**22  # angles computed at a time
 ROUNDING = 1e-9  # of a cosine
 SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
+
+
+class GOPAC(BranchAndBound):
+    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
+
+    `residual` of the pose is the share of image points without a partner; `converged` is the certificate that no pose
+    has more inliers.
+
+    Args:
+        angle: largest angle between an inlier's ray and its scene point, radians.
+        max_boxes: most boxes, inner ones included; null for as many as the time allows.
+        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+    """
+
+    estimates = ("gopac",)
+
+    def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
+        super().__init__(max_boxes, time_limit)
+        check_positive(angle=angle)
+        self.angle = angle
+
+    def search(
+        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
+    ) -> tuple[Found, float]:
+        limits = {"angle": self.angle, "max_boxes": self.max_boxes}
+        found = maximise_inliers(bearings(points2d), points3d, domain, deadline=deadline, **limits)
+        return found, 1 - found.value / len(points2d)
 
 
 def maximise_inliers(
@@ -63,10 +87,13 @@ def maximise_inliers(
         return children, rays.new_tensor(bounds), best[2]
 
     left, outer = best_first(
-        domain, rays.new_full((1,), len(rays)), expand, at_once=1,
+        domain,
+        rays.new_full((1,), len(rays)),
+        expand,
+        at_once=1,
         small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST,
         until=lambda done: deadline.passed() or done + inner >= max_boxes,
-    )  # fmt: skip
+    )
     bound = max(best[2], left)
     return Found(*best, bound, outer + inner, best[2] >= bound)
 
@@ -120,10 +147,13 @@ def best_rotation(
         return children, reachable, count
 
     left, boxes = best_first(
-        domain, rays.new_full((len(domain.turn),), len(rays)), expand,
-        at_once=max(1, CHUNK // (8 * len(rays) * len(directions))), small=lambda boxes: boxes.turn_half < smallest,
+        domain,
+        rays.new_full((len(domain.turn),), len(rays)),
+        expand,
+        at_once=max(1, CHUNK // (8 * len(rays) * len(directions))),
+        small=lambda boxes: boxes.turn_half < smallest,
         until=lambda _: deadline.passed() or (first and rotation is not None),
-    )  # fmt: skip
+    )
     return Found(rotation, place, count, max(count, left), boxes, count >= left)
 
 
@@ -137,31 +167,3 @@ def count_inliers(
     """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
     directions = torch.nn.functional.normalize(points - place, dim=-1)
     return int(((rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING).any(-1).sum())
-
-
-class GOPAC(PairSolver):
-    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
-
-    The camera centre is searched in a cube around the scene's centre, the rotation everywhere. `residual` of the pose
-    is the share of image points without a partner; `converged` is the certificate that no pose has more inliers.
-
-    Args:
-        angle: largest angle between an inlier's ray and its scene point, radians.
-        max_boxes: most boxes, inner ones included; null for as many as the time allows.
-        time_limit: seconds per pair, after which the best pose so far is returned unconverged; null for none.
-    """
-
-    estimates = ("gopac",)
-
-    def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
-        super().__init__(time_limit)
-        check_positive(angle=angle)
-        self.angle, self.max_boxes = angle, math.inf if max_boxes is None else max_boxes
-
-    def solve(self, pair: SinglePair, deadline: Deadline) -> Answer:
-        points, centre, radius = unit_scene(pair.points3d)
-        domain = whole_domain(points, DOMAIN * weak_perspective_distance(pair.points2d, points))
-        found = maximise_inliers(
-            bearings(pair.points2d), points, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline
-        )
-        return found.answer(centre, radius, residual=1 - found.value / len(pair.points2d))

@@ -1,10 +1,11 @@
-"""Boxes of camera poses for branch and bound: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid.
+"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid.
 
 The uncertainty angles bound how far a direction can turn within a box, as in GOPAC (Campbell et al., ICCV 2017).
 """
 
 import itertools
 import math
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,7 +14,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.models.baselines.single_pairs import Answer
+from bpnp.loops.parallel import Deadline
+from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
+
+DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 
 
 class Boxes(NamedTuple):
@@ -43,12 +47,35 @@ class Found(NamedTuple):
     boxes: int
     certified: bool
 
-    def answer(self, centre: Float[Tensor, "3"], radius: float, residual: float) -> Answer:
-        """The pose in the coordinates of the scene that `unit_scene` centred and scaled."""
-        if self.rotation is None:
-            return Answer(iterations=self.boxes)
-        translation = -self.rotation @ (radius * self.place + centre)
-        return Answer((self.rotation, translation), self.boxes, residual, self.certified)
+
+class BranchAndBound(SingleSolver):
+    """Searches the camera centre in a cube around the scene's centre and the rotation everywhere."""
+
+    def __init__(self, max_boxes: int | None, time_limit: float | None) -> None:
+        super().__init__(time_limit)
+        self.max_boxes = math.inf if max_boxes is None else max_boxes
+
+    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        centre = problem.points3d.mean(0)
+        radius = root_mean_square((problem.points3d - centre).norm(dim=-1))
+        points = (problem.points3d - centre) / radius
+        away = weak_perspective_distance(problem.points2d, points)
+        zero = points.new_zeros(1, 3)
+        domain = Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * away))
+        found, residual = self.search(problem.points2d, points, domain, away, deadline)
+        if found.rotation is None:
+            return Answer(iterations=found.boxes)
+        translation = -found.rotation @ (radius * found.place + centre)
+        return Answer((found.rotation, translation), found.boxes, residual, found.certified)
+
+    @abstractmethod
+    def search(
+        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
+    ) -> tuple[Found, float]:
+        """The best pose for a scene of root mean square radius 1 at the origin, and its residual.
+
+        away: weak-perspective distance of the camera.
+        """
 
 
 def best_first(
@@ -77,23 +104,10 @@ def best_first(
         done += len(upper)
         boxes = Boxes(*(torch.cat(values) for values in zip(boxes.pick(rest), children, strict=True)))
         bounds = torch.cat([bounds[rest], torch.minimum(upper, bounds.max())])
-        kept, final = bounds > least, small(boxes)
-        aside = torch.cat([aside, bounds[kept & final]])
-        boxes, bounds = boxes.pick(kept & ~final), bounds[kept & ~final]
+        promising, final = bounds > least, small(boxes)
+        aside = torch.cat([aside, bounds[promising & final]])
+        boxes, bounds = boxes.pick(promising & ~final), bounds[promising & ~final]
     return float(torch.cat([aside, bounds]).max()), done
-
-
-def whole_domain(like: Tensor, half: float) -> Boxes:
-    """All rotations, and the camera centres within `half` of the origin along each axis."""
-    zero = like.new_zeros(1, 3)
-    return Boxes(zero, like.new_full((1,), math.pi), zero, like.new_full((1, 3), half))
-
-
-def unit_scene(points3d: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "3"], float]:
-    """The points centred and of root mean square radius 1, with the centre and the radius."""
-    centre = points3d.mean(0)
-    radius = root_mean_square((points3d - centre).norm(dim=-1))
-    return (points3d - centre) / radius, centre, radius
 
 
 def root_mean_square(distances: Float[Tensor, " k"]) -> float:

@@ -1,1 +1,0 @@
-"""Globally optimal solvers by branch and bound: GOPAC and GOSMA."""

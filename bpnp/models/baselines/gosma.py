@@ -1,0 +1,346 @@
+"""GOSMA: globally optimal alignment of two mixtures on the sphere, by branch and bound (Campbell et al., CVPR 2019).
+
+From the camera centre c a Gaussian (mu, s^2) is seen as a von Mises-Fisher density of direction mu - c and of
+concentration |mu - c|^2/s^2 + 1. The product of two densities has the integral E = Z(|k m + k' m'|) / (Z(k) Z(k')),
+Z(k) = 4 pi sinh(k)/k, so that the L2 distance of the scene's mixture, seen from a camera, to the image's is closed:
+d(R, c) = sum_ab w_a w_b E_ab(c) - 2 sum_ac w_a w_c E_ac(R, c) + sum_cc' w_c w_c' E_cc'.
+"""
+
+import math
+from typing import NamedTuple
+
+import roma
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn.functional import normalize, one_hot
+
+from bpnp.checks import check_positive
+from bpnp.geometry import angle_between, bearings, retract
+from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.models.baselines.branch_and_bound import (
+    Boxes,
+    BranchAndBound,
+    Found,
+    best_first,
+    distance_range,
+    root_mean_square,
+    rotation_uncertainty,
+    split,
+    translation_uncertainty,
+)
+
+CLOSEST = 0.5  # distance of a camera centre from the scene's, weak-perspective distances
+GAP = 0.1  # share of the image mixture's squared norm by which the answer may miss the optimum
+POLISH_STEPS = 50
+DESCENTS = 32  # best box centres of an iteration, from which Adam descends
+DESCENT_STEPS = 30
+ITERATIONS = 300  # of Lloyd's
+BISECTIONS = 16
+ROUNDING = 1e-9  # relative; of a bound's terms
+
+
+class RayMixture(NamedTuple):
+    """von Mises-Fisher components on the unit sphere."""
+
+    weights: Float[Tensor, " c"]
+    directions: Float[Tensor, "c 3"]
+    concentrations: Float[Tensor, " c"]
+
+
+class SceneMixture(NamedTuple):
+    """Isotropic Gaussian components."""
+
+    weights: Float[Tensor, " a"]
+    means: Float[Tensor, "a 3"]
+    variances: Float[Tensor, " a"]
+
+    def seen(self, place: Float[Tensor, "b 3"]) -> tuple[Float[Tensor, "b a 3"], Float[Tensor, "b a"]]:
+        """Directions and concentrations of the components from camera centres."""
+        towards = self.means - place.unsqueeze(1)
+        return normalize(towards, dim=-1), towards.square().sum(-1) / self.variances + 1
+
+
+class GOSMA(BranchAndBound):
+    """Branch and bound on the distance between the mixtures of both point sets; no matching, no initial pose.
+
+    Camera centres are no closer to the scene's centre than CLOSEST. `residual` of the pose is its distance as a share
+    of the image mixture's squared norm (0 for mixtures that coincide); `converged` is the certificate that no pose of
+    the domain is better by more than GAP. It certifies the mixtures' alignment, which need not be that of the points.
+
+    Args:
+        cluster2d: largest angle from an image cluster's mean, in root mean square angles of all rays to theirs.
+        cluster3d: largest distance from a scene cluster's mean, in root mean square distances of all points to theirs.
+        batch: boxes split together.
+        max_boxes: most boxes; null for as many as the time allows.
+        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+    """
+
+    estimates = ("gosma",)
+
+    def __init__(
+        self,
+        *,
+        cluster2d: float = 0.8,
+        cluster3d: float = 0.8,
+        batch: int = 512,
+        max_boxes: int | None = None,
+        time_limit: float | None = 30.0,
+    ) -> None:
+        super().__init__(max_boxes, time_limit)
+        check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
+        self.cluster2d, self.cluster3d, self.batch = cluster2d, cluster3d, batch
+
+    def search(
+        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
+    ) -> tuple[Found, float]:
+        rays = bearings(points2d)
+        angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
+        mixtures = scene_mixture(points3d, self.cluster3d), ray_mixture(rays, self.cluster2d * angle)
+        limits = {"batch": self.batch, "max_boxes": self.max_boxes}
+        found = align_mixtures(*mixtures, domain, closest=CLOSEST * away, deadline=deadline, **limits)  # type: ignore[arg-type]
+        return found, found.value
+
+
+def align_mixtures(
+    scene: SceneMixture,
+    rays: RayMixture,
+    domain: Boxes,
+    *,
+    gap: float = GAP,
+    closest: float = 0.0,
+    batch: int = 512,
+    max_boxes: int | float = math.inf,
+    deadline: Deadline = NEVER,
+) -> Found:
+    """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
+    squared norm.
+
+    Best first: the `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the
+    less certain; Adam descends from the best centres, also where they are worse than the best so far, since a better
+    optimum may lie close to them, and L-BFGS polishes a better pose. Ends with the certificate, or with the best pose
+    so far after about `max_boxes` boxes or at the deadline. Value and bound are shares of the image mixture's squared
+    norm.
+    """
+    norm = float(squared_norm(rays))
+    best = (math.inf, domain.rotation[0], domain.place[0])
+
+    def descend_from(boxes: Boxes) -> None:
+        nonlocal best
+        if len(boxes.turn) == 0:
+            return
+        values = distance(scene, rays, boxes.rotation, boxes.place)
+        chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
+        poses = descend(scene, rays, chosen.rotation, chosen.place)
+        values = distance(scene, rays, *poses)
+        i = int(values.argmin())
+        if float(values[i]) < best[0]:
+            best = polish(scene, rays, poses[0][i], poses[1][i])
+
+    def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        moving = translation_uncertainty(parents, scene.means).amax(-1)
+        children = split(parents, rotation_uncertainty(parents) >= moving)
+        _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
+        children = children.pick(farthest.squeeze(-1) >= closest)
+        bounds = -lower_bound(scene, rays, children)
+        descend_from(children.pick(children.place.norm(dim=-1) >= closest))
+        # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
+        return children, bounds, gap * norm - best[0]
+
+    descend_from(domain)
+    left, boxes = best_first(
+        domain,
+        -lower_bound(scene, rays, domain),
+        expand,
+        at_once=batch,
+        until=lambda done: deadline.passed() or done + len(domain.turn) >= max_boxes,
+    )
+    value, rotation, place = best
+    certified = -left >= value - gap * norm
+    bound = value - gap * norm if certified else -left
+    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + len(domain.turn), certified)
+
+
+def descend(
+    scene: SceneMixture,
+    rays: RayMixture,
+    rotation: Float[Tensor, "b 3 3"],
+    place: Float[Tensor, "b 3"],
+    *,
+    finely: bool = False,
+) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
+    """Adam's steps from several poses, each for itself, from a tenth of a unit down to a thousandth; or L-BFGS.
+
+    Units of a step: radians, and the mean distance to the scene's clusters, so that both move the image alike.
+    """
+    away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
+    unit = torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
+    step = torch.zeros_like(unit, requires_grad=True)
+    lbfgs = torch.optim.LBFGS([step], max_iter=POLISH_STEPS, line_search_fn="strong_wolfe")
+    optimiser = lbfgs if finely else torch.optim.Adam([step], lr=0.1)
+
+    def loss() -> Tensor:
+        step.grad = None
+        total = distance(scene, rays, *retract(unit * step, rotation, place)).sum()
+        total.backward()
+        return total
+
+    with torch.enable_grad():
+        for _ in range(1 if finely else DESCENT_STEPS):
+            optimiser.step(loss)
+            optimiser.param_groups[0]["lr"] *= 0.01 ** (1 / DESCENT_STEPS)
+    return retract(unit * step.detach(), rotation, place)
+
+
+def polish(
+    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "3 3"], place: Float[Tensor, "3"]
+) -> tuple[float, Float[Tensor, "3 3"], Float[Tensor, "3"]]:
+    """L-BFGS from one pose; the pose given where it ends no lower."""
+    start = rotation.unsqueeze(0), place.unsqueeze(0)
+    turned, moved = descend(scene, rays, *start, finely=True)
+    end, before = float(distance(scene, rays, turned, moved)), float(distance(scene, rays, *start))
+    return (end, roma.special_procrustes(turned[0]), moved[0]) if end < before else (before, rotation, place)
+
+
+def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
+    """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF that fits each.
+
+    The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and at most that of a cluster with a
+    standard deviation of a tenth of the angle, which single points would exceed.
+    """
+    weights, sums = _totals(rays, _means(rays, angle, spherical=True))
+    length = torch.linalg.vector_norm(sums, dim=-1) / weights
+    concentration = length * (3 - length.square()) / (1 - length.square()).clamp_min(1e-12)
+    return RayMixture(weights / len(rays), normalize(sums, dim=-1), concentration.clamp_max((10 / angle) ** 2))
+
+
+def scene_mixture(points: Float[Tensor, "n 3"], radius: float) -> SceneMixture:
+    """DP-means: clusters within `radius` of their mean, and the isotropic Gaussian of each, no narrower than a tenth
+    of the radius."""
+    labels = _means(points, radius, spherical=False)
+    weights, sums = _totals(points, labels)
+    means = sums / weights.unsqueeze(-1)
+    squared = (points - means[labels]).square().sum(-1, keepdim=True)
+    variances = _totals(squared, labels)[1].squeeze(-1) / (3 * weights)
+    return SceneMixture(weights / len(points), means, variances.clamp_min((radius / 10) ** 2))
+
+
+def _means(points: Tensor, limit: float, *, spherical: bool) -> Int[Tensor, " k"]:
+    """DP-means: Lloyd's iterations; when they have converged, a new cluster at the point farthest from all centres, if
+    that is beyond `limit`. The result does not depend on the order of the points."""
+    labels = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for _ in range(ITERATIONS):
+        weights, sums = _totals(points, labels)
+        centres = normalize(sums, dim=-1) if spherical else sums / weights.unsqueeze(-1)
+        away = angle_between(points.unsqueeze(1), centres) if spherical else torch.cdist(points, centres)
+        nearest, assigned = away.min(-1)
+        if bool((assigned == labels).all()):
+            outermost = int(nearest.argmax())
+            if float(nearest[outermost]) <= limit:
+                break
+            assigned[outermost] = len(centres)
+        labels = assigned.unique(return_inverse=True)[1]
+    return labels
+
+
+def _totals(values: Tensor, labels: Tensor) -> tuple[Tensor, Tensor]:
+    """Number and sum of the values of each label."""
+    members = one_hot(labels).to(values.dtype)
+    return members.sum(0), members.mT @ values
+
+
+def log_z(k: Tensor) -> Tensor:
+    """log of 4 pi sinh(k)/k, k >= 0."""
+    k = k.clamp_min(1e-9)
+    return k + torch.log(-torch.expm1(-2 * k)) - torch.log(2 * k) + math.log(4 * math.pi)
+
+
+def overlap(k: Tensor, other: Tensor, cosine: Tensor) -> Tensor:
+    """E of two von Mises-Fisher densities whose directions enclose an angle of this cosine."""
+    together = (k.square() + other.square() + 2 * k * other * cosine).clamp_min(0).sqrt()
+    return torch.exp(log_z(together) - log_z(k) - log_z(other))
+
+
+def squared_norm(rays: RayMixture) -> Float[Tensor, ""]:
+    """Integral of the squared density of the image's mixture."""
+    terms = overlap(rays.concentrations.unsqueeze(-1), rays.concentrations, rays.directions @ rays.directions.mT)
+    return rays.weights @ terms @ rays.weights
+
+
+def distance(
+    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "b 3 3"], place: Float[Tensor, "b 3"]
+) -> Float[Tensor, " b"]:
+    """d(R, c) without the constant `squared_norm(rays)`."""
+    directions, k = scene.seen(place)
+    self_terms = overlap(k.unsqueeze(-1), k.unsqueeze(-2), directions @ directions.mT)
+    cross_terms = overlap(k.unsqueeze(-1), rays.concentrations, directions @ rotation.mT @ rays.directions.mT)
+    return _combine(scene, rays, self_terms, cross_terms)
+
+
+def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Tensor, " b"]:
+    """A number that d(R, c) does not fall below for any pose of a box.
+
+    Every term takes its best value on its own: angles within the box's uncertainty of those at its centre, and
+    concentrations between those at the least and the largest distance.
+
+    The angle that two means subtend at the camera centre grows by the uncertainty of both directions at most. Its
+    gradient has the length |mu - mu'| / (d d') with the distances d, d' of the means: moving the centre by half a
+    diagonal adds at most that times the largest length.
+    """
+    directions, _ = scene.seen(boxes.place)
+    turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, scene.means)
+    closest, farthest = distance_range(boxes, scene.means)
+    least, largest = (values.square() / scene.variances + 1 for values in (closest, farthest))
+
+    half_diagonal = boxes.place_half.norm(dim=-1)[:, None, None]
+    gradient = torch.cdist(scene.means, scene.means) / (closest.unsqueeze(-1) * closest.unsqueeze(-2)).clamp_min(1e-12)
+    parting = torch.minimum(moving.unsqueeze(-1) + moving.unsqueeze(-2), half_diagonal * gradient + 1e-7)
+    wide = (_angle(directions @ directions.mT) + parting).clamp_max(math.pi)
+    wide = wide * (1 - torch.eye(len(scene.means), dtype=wide.dtype, device=wide.device))
+    self_terms = _least_overlap(least, largest, wide.cos())
+    angle = _angle(directions @ boxes.rotation.mT @ rays.directions.mT)
+    narrow = (angle - turning[:, None, None] - moving.unsqueeze(-1)).clamp_min(0)
+    cross_terms = _largest_overlap(least.unsqueeze(-1), largest.unsqueeze(-1), rays.concentrations, narrow.cos())
+    return _combine(scene, rays, self_terms * (1 - ROUNDING), cross_terms * (1 + ROUNDING))
+
+
+def _combine(scene: SceneMixture, rays: RayMixture, self_terms: Tensor, cross_terms: Tensor) -> Tensor:
+    return (self_terms @ scene.weights) @ scene.weights - 2 * (cross_terms @ rays.weights) @ scene.weights
+
+
+def _angle(cosine: Tensor) -> Tensor:
+    return torch.acos(cosine.clamp(-1, 1))
+
+
+def _least_overlap(least: Tensor, largest: Tensor, cosine: Tensor) -> Tensor:
+    """Smallest E over both concentrations: E has one maximum in each of them, so its minimum is at an end."""
+    ends = [overlap(a.unsqueeze(-1), b.unsqueeze(-2), cosine) for a in (least, largest) for b in (least, largest)]
+    # A component with itself: one concentration, not two.
+    itself = overlap(least, least, torch.ones_like(least))
+    same = torch.eye(least.shape[-1], dtype=torch.bool, device=least.device)
+    return torch.where(same, itself.unsqueeze(-1), torch.stack(ends).amin(0))
+
+
+def _largest_overlap(least: Tensor, largest: Tensor, fixed: Tensor, cosine: Tensor) -> Tensor:
+    """Largest E over the first concentration, where its only maximum is found by bisection of the slope's sign."""
+    low, high, fixed, cosine = torch.broadcast_tensors(least, largest, fixed, cosine)
+    rises_to_end, falls_from_start = _rises(high, fixed, cosine), ~_rises(low, fixed, cosine)
+    inside = ~(rises_to_end | falls_from_start)
+    best = torch.where(rises_to_end, high, low).clone()
+    a, b, k, c = (values[inside] for values in (low, high, fixed, cosine))
+    for _ in range(BISECTIONS):
+        middle = (a + b) / 2
+        up = _rises(middle, k, c)
+        a, b = torch.where(up, middle, a), torch.where(up, b, middle)
+    best[inside] = (a + b) / 2
+    return overlap(best, fixed, cosine)
+
+
+def _rises(k: Tensor, fixed: Tensor, cosine: Tensor) -> Tensor:
+    """Whether E grows with k: A(|k m + k' m'|) cos(m, k m + k' m') > A(k) with A(k) = coth k - 1/k."""
+    together = (k.square() + fixed.square() + 2 * k * fixed * cosine).clamp_min(1e-18).sqrt()
+    return _mean_length(together) * (k + fixed * cosine) > _mean_length(k) * together
+
+
+def _mean_length(k: Tensor) -> Tensor:
+    return torch.where(k < 1e-3, k / 3, 1 / torch.tanh(k.clamp_min(1e-3)) - 1 / k.clamp_min(1e-3))
