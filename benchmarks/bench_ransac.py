@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 from timing import machine, write_json
 
 from bpnp.geometry import rotation_angle
-from bpnp.robust.consensus import Pairs, consensus, normalised
+from bpnp.robust.consensus import Matches, consensus, normalised
 
 NOISE, THRESHOLD, POINTS, FOCAL = 0.0025, 0.01, 1000, 1000.0
 CAMERA = {"model": "SIMPLE_PINHOLE", "width": 1000, "height": 1000, "params": [FOCAL, 0.0, 0.0]}
@@ -80,7 +80,7 @@ def with_torch(problems: list[Problem], *, hypotheses: int) -> Array:
     arrays = [[getattr(p, name) for p in problems] for name in ("points2d", "points3d")]
     points2d, points3d = (torch.as_tensor(np.stack(a), dtype=torch.float32) for a in arrays)
     real = torch.ones(points2d.shape[:2], dtype=torch.bool)  # the most probable pair first, as they are
-    pairs, *_ = normalised(Pairs(points2d, points3d, real))
+    pairs, *_ = normalised(Matches(points2d, points3d, real))
     return consensus(pairs, THRESHOLD, hypotheses, 0)[0][..., :3].numpy()
 
 

@@ -89,7 +89,7 @@ def listed(name: str, values: Arrays, ndim: int) -> list[Tensor]:
         return [_as_tensor(name, v) for v in values]
     array = _as_tensor(name, values)
     if array.numel() == 0 and array.ndim != ndim:
-        raise ValueError(f"expected at least one pair, got an empty `{name}`")
+        raise ValueError(f"expected at least one problem, got an empty `{name}`")
     return list(array) if array.ndim == ndim + 1 else [array]
 
 
@@ -104,25 +104,25 @@ def _as_tensor(name: str, values: Arrays) -> Tensor:
 
 
 def checked_points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
-    """The points of pair i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
+    """The points of problem i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
-        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in pair {i}{hint}")
+        raise ValueError(f"expected `{name}` of shape (k, {dim}), got {tuple(points.shape)} in problem {i}{hint}")
     if len(points) == 0:
-        raise ValueError(f"expected at least one point in `{name}`, got none in pair {i}")
+        raise ValueError(f"expected at least one point in `{name}`, got none in problem {i}")
     if not points.isfinite().all():
         bad = int((~points.isfinite().all(-1)).nonzero()[0, 0])
-        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of pair {i}")
+        raise ValueError(f"expected finite `{name}`, got {points[bad].tolist()} at point {bad} of problem {i}")
     return points
 
 
 def checked_match(i: int, match: Tensor, m: int, n: int) -> Tensor:
-    """The match3d of pair i, (n,). Raises ValueError for another shape, other than integers, or what is no 2D point."""
+    """The match3d of problem i, (n,). Raises ValueError for another shape, no integers, or what is no 2D point."""
     if match.shape != (n,):
-        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in pair {i}")
+        raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in problem {i}")
     if match.is_floating_point() or match.is_complex() or match.dtype == torch.bool:
         raise ValueError(
-            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in pair {i}; try .astype(int)"
+            f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in problem {i}; try .astype(int)"
         )
     if int(match.min()) < -1 or int(match.max()) >= m:
         raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
@@ -130,10 +130,10 @@ def checked_match(i: int, match: Tensor, m: int, n: int) -> Tensor:
 
 
 def stacked(name: str, values: list[Tensor], shape: tuple[int, ...], dtype: torch.dtype) -> Tensor:
-    """One tensor of the values of all pairs. Raises ValueError for another shape, NaN or infinity."""
+    """One tensor of the values of all problems. Raises ValueError for another shape, NaN or infinity."""
     for i, value in enumerate(values):
         if value.shape != shape:
-            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in pair {i}")
+            raise ValueError(f"expected `{name}` of shape {shape}, got {tuple(value.shape)} in problem {i}")
         if not value.isfinite().all():
-            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in pair {i}")
+            raise ValueError(f"expected finite `{name}`, got {value.tolist()} in problem {i}")
     return torch.stack([v.to(dtype) for v in values])

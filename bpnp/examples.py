@@ -90,13 +90,13 @@ def _photo(rng: np.random.Generator) -> Example:
     options = MapOptions(
         num_points=300, min_points=150, outliers=0.33, views=(1, 1), kinds={"facades": 1.0}, noise_px=NOISE_PX
     )
-    pair = draw_map_pair("photo", options, rng)
+    problem = draw_map_pair("photo", options, rng)
     middle = LONG_SIDE / 2  # of the photo, upright or not
-    camera = np.array([[pair.focal, 0.0, middle], [0.0, pair.focal, middle], [0.0, 0.0, 1.0]])
-    pixels = pair.focal * pair.points2d.astype(np.float64) + middle
+    camera = np.array([[problem.focal, 0.0, middle], [0.0, problem.focal, middle], [0.0, 0.0, 1.0]])
+    pixels = problem.focal * problem.points2d.astype(np.float64) + middle
     return Example(
-        rng.permutation(pixels), pair.points3d.astype(np.float64), camera,
-        np.asarray(pair.rotation, np.float64), np.asarray(pair.translation, np.float64),
+        rng.permutation(pixels), problem.points3d.astype(np.float64), camera,
+        np.asarray(problem.rotation, np.float64), np.asarray(problem.translation, np.float64),
     )  # fmt: skip
 
 

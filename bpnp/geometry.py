@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MIN_POINTS = 4  # that fix a pose: three pairs fit up to four poses exactly
+MIN_POINTS = 4  # that fix a pose: three matches fit up to four poses exactly
 
 
 def bearings(points2d: Float[Tensor, "*b 2"]) -> Float[Tensor, "*b 3"]:

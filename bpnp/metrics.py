@@ -24,7 +24,7 @@ from bpnp.types import Batch, Pose
 
 @dataclass(frozen=True)
 class PoseErrors:
-    """Errors of one estimate for b pairs, float64; see the functions below. `index` is the pairs' `Batch.index`."""
+    """Errors of one estimate for b problems, float64; see the functions below. `index` is their `Batch.index`."""
 
     rotation_deg: Float[Tensor, " b"]
     translation: Float[Tensor, " b"]
@@ -76,11 +76,11 @@ def reprojection_error(
     points3d: Float[Tensor, "b n 3"],
     match3d: Int[Tensor, "b n"],
 ) -> Float[Tensor, " b"]:
-    """Mean angle in degrees between f_i and R p_j + t over the true pairs i = match3d[j] >= 0.
+    """Mean angle in degrees between f_i and R p_j + t over the true matches i = match3d[j] >= 0.
 
-    Paper Eq. 2 divides the sum over the true pairs by m n; here it is divided by their number, so that it is an angle
+    Paper Eq. 2 divides the sum over the true matches by m n; here it is divided by their number, so that it is an angle
     and does not depend on the sizes of the sets. A point at the camera centre counts as 180. A sample without a pose
-    is 180; else a sample without a true pair is NaN.
+    is 180; else a sample without a true match is NaN.
     """
     true = match3d >= 0
     seen = points2d.double().gather(1, match3d.clamp(min=0).unsqueeze(-1).expand(-1, -1, 2))
@@ -115,12 +115,12 @@ def pose_errors(pose: Pose, batch: Batch) -> PoseErrors:
 
 
 Limits = Sequence[float | int]
-NO_PAIR = "expected at least one pair, got none; try update() before compute()"
+NO_PROBLEM = "expected at least one problem, got none; try update() before compute()"
 
 
 @dataclass(frozen=True)
 class RecallThresholds:
-    """Errors up to which a pose counts as right; `joint` holds pairs (rotation in deg, translation)."""
+    """Errors up to which a pose counts as right; `joint` holds limits (rotation in deg, translation)."""
 
     rotation_deg: Limits = (1.0, 2.0, 5.0, 10.0, 15.0, 20.0)
     translation: Limits = (0.05, 0.1, 0.2, 0.5, 1.0)
@@ -137,10 +137,11 @@ class RecallThresholds:
 def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
     """First, second (median) and third quartile of each error, as float64 scalars.
 
-    Keys: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on; "found", the share of pairs
-    with a pose; "without_true_pairs", the number of pairs without a reprojection error. Linear interpolation between
-    order statistics (numpy's default); a quartile that leans on an infinite neighbour is infinite. The reprojection
-    quartiles are absent if no pair has that error. Raises ValueError if there is no pair.
+    Keys: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on; "found", the share of
+    problems with a pose; "without_true_pairs", the number of those without a reprojection error. Linear
+    interpolation between order statistics (numpy's default); a quartile that leans on an infinite neighbour is
+    infinite. The reprojection quartiles are absent if no problem has that error. Raises ValueError if there is no
+    problem.
     """
     values: dict[str, Tensor] = {}
     for name, unit, error in known_errors(errors):
@@ -157,10 +158,10 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
 
 
 def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None) -> dict[str, Tensor]:
-    """Share of pairs in [0, 1] with error <= threshold, for every threshold, as float64 scalars.
+    """Share of problems in [0, 1] with error <= threshold, for every threshold, as float64 scalars.
 
     Keys: "recall_rotation_5deg", "recall_translation_0.5", "recall_centre_0.5", "recall_reprojection_1deg", and
-    "recall_joint_15deg_0.5" for rotation and translation both. Raises ValueError if there is no pair.
+    "recall_joint_15deg_0.5" for rotation and translation both. Raises ValueError if there is no problem.
     """
     thresholds = thresholds or RecallThresholds()
     values: dict[str, Tensor] = {}
@@ -174,20 +175,20 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
 
 
 def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:
-    """Name, unit and values of each error that at least one pair has."""
+    """Name, unit and values of each error that at least one problem has."""
     if len(errors.rotation_deg) == 0:
-        raise ValueError(NO_PAIR)
+        raise ValueError(NO_PROBLEM)
     for name, unit in (("rotation", "deg"), ("translation", ""), ("centre", ""), ("reprojection", "deg")):
         error: Tensor = getattr(errors, f"{name}_{unit}".rstrip("_"))
         known = error[~error.isnan()].double()
         if len(known) < len(error) and name != "reprojection":
-            raise ValueError(f"expected a {name} error for each pair, got NaN; a pair without a pose is 180 deg or inf")
+            raise ValueError(f"expected a {name} error for each problem, got NaN; one without a pose is 180 deg or inf")
         if len(known):
             yield name, unit, known
 
 
-class PairMetric(Metric):
-    """Numbers of every pair, `width` of them, over batches and processes; each pair once, by its index."""
+class ProblemMetric(Metric):
+    """Numbers of every problem, `width` of them, over batches and processes; each problem once, by its index."""
 
     full_state_update = False
     is_differentiable = False
@@ -210,26 +211,26 @@ class PairMetric(Metric):
         self.records.append(torch.stack([column.detach().double() for column in (*columns, index)], -1))
 
     def _columns(self) -> tuple[Tensor, ...]:
-        """The columns so far, with the first occurrence of each pair."""
+        """The columns so far, with the first occurrence of each problem."""
         records = dim_zero_cat(self.records)
         if len(records) == 0:
-            raise ValueError(NO_PAIR)
+            raise ValueError(NO_PROBLEM)
         values, index = records[:, :-1], records[:, -1]
         order = torch.argsort(index, stable=True)
-        again = index[order].diff() == 0  # never true of NaN, the index of pairs that have none
+        again = index[order].diff() == 0  # never true of NaN, the index of problems that have none
         first, repeat = order[:-1][again], order[1:][again]
         if not torch.isclose(values[first], values[repeat], rtol=1e-3, atol=1e-3, equal_nan=True).all():
-            message = "expected one pair per `Batch.index`, got one index with several values; the first is counted"
-            warnings.warn(f"{message}; try a metric per data set, and an index for each of its pairs", stacklevel=2)
+            message = "expected one problem per `Batch.index`, got one index with several values; the first is counted"
+            warnings.warn(f"{message}; try a metric per data set, and an index for each of its problems", stacklevel=2)
         keep = torch.ones_like(index, dtype=torch.bool)
         keep[repeat] = False
         return values[keep].unbind(-1)
 
 
-class MeanOverPairs(PairMetric):
-    """Mean of one value per pair over batches and processes, each pair counted once by its `Batch.index`.
+class MeanOverProblems(ProblemMetric):
+    """Mean of one value per problem over batches and processes, each problem counted once by its `Batch.index`.
 
-    >>> mean = MeanOverPairs()
+    >>> mean = MeanOverProblems()
     >>> mean.update(torch.tensor([1.0, 2.0, 6.0]), torch.tensor([0, 1, 2]))
     >>> mean.update(torch.tensor([6.0]), torch.tensor([2]))
     >>> float(mean.compute())
@@ -246,8 +247,8 @@ class MeanOverPairs(PairMetric):
         return self._columns()[0].mean()
 
 
-class PoseMetric(PairMetric):
-    """The four errors of every pair's pose."""
+class PoseMetric(ProblemMetric):
+    """The four errors of every problem's pose."""
 
     width = 4
 
@@ -258,12 +259,12 @@ class PoseMetric(PairMetric):
         )
 
     def errors(self) -> PoseErrors:
-        """The errors so far, each pair once."""
+        """The errors so far, each problem once."""
         return PoseErrors(*self._columns())
 
 
 class PoseQuartiles(PoseMetric):
-    """`pose_quartiles` over all pairs.
+    """`pose_quartiles` over all problems.
 
     >>> metric = PoseQuartiles()
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))
@@ -278,7 +279,7 @@ class PoseQuartiles(PoseMetric):
 
 
 class PoseRecall(PoseMetric):
-    """`pose_recalls` over all pairs.
+    """`pose_recalls` over all problems.
 
     >>> metric = PoseRecall(RecallThresholds(rotation_deg=(4,)))
     >>> metric.update(PoseErrors(*torch.tensor([[1.0, 3.0, 5.0], [0.1, 0.2, 0.3], [0.1, 0.2, 0.3], [0.2, 0.2, 0.4]])))

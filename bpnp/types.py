@@ -67,7 +67,7 @@ class Pose(Tensors):
 
 @dataclass(frozen=True)
 class Prediction(Tensors):
-    """A solver's answer: the joint probability of every pair, and each pose estimate by name.
+    """A solver's answer: the joint probability of every match, and each pose estimate by name.
 
     assignment: what the solver's own transport gave. rematched: that of the last round, of a solver that matches again
         under its pose in evaluation.
@@ -92,9 +92,9 @@ class Batch(Tensors):
     rotation, translation: true pose, if known.
     match3d: (b, n) index of the 2D point that 3D point j was seen as, -1 for none; if known.
     focal: (b,) pixels per unit of normalised coordinates, to report errors in pixels.
-    index: (b,) position of each pair in its data set; a pair that appears twice (a padded distributed epoch) is
+    index: (b,) position of each problem in its data set; a problem that appears twice (a padded distributed epoch) is
         counted once.
-    ids: a name for each pair.
+    ids: a name for each problem.
     origin: (b, 3) what was subtracted from the scene's coordinates; written poses have it undone.
     """
 
@@ -137,9 +137,9 @@ class Batch(Tensors):
         index: Sequence[int] | None = None,
         ids: Sequence[str] | None = None,
     ) -> "Batch":
-        """Pad and mask one pair, or lists of pairs of different sizes.
+        """Pad and mask one problem, or lists of problems of different sizes.
 
-        points2d (m, 2) and points3d (n, 3) for one pair, or sequences of such arrays; rotation (3, 3), translation
+        points2d (m, 2) and points3d (n, 3) for one problem, or sequences of such arrays; rotation (3, 3), translation
         (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D
         array is, else float32; the batch is on the CPU.
 
@@ -163,7 +163,7 @@ class Batch(Tensors):
         for name, values in (("points3d", sets3d), ("rotation", rotations), ("translation", translations),
                              ("match3d", matches), ("focal", focals), ("index", index), ("ids", ids)):  # fmt: skip
             if values is not None and len(values) != size:
-                raise ValueError(f"expected `{name}` for {size} pairs as in `points2d`, got {len(values)}")
+                raise ValueError(f"expected `{name}` for {size} problems as in `points2d`, got {len(values)}")
         m, n = max(map(len, sets2d)), max(map(len, sets3d))
         if matches is not None:
             matches = [checked_match(i, x, len(sets2d[i]), len(sets3d[i])) for i, x in enumerate(matches)]

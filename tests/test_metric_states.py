@@ -9,7 +9,7 @@ from planted import posed
 from torchmetrics import MetricCollection
 
 from bpnp.metrics import (
-    MeanOverPairs,
+    MeanOverProblems,
     PoseErrors,
     PoseQuartiles,
     PoseRecall,
@@ -76,15 +76,15 @@ def test_two_data_sets_in_one_metric_are_noticed() -> None:
     metric = PoseQuartiles()
     metric.update(random_errors(0, 5))
     metric.update(random_errors(1, 5))
-    with pytest.warns(UserWarning, match="one pair per `Batch.index`"):
+    with pytest.warns(UserWarning, match="one problem per `Batch.index`"):
         values = metric.compute()
     assert values == pose_quartiles(random_errors(0, 5))
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
-@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall(), MeanOverPairs()])
-def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall | MeanOverPairs) -> None:
-    with pytest.raises(ValueError, match=r"expected at least one pair, got none; try update\(\)"):
+@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall(), MeanOverProblems()])
+def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall | MeanOverProblems) -> None:
+    with pytest.raises(ValueError, match=r"expected at least one problem, got none; try update\(\)"):
         metric.compute()
 
 
@@ -93,7 +93,7 @@ def _process(rank: int, folder: Path, shards: list[list[list[list[int]]]]) -> No
     results = []
     for processes in shards:
         metrics = MetricCollection([PoseQuartiles(), PoseRecall()]).to(torch.device("cpu"))
-        mean = MeanOverPairs()
+        mean = MeanOverProblems()
         for rows in processes[rank]:
             metrics.update(select(random_errors(0, 7), rows))
             mean.update(torch.tensor(rows) ** 2.0, torch.tensor(rows))

@@ -223,5 +223,5 @@ def test_bad_input_raises_one_clear_error() -> None:
     with pytest.raises(ValueError, match="expected finite thresholds >= 0"):
         RecallThresholds(joint=[(1, math.inf)])
     nan = torch.full((1,), math.nan, dtype=torch.float64)
-    with pytest.raises(ValueError, match="expected a rotation error for each pair, got NaN"):
+    with pytest.raises(ValueError, match="expected a rotation error for each problem, got NaN"):
         pose_quartiles(PoseErrors(nan, nan, nan, nan))

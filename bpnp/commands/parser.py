@@ -130,8 +130,8 @@ def _word(kind: Any) -> tuple[Any, str | int | None]:
 
 LIGHTNING = {
     "fit": "Train a solver.",
-    "validate": "Evaluate a solver on the validation pairs.",
-    "test": "Evaluate a solver on the test pairs and write their results.",
+    "validate": "Evaluate a solver on the validation problems.",
+    "test": "Evaluate a solver on the test problems and write their results.",
 }
 # What `bpnp fit --help GROUP` shows: the options that begin with these.
 GROUPS = {
@@ -148,8 +148,8 @@ OPTIONS = {
     "--seed_everything N": "seed",
     "--data CLASS": "class path of the data, such as bpnp.datamodules.MeshDataModule",
     "--data.root FOLDER": "where they are; procedural shapes without it",
-    "--data.num_points N": "points a pair",
-    "--data.batch_size N": "pairs a step",
+    "--data.num_points N": "points a problem",
+    "--data.batch_size N": "problems a step",
     "--model CLASS": "class path of a LightningModule in place of BlindPnPTask",
     "--model.solver CLASS": "class path of an nn.Module from Batch to Prediction",
     "--model.weights NAME": "start from packaged weights, or from a checkpoint",

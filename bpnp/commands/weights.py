@@ -1,4 +1,4 @@
-"""`bpnp convert-weights`: the authors' released weights as a checkpoint."""
+"""`bpnp convert-weights`: the authors' weights as a checkpoint."""
 
 from pathlib import Path
 from typing import Any, Literal
@@ -14,10 +14,10 @@ def convert_weights(
     ransac: Literal["poselib", "opencv"] = "poselib",
     pnp: Literal["newton", "lbfgs"] = "newton",
 ) -> None:
-    """Convert the weights that the authors of BPnPNet released into a checkpoint of bpnp.
+    """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
 
     The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. Raises ValueError or OSError as
-    `load_released` does, and leaves no file that is half written.
+    `load_authors_weights` does, and leaves no file that is half written.
 
     Args:
         file: the authors' file, *.pth.tar.
@@ -28,10 +28,10 @@ def convert_weights(
     import lightning
     import torch
 
-    from bpnp.models.released import load_released
+    from bpnp.models.authors import load_authors_weights
     from bpnp.training.task import BlindPnPTask
 
-    task = BlindPnPTask(load_released(file, backend=ransac, method=pnp))
+    task = BlindPnPTask(load_authors_weights(file, backend=ransac, method=pnp))
     checkpoint: dict[str, Any] = {
         "epoch": 0,
         "global_step": 0,

@@ -32,9 +32,9 @@ def sinkhorn(
     max_iterations: int = 1000,
     backward_stats: BackwardStats | None = None,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Joint probability P of every pair: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 8).
+    """Joint probability P of every match: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 8).
 
-    cost: M, infinite for a pair that cannot be.
+    cost: M, infinite for a match that cannot be.
     mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).
     row_marginal, col_marginal: r and c, each summing to one over real points (default uniform); they receive gradients.
     mask2d, mask3d: True at real points; a padded row or column gets no mass.

@@ -46,7 +46,7 @@ def newton(
         lower = (trial.value < current.value) | (flat & (trial.gradient.norm(dim=-1) < current.gradient.norm(dim=-1)))
         accept = usable & lower
         rotation, translation = choose(accept, new_rotation, rotation), choose(accept, new_translation, translation)
-        current = Derivatives(*(choose(accept, *pair) for pair in zip(trial, current, strict=True)))
+        current = Derivatives(*(choose(accept, *both) for both in zip(trial, current, strict=True)))
         raised = (10 * damping).clamp_min(1e-3)
         lowered = torch.where(damping > 1e-6, damping / 10, 0)
         damping = torch.where(active, torch.where(accept, lowered, raised), damping)

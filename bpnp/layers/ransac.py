@@ -1,4 +1,4 @@
-"""RANSAC on the most probable pairs: a robust first pose from a soft assignment (paper section 3.3)."""
+"""RANSAC on the most probable matches: a robust first pose from a soft assignment (paper section 3.3)."""
 
 from typing import Literal, NamedTuple
 
@@ -10,14 +10,14 @@ from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.backends import BACKENDS
-from bpnp.robust.consensus import Pairs, in_scene, normalised, residuals, take
+from bpnp.robust.consensus import Matches, in_scene, normalised, residuals, take
 from bpnp.types import SolveStats, unpadded
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]
 
 
 class PairList(NamedTuple):
-    """The most probable pairs of each sample, most probable first."""
+    """The most probable matches of each sample, most probable first."""
 
     index2d: Int[Tensor, "b k"]
     index3d: Int[Tensor, "b k"]
@@ -31,7 +31,7 @@ def top_pairs(
     mask3d: Bool[Tensor, "b n"] | None = None,
     pairs_factor: float = 1.5,
 ) -> PairList:
-    """The k = pairs_factor * min(m, n) pairs of highest probability, m and n counting a sample's real points."""
+    """The k = pairs_factor * min(m, n) matches of highest probability, m and n counting a sample's real points."""
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
@@ -62,7 +62,7 @@ def ransac_pnp(
     max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """Pose from the k = pairs_factor * min(m, n) most probable pairs by RANSAC with a P3P solver.
+    """Pose from the k = pairs_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
 
     assignment: P; only the order of its entries matters. points2d: normalised image coordinates. points3d: scene units.
     backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with 1000 iterations,
@@ -89,13 +89,13 @@ def ransac_pnp(
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
     chosen = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
-    pairs = Pairs(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
-    local, centre, scale = normalised(pairs)
+    matches = Matches(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
+    local, centre, scale = normalised(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
     rotation, translation = (values.squeeze(1) for values in in_scene(poses.unsqueeze(1), centre, scale))
     # The returned pose itself is scored: a refit to the inliers of another pose may have lost them.
     poses = torch.cat([rotation, translation.unsqueeze(-1)], -1).unsqueeze(1)
-    squared, inlier, *_ = (values.squeeze(1) for values in residuals(poses, pairs, threshold**2))
+    squared, inlier, *_ = (values.squeeze(1) for values in residuals(poses, matches, threshold**2))
     count = inlier.sum(-1)
     found = count >= MIN_POINTS
     error = torch.where(inlier, squared, 0).sqrt().sum(-1) / count
@@ -110,7 +110,7 @@ class RansacPnP(nn.Module):
     Args:
         backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
             its device), or auto (torch on cuda, else poselib).
-        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable pairs.
+        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable matches.
         threshold: inlier threshold, normalised image coordinates.
         max_iterations: most hypotheses; the paper has 1000.
         seed: of the sampling.

@@ -22,7 +22,7 @@ SQUARED_FLOOR = 1e-7  # rounding of the product of two float32 unit vectors
 
 
 class BPnPNet(TrainedNet):
-    """Features of both point sets, transport between them, RANSAC on the best pairs, weighted PnP on all of them.
+    """Features of both point sets, transport between them, RANSAC on the best matches, weighted PnP on all of them.
 
     Every part is a module with its own options and may be replaced by another of the same arguments and results. A
     part that is None is the paper's with its default options.

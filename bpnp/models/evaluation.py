@@ -1,6 +1,6 @@
 """From an assignment to poses, and what an evaluation adds: points matched again under the pose, and refinement.
 
-Both judge a pair (i, j) by d_ij = r_ij^2 / (2 s^2), where r_ij is the chord between bearing i and the direction of
+Both judge a match (i, j) by d_ij = r_ij^2 / (2 s^2), where r_ij is the chord between bearing i and the direction of
 R p_j + t and s the standard deviation of the residuals in radians: -log of a normal density but for a constant.
 """
 
@@ -21,15 +21,15 @@ from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 REFINED = "refined"  # name of the third pose
 FIRST_WIDTH = 5.0  # s of the first round, in widths of the last
-FEATURE_WEIGHT = 0.03  # of the feature distances in a round, where the pose tells true pairs from others better
-FARTHEST = 12.0  # nats; d of a pair five widths apart, beyond which pairs are alike
+FEATURE_WEIGHT = 0.03  # of the feature distances in a round, where the pose tells true matches from others better
+FARTHEST = 12.0  # nats; d of points five widths apart, beyond which all are alike
 TRUST = 0.7  # weight of the assignment in `log_support`; the rest is uniform
 ALONE = 0.2  # share of the image points without a partner
 WIDTH = 0.01  # s of `log_support`, radians: RANSAC's default threshold
 
 
 def ransac_pose(ransac: nn.Module, assignment: Float[Tensor, "b m n"], batch: Batch) -> Pose:
-    """A robust first pose from the most probable pairs; no gradient reaches the assignment.
+    """A robust first pose from the most probable matches; no gradient reaches the assignment.
 
     ransac: a module with the arguments of `bpnp.layers.RansacPnP`.
     """
@@ -92,7 +92,7 @@ def match_again(
 def cost_under_pose(
     cost: Float[Tensor, "b m n"], batch: Batch, pose: Pose, *, width: float, mu: float | Tensor
 ) -> Float[Tensor, "b m n"]:
-    """w M_ij + mu min(d_ij, L): distances M of the features and residuals under a pose judge a pair together.
+    """w M_ij + mu min(d_ij, L): distances M of the features and residuals under a pose judge a match together.
 
     The entropic transport of this cost assigns in proportion to exp(-w M_ij / mu) times a normal density of the
     residual with a floor. No gradient reaches the pose; a sample without one keeps its M.
@@ -180,5 +180,5 @@ def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
 def _chosen(chosen: Bool[Tensor, " b"], first: Pose, second: Pose) -> Pose:
     """The first pose of the chosen samples, the second of the others."""
     fields = ((pose.rotation, pose.translation, *vars(pose.stats).values()) for pose in (first, second))
-    rotation, translation, *stats = (choose(chosen, *pair) for pair in zip(*fields, strict=True))
+    rotation, translation, *stats = (choose(chosen, *both) for both in zip(*fields, strict=True))
     return Pose(rotation, translation, SolveStats(*stats))

@@ -113,7 +113,7 @@ class Matcher(TrainedNet):
     def transport(self, batch: Batch) -> tuple[Float[Tensor, "b rows cols"], SolveStats]:
         """Plan over the points and one bin on each side (last row, last column).
 
-        Every real point has the mass 1 / (m + n), each bin that of the other side's points. A pair costs the distance
+        Every real point has the mass 1 / (m + n), each bin that of the other side's points. A match costs the distance
         of the unit features, a point its own cost to leave.
         """
         batch = batch.to(self.bin_cost.dtype)

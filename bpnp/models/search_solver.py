@@ -23,7 +23,7 @@ class Search(nn.Module):
 
     Args:
         seed: of the starts.
-        time_limit: seconds a pair; none for no limit.
+        time_limit: seconds a problem; none for no limit.
         settings: of the search.
     """
 

@@ -1,4 +1,4 @@
-"""RANSAC of this and of other libraries on candidate pairs: one signature, one pose a sample."""
+"""RANSAC of this and of other libraries on candidate matches: one signature, one pose a sample."""
 
 from collections.abc import Callable
 from functools import partial
@@ -13,24 +13,24 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
-from bpnp.robust.consensus import Pairs, consensus, residuals
+from bpnp.robust.consensus import Matches, consensus, residuals
 
 FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
 SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
-Estimator = Callable[[Pairs, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]
+Estimator = Callable[[Matches, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]
 
 
 def _each(
-    estimate: SingleEstimator, pairs: Pairs, threshold: float, max_iterations: int, seed: int
+    estimate: SingleEstimator, matches: Matches, threshold: float, max_iterations: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
-    """One sample after the other; those with fewer than 4 pairs have no pose and no iterations."""
-    poses, iterations = pairs.points3d.new_full((len(pairs.real), 3, 4), torch.nan), pairs.real.sum(-1)
+    """One sample after the other; those with fewer than 4 matches have no pose and no iterations."""
+    poses, iterations = matches.points3d.new_full((len(matches.real), 3, 4), torch.nan), matches.real.sum(-1)
     for i, count in enumerate(iterations.tolist()):
         iterations[i] = 0 if count < MIN_POINTS else max_iterations
-        x, p = (points[i][pairs.real[i]].cpu().numpy() for points in pairs[:2])
+        x, p = (points[i][matches.real[i]].cpu().numpy() for points in matches[:2])
         if count >= MIN_POINTS and (found := estimate(x, p, threshold, max_iterations, seed)) is not None:
             poses[i], iterations[i] = torch.as_tensor(found[0]), found[1]
     return poses, iterations
@@ -70,12 +70,12 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
 
 
 def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
-    pairs = Pairs(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
-    return int(residuals(torch.as_tensor(pose)[None, None], pairs, threshold**2).inlier.sum())
+    matches = Matches(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
+    return int(residuals(torch.as_tensor(pose)[None, None], matches, threshold**2).inlier.sum())
 
 
-# Pairs as `bpnp.robust.consensus.normalised` gives them, most probable first, threshold, most hypotheses, seed -> poses
-# [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
+# Matches as `bpnp.robust.consensus.normalised` gives them, most probable first, threshold, most hypotheses, seed ->
+# poses [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
 BACKENDS: dict[str, Estimator] = {
     "poselib": partial(_each, _poselib),
     "opencv": partial(_each, _opencv),

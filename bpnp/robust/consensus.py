@@ -14,13 +14,13 @@ from torch import Tensor
 from bpnp.geometry import bearings, retract, transform
 from bpnp.robust.p3p import poses_of_triples, take
 
-SMALLEST_POOL = 16  # pairs of largest weight, from which the first triples of a growing pool are drawn
+SMALLEST_POOL = 16  # matches of largest weight, from which the first triples of a growing pool are drawn
 
 
 def growing_pool(count: Int[Tensor, " b"], draws: int) -> Float[Tensor, "b d"]:
     """Size of the pool of each draw: it grows geometrically from SMALLEST_POOL to `count`.
 
-    The order of growth is that of PROSAC (Chum, Matas, CVPR 2005): pairs of large weight are tried first.
+    The order of growth is that of PROSAC (Chum, Matas, CVPR 2005): matches of large weight are tried first.
     """
     progress = (torch.arange(draws, device=count.device, dtype=torch.float64) + 0.5) / draws
     last = count.clamp(min=3).unsqueeze(-1).double()
@@ -65,8 +65,8 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
 CHUNK = 2**18  # residuals scored at a time: 1 MiB in float32, which stays in the cache of a core
 
 
-class Pairs(NamedTuple):
-    """Candidate pairs of a 2D and a 3D point; `real` is False for padding, whose points are zero."""
+class Matches(NamedTuple):
+    """Candidate matches of a 2D and a 3D point; `real` is False for padding, whose points are zero."""
 
     points2d: Float[Tensor, "b k 2"]
     points3d: Float[Tensor, "b k 3"]
@@ -74,7 +74,7 @@ class Pairs(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Of c poses on k pairs. inlier: real, in front of the camera and with a reprojection error below the threshold."""
+    """Of c poses on k matches. inlier: real, in front of the camera, and with an error below the threshold."""
 
     squared: Float[Tensor, "b c k"]
     inlier: Bool[Tensor, "b c k"]
@@ -82,39 +82,39 @@ class Residuals(NamedTuple):
     camera: Float[Tensor, "b c k 3"]
 
 
-def normalised(pairs: Pairs) -> tuple[Pairs, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
-    """The pairs in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
+def normalised(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
+    """The matches in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
 
     A scene far from its origin then loses no digits in the minimal solver. Points with NaN or infinity are not real.
     """
-    usable = pairs.real & pairs.points2d.isfinite().all(-1) & pairs.points3d.isfinite().all(-1)
+    usable = matches.real & matches.points2d.isfinite().all(-1) & matches.points3d.isfinite().all(-1)
     real = usable.unsqueeze(-1)
-    image, scene = (torch.where(real, points, 0).double() for points in pairs[:2])
+    image, scene = (torch.where(real, points, 0).double() for points in matches[:2])
     count = usable.sum(-1, keepdim=True).clamp(min=1)
     centre = scene.sum(1) / count
     scene = torch.where(real, scene - centre.unsqueeze(1), 0)
     scale = (scene.square().sum((1, 2)).unsqueeze(-1) / count).sqrt().clamp(min=1e-300)
-    return Pairs(image, scene / scale.unsqueeze(-1), usable), centre, scale
+    return Matches(image, scene / scale.unsqueeze(-1), usable), centre, scale
 
 
 def in_scene(
     poses: Float[Tensor, "b c 3 4"], centre: Float[Tensor, "b 3"], scale: Float[Tensor, "b 1"]
 ) -> tuple[Float[Tensor, "b c 3 3"], Float[Tensor, "b c 3"]]:
-    """Rotation and translation, in the scene's own coordinates, of poses that were found on normalised pairs."""
+    """Rotation and translation, in the scene's own coordinates, of poses that were found on normalised matches."""
     rotation = poses[..., :3]
     return rotation, scale.unsqueeze(1) * poses[..., 3] - (rotation @ centre[:, None, :, None]).squeeze(-1)
 
 
 def truncated_scores(
-    poses: Float[Tensor, "b c 3 4"], pairs: Pairs, threshold2: float | Float[Tensor, "b 1 1"]
+    poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float | Float[Tensor, "b 1 1"]
 ) -> Float[Tensor, "b c"]:
-    """sum_i min(r_i^2, threshold2) over the real pairs, r_i the reprojection error, infinite behind the camera.
+    """sum_i min(r_i^2, threshold2) over the real matches, r_i the reprojection error, infinite behind the camera.
 
     Computed in float32. NaN for a pose that is NaN.
     """
-    x, y = pairs.points2d.float().unsqueeze(1).unbind(-1)
-    scene = torch.cat([pairs.points3d.float(), torch.ones_like(x).mT], -1).mT
-    real = pairs.real.unsqueeze(1).float()
+    x, y = matches.points2d.float().unsqueeze(1).unbind(-1)
+    scene = torch.cat([matches.points3d.float(), torch.ones_like(x).mT], -1).mT
+    real = matches.real.unsqueeze(1).float()
     # x' - x = (row_0 - x row_2) [p; 1] / depth: one product for the numerator, and the depth is only squared.
     along_x, along_y = torch.cat([scene, -x * scene], 1), torch.cat([scene, -y * scene], 1)
     scores = []
@@ -128,50 +128,53 @@ def truncated_scores(
     return torch.cat(scores, 1)
 
 
-def residuals(poses: Float[Tensor, "b c 3 4"], pairs: Pairs, threshold2: float) -> Residuals:
-    """Reprojection error of every pair under every pose, in the type of the points."""
-    points3d = pairs.points3d.unsqueeze(1).expand(-1, poses.shape[1], -1, -1)
+def residuals(poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float) -> Residuals:
+    """Reprojection error of every match under every pose, in the type of the points."""
+    points3d = matches.points3d.unsqueeze(1).expand(-1, poses.shape[1], -1, -1)
     camera = transform(poses[..., :3], poses[..., 3], points3d)
-    residual = camera[..., :2] / camera[..., 2:] - pairs.points2d.unsqueeze(1)
+    residual = camera[..., :2] / camera[..., 2:] - matches.points2d.unsqueeze(1)
     squared = residual.square().sum(-1)
-    inlier = (squared < threshold2) & (camera[..., 2] > 0) & pairs.real.unsqueeze(1)
+    inlier = (squared < threshold2) & (camera[..., 2] > 0) & matches.real.unsqueeze(1)
     return Residuals(squared, inlier, residual, camera)
 
 
-SUBSET = 512  # pairs of largest weight, on which all hypotheses are scored; with 256, poses are lost at 10 % inliers
-SHORTLIST = 256  # hypotheses that are then scored on all pairs
+SUBSET = 512  # matches of largest weight, on which all hypotheses are scored; with 256, poses are lost at 10 % inliers
+SHORTLIST = 256  # hypotheses that are then scored on all matches
 REFINED = 16  # hypotheses that are refined locally on the subset
-LOCAL_STEPS, FINAL_STEPS = 4, 6  # Gauss-Newton steps of these, and of the best one on all pairs
+LOCAL_STEPS, FINAL_STEPS = 4, 6  # Gauss-Newton steps of these, and of the best one on all matches
 DAMPING = 1e-9  # share of the Hessian's mean diagonal
 
 
 def consensus(
-    pairs: Pairs, threshold: float, hypotheses: int, seed: int
+    matches: Matches, threshold: float, hypotheses: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
     """Pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2), and `hypotheses`.
 
-    pairs: as `bpnp.robust.consensus.normalised` gives them, most probable first. A point may be in many pairs.
-    hypotheses: triples for each sample. They come from a pool of the most probable pairs that grows to all pairs
+    matches: as `bpnp.robust.consensus.normalised` gives them, most probable first. A point may be in many matches.
+    hypotheses: triples for each sample. They come from a pool of the most probable matches that grows to all matches
     (PROSAC; Chum, Matas, CVPR 2005), `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an
     outlier), and the best are refined. A last fit uses Cauchy's loss with a scale of four times the median squared
-    residual of the inliers (95 % efficient for normal noise), which reduces the influence of wrong pairs below the
+    residual of the inliers (95 % efficient for normal noise), which reduces the influence of wrong matches below the
     threshold. Computed in float64 but for the scores. A sample without a pose may hold any, or NaN.
     """
     threshold2 = threshold**2
-    subset = Pairs(*(values[:, :SUBSET] for values in pairs))
-    triples = distinct_triples(growing_pool(pairs.real.sum(-1), hypotheses), seed)
-    triples = triples.clamp(max=pairs.real.shape[1] - 1).flatten(1)  # fewer than three pairs: repeated ones, no pose
-    rays, scene = (take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(pairs.points2d), pairs.points3d))
+    subset = Matches(*(values[:, :SUBSET] for values in matches))
+    triples = distinct_triples(growing_pool(matches.real.sum(-1), hypotheses), seed)
+    # Fewer than three matches: repeated ones, no pose.
+    triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
+    rays, scene = (
+        take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(matches.points2d), matches.points3d)
+    )
     poses = poses_of_triples(rays, scene)
     poses = _best(poses, truncated_scores(poses, subset, threshold2), SHORTLIST)
-    poses = _best(poses, truncated_scores(poses, pairs, threshold2), REFINED)
+    poses = _best(poses, truncated_scores(poses, matches, threshold2), REFINED)
     poses = refine_locally(poses, subset, threshold2, LOCAL_STEPS)
-    pose = _best(poses, truncated_scores(poses, pairs, threshold2), 1)
-    pose = refine_locally(pose, pairs, threshold2, FINAL_STEPS)
-    squared, inlier, *_ = residuals(pose, pairs, threshold2)
+    pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
+    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS)
+    squared, inlier, *_ = residuals(pose, matches, threshold2)
     median = torch.where(inlier, squared, torch.nan).nanmedian(-1).values.nan_to_num(threshold2)
-    pose = refine_locally(pose, pairs, threshold2, FINAL_STEPS, cauchy=4 * median)
-    return pose.squeeze(1), pairs.real.sum(-1).fill_(hypotheses)
+    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS, cauchy=4 * median)
+    return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
 
 
 def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: int) -> Float[Tensor, "b s 3 4"]:
@@ -181,7 +184,7 @@ def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: in
 
 def refine_locally(
     poses: Float[Tensor, "b c 3 4"],
-    pairs: Pairs,
+    matches: Matches,
     threshold2: float,
     steps: int,
     *,
@@ -199,11 +202,11 @@ def refine_locally(
     lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
     damping = DAMPING * torch.eye(6, dtype=poses.dtype, device=poses.device)
     for _ in range(steps + 1):
-        squared, inlier, residual, camera = residuals(poses, pairs, threshold2)
+        squared, inlier, residual, camera = residuals(poses, matches, threshold2)
         loss, weight = torch.where(inlier, squared, threshold2), inlier.to(squared.dtype)
         if scale is not None:
             loss, weight = scale * (loss / scale).log1p(), weight / (1 + loss / scale)
-        score = loss.mul(pairs.real.unsqueeze(1)).sum(-1)
+        score = loss.mul(matches.real.unsqueeze(1)).sum(-1)
         better = score < lowest
         best, lowest = torch.where(better[..., None, None], poses, best), torch.where(better, score, lowest)
         jacobian = _jacobian(camera, camera - poses[..., None, :, 3], inlier)

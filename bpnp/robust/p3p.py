@@ -30,7 +30,7 @@ class P3P(NamedTuple):
 
 
 def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) -> P3P:
-    """Solve d_i f_i = R p_i + t, d_i > 0, for three pairs (rows of the last two axes).
+    """Solve d_i f_i = R p_i + t, d_i > 0, for three matches (rows of the last two axes).
 
     With x = d_0/d_2 and y = d_1/d_2 the law of cosines in the triangles at the camera gives two conics in (x, y). One
     real root s of the cubic det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at

@@ -1,6 +1,6 @@
-"""Poses proposed by a soft assignment: P3P on triples of pairs drawn in proportion to their probability.
+"""Poses proposed by a soft assignment: P3P on triples of matches drawn in proportion to their probability.
 
-Where an assignment has few true pairs among its most probable ones, some of these are near the true pose all the same.
+Where an assignment has few true matches among its most probable ones, some are near the true pose all the same.
 """
 
 import math
@@ -13,13 +13,13 @@ from bpnp.checks import check_positive, checked_shapes
 from bpnp.distinct_poses import distinct
 from bpnp.geometry import bearings
 from bpnp.precision import full_precision
-from bpnp.robust.consensus import Pairs, in_scene, normalised, take, truncated_scores, weighted_draws
+from bpnp.robust.consensus import Matches, in_scene, normalised, take, truncated_scores, weighted_draws
 from bpnp.robust.p3p import poses_of_triples
 from bpnp.types import SolveStats
 
 TRIPLES = 1024  # solved for each sample
 DRAWN_EACH = 4  # triples drawn for each that is solved: those of the widest triangles
-SCORED = 512  # pairs drawn to score the poses on
+SCORED = 512  # matches drawn to score the poses on
 APART_DEG = 15.0  # smallest angle between two proposals
 
 
@@ -37,10 +37,10 @@ def pose_hypotheses(
     threshold: float = 0.2,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"], SolveStats]:
-    """The s = `count` best poses, any two of them 15 degrees apart, of triples of pairs drawn in proportion to P.
+    """The s = `count` best poses, any two of them 15 degrees apart, of triples of matches drawn in proportion to P.
 
     Of the triples drawn those with the largest products of their triangles' areas on both sides are solved (`p3p`): a
-    small triangle magnifies the errors of its pairs. A pose scores sum_k min(r_k^2, threshold^2) over other pairs k
+    small triangle magnifies the errors of its matches. A pose scores sum_k min(r_k^2, threshold^2) over other matches k
     drawn from P, r_k the reprojection error and infinite behind the camera, which estimates the expectation under P.
 
     assignment: P, non-negative, of any sum. points2d: normalised image coordinates. points3d: scene units.
@@ -61,10 +61,10 @@ def pose_hypotheses(
     usable = mass.isfinite() & (mass > 0) & (torch.minimum(real2d.sum(-1), real3d.sum(-1)) >= 3)
 
     drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN_EACH * TRIPLES, seed)
-    chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
-    pairs, centre, scale = normalised(chosen)
-    poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in pairs[:2]))
-    sample = Pairs(*(values[:, :SCORED] for values in pairs))
+    chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
+    matches, centre, scale = normalised(chosen)
+    poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in matches[:2]))
+    sample = Matches(*(values[:, :SCORED] for values in matches))
     threshold2 = threshold**2 * _variance(points2d, real2d)
     score = truncated_scores(poses, sample, threshold2.float()[:, None, None]) / SCORED
 
@@ -92,7 +92,7 @@ def drawn_poses(
     seed: int,
     aligned: bool = False,
 ) -> Float[Tensor, "b s 3 4"]:
-    """All poses of the widest quarter of so many triples of pairs drawn in proportion to P; NaN in empty slots.
+    """All poses of the widest quarter of so many triples of matches drawn in proportion to P; NaN in empty slots.
 
     The arguments are those of `pose_hypotheses`, unpadded; P has mass. aligned: whether the axes of the scene are about
     those of the camera. Of the wider half of the triples those are solved, an eighth of all, whose triangles are most
@@ -100,9 +100,9 @@ def drawn_poses(
     """
     drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]
-    chosen = Pairs(take(points2d, drawn // n), take(points3d, drawn % n), torch.ones_like(drawn, dtype=torch.bool))
-    pairs, centre, scale = normalised(chosen)
-    poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in pairs[:2]), aligned=aligned)
+    chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), torch.ones_like(drawn, dtype=torch.bool))
+    matches, centre, scale = normalised(chosen)
+    poses = _poses_of_widest(*(points.unflatten(1, (-1, 3)) for points in matches[:2]), aligned=aligned)
     rotation, translation = in_scene(poses, centre, scale)
     return torch.cat([rotation, translation.unsqueeze(-1)], -1)
 

@@ -123,16 +123,16 @@ class OfflineWandbLogger(WandbLogger):
 
 
 class TrainingMonitor(Callback):
-    """Logs "train/pairs_per_second" per epoch and, of the first few validation pairs, "val/true_match_mass", the
+    """Logs "train/pairs_per_second" per epoch and, of the first few validation problems, "val/true_match_mass", the
     probability that the assignment gives to their true matches, "val/<estimate>_iterations" of each pose, and
     "val/feature_spread_2d" and "_3d" (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a
     set have the same feature the assignment is uniform, and the loss stays where it is.
 
-    Every `every` epochs the same pairs are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
+    Every `every` epochs the same problems are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
     of the trainer's default_root_dir.
 
     Args:
-        pairs: how many validation pairs are watched.
+        pairs: how many validation problems are watched.
         every: epochs between pictures; 0 for none.
     """
 
@@ -161,7 +161,7 @@ class TrainingMonitor(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if batch_idx == 0 and self.watched is None:
-            self.watched = first_pairs(batch, self.pairs)
+            self.watched = first_problems(batch, self.pairs)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.watched is None or trainer.sanity_checking:
@@ -182,8 +182,8 @@ class TrainingMonitor(Callback):
             _draw(trainer, views_from(prediction, batch))
 
 
-def first_pairs(batch: Batch, count: int) -> Batch:
-    """The first pairs of a batch, on the CPU."""
+def first_problems(batch: Batch, count: int) -> Batch:
+    """The first problems of a batch, on the CPU."""
     parts: dict[str, Any] = {
         name: value[:count].cpu() if isinstance(value, Tensor) else value and value[:count]
         for name, value in vars(batch).items()
@@ -203,7 +203,7 @@ def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
 
 
 def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
-    """Mean over the pairs of the probability on true matches, and of the iterations of each pose."""
+    """Mean over the problems of the probability on true matches, and of the iterations of each pose."""
     values = {f"{name}_iterations": pose.stats.iterations.float().mean() for name, pose in prediction.poses.items()}
     if prediction.assignment is not None and batch.match3d is not None:
         matched = batch.match3d >= 0

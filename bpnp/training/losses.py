@@ -1,4 +1,4 @@
-"""What a solver is trained with (paper Eqs. 9 to 13): the true pairs of an assignment, the true pose, or neither.
+"""What a solver is trained with (paper Eqs. 9 to 13): the true matches of an assignment, the true pose, or neither.
 
 Every loss is one value per sample; the mean over a batch is the caller's.
 """
@@ -54,13 +54,13 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
     known = correspondence_losses(prediction, batch, angle=angle)
     if known is None:
         raise ValueError(
-            "expected pairs with `match3d` for matching_loss correspondence, got none; try matching_loss reprojection"
+            "expected problems with `match3d` for matching_loss correspondence, got none; try reprojection"
         )
     return Losses(known, everyone)
 
 
 def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
-    """The values of a user's loss. Raises ValueError unless they are one number a pair."""
+    """The values of a user's loss. Raises ValueError unless they are one number a problem."""
     values = loss(prediction, batch)
     if not isinstance(values, Tensor) or values.shape != (len(batch),):
         got = tuple(values.shape) if isinstance(values, Tensor) else type(values).__name__
@@ -72,8 +72,8 @@ def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
     """L_c per sample (paper Eq. 9); None if there is no assignment, or nothing to compare it with.
 
-    angle: None for the true pairs; else all pairs within it, radians, under the true pose: supervision by the pose
-        alone, with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], of which several may be of one point.
+    angle: None for the true matches; else all points within it of each other, radians, under the true pose: supervision
+        by the pose alone, with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], of which several may be of one point.
     """
     if prediction.assignment is None:
         return None
@@ -110,10 +110,10 @@ def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor,
 def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tensor, " b"]:
     """Negative log likelihood of the true partner of each point, -log P(j | i) and -log P(i | j), in nats.
 
-    A mean over the true pairs (both directions) plus, where the assignment has bins, a mean over the points without a
+    A mean over the true matches (both directions) plus, where the assignment has bins, a mean over the points without a
     partner of -log P(bin | i): balanced, whatever their numbers. Its gradient does not vanish where the probability of
-    the true pair is small, as that of `correspondence_loss` does; otherwise it asks for the same optimum. Raises
-    ValueError for a prediction without an assignment or a batch without its pairs.
+    the true match is small, as that of `correspondence_loss` does; otherwise it asks for the same optimum. Raises
+    ValueError for a prediction without an assignment or a batch without its matches.
     """
     assignment, match3d = prediction.assignment, batch.match3d
     if assignment is None or match3d is None:
@@ -164,8 +164,8 @@ def pose_loss(
 def reprojection_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
     """sum_ij P_ij angle(f_i, R p_j + t) / sum_ij P_ij in radians (Eq. 2 with P for C), a pose solved from P.
 
-    Neither the true pose nor the true pairs are looked at (paper section 5). The gradient reaches the assignment itself
-    and, through a differentiable solver, the pose. A sample whose pose did not converge has loss zero and no gradient:
+    Neither true pose nor true matches are looked at (paper section 5). The gradient reaches the assignment itself and,
+    through a differentiable solver, the pose. A sample whose pose did not converge has loss zero and no gradient:
     leave it out of means by `pose.stats.converged`.
     """
     solved = pose.stats.converged

@@ -22,7 +22,7 @@ NUMBER = "try Batch.from_arrays(..., index=...) with the position of each proble
 
 
 class ResultsWriter(Callback):
-    """Writes `pairs.csv`, `summary.json`, the points of some pairs and a few points of every problem after a test.
+    """Writes `pairs.csv`, `summary.json`, the points of some problems and a few points of every problem after a test.
 
     Args:
         folder: where; null for `test` in the trainer's default_root_dir.
@@ -63,7 +63,7 @@ class ResultsWriter(Callback):
         rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """Of an interrupted test the pairs that are finished; of several processes those of the first."""
+        """Of an interrupted test the problems that are finished; of several processes those of the first."""
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
             self._write_test(trainer, [(self.rows, self.losses, self.chosen, self.views)], complete=False)
 
@@ -79,7 +79,8 @@ class ResultsWriter(Callback):
             write_views(folder, [*chosen, *(view for *_, part in gathered for view in part)])
             report([folder])
             rank_zero_info(
-                f"{'' if complete else 'interrupted: '}results of {len({row.index for row in rows})} pairs in {folder}"
+                f"{'' if complete else 'interrupted: '}results of {len({row.index for row in rows})} problems "
+                f"in {folder}"
             )
 
     def _check_replaced(self, trainer: Trainer) -> None:

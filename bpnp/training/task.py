@@ -17,7 +17,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MetricCollection
 
 from bpnp.layers.implicit import BackwardStats
-from bpnp.metrics import MeanOverPairs, PoseQuartiles, PoseRecall, pose_errors
+from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
 from bpnp.models.weights import AnyModule, TrainedNet, chosen, described, fitting_state, read_checkpoint
@@ -53,10 +53,10 @@ class BlindPnPTask(LightningModule):
             `PoseLossWarmup` raises it.
         matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
             negative log likelihood of each point's partner (`matching_likelihood_loss`); reprojection for the angle
-            between the pairs under the solved pose, without labels (Eq. 2).
-        correspondence_angle: with L_c, supervise by the pose alone: pairs within this angle (radians) count as
+            between matches under the solved pose, without labels (Eq. 2).
+        correspondence_angle: with L_c, supervise by the pose alone: points within this angle (radians) count as
             correspondences; null for the true ones.
-        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a pair (b,); NaN for a pair that
+        loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a problem (b,); NaN for one that
             has none. With its attribute `needs_pose = False`, a training step gives it a prediction without poses.
         refine_validation: whether validation refines poses, as tests do; it takes most of the time of a validation.
     """
@@ -101,7 +101,7 @@ class BlindPnPTask(LightningModule):
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
-        self.metrics = nn.ModuleDict({stage: MeanOverPairs() for stage in self.estimates})
+        self.metrics = nn.ModuleDict({stage: MeanOverProblems() for stage in self.estimates})
         for stage, names in self.estimates.items():
             for name in names:
                 self.metrics[f"{stage}_{name}"] = MetricCollection([PoseQuartiles(), PoseRecall()])
@@ -126,7 +126,7 @@ class BlindPnPTask(LightningModule):
         return self._evaluate(batch, "val")
 
     def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Any]:
-        """The prediction, the seconds that it took, and the correspondence loss per pair; for the results writer."""
+        """The prediction, its seconds, and the correspondence loss of each problem; for the results writer."""
         return self._evaluate(batch, "test")
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
@@ -274,7 +274,7 @@ class BlindPnPTask(LightningModule):
             for place in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
                 # The metrics have already been gathered over processes.
                 self.log_dict({f"{place}/{key}": value.float() for key, value in values.items()})
-        loss = cast(MeanOverPairs, self.metrics[stage])
+        loss = cast(MeanOverProblems, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from authors_network import Released, checkpoint
 from planted_model import plant_model
-from released_network import Released, checkpoint
 from released_pickles import sample, write
 from small_data import SMALL_NET, write_mesh_tree
 

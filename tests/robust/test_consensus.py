@@ -13,7 +13,7 @@ from torch._subclasses.fake_tensor import FakeTensorMode
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
 from bpnp.robust import consensus as scoring
-from bpnp.robust.consensus import Pairs, residuals, truncated_scores
+from bpnp.robust.consensus import Matches, residuals, truncated_scores
 from bpnp.types import SolveStats
 
 THRESHOLD = 0.01
@@ -21,7 +21,7 @@ THRESHOLD = 0.01
 
 def problem(
     seed: int, *, pairs: int = 600, inliers: float = 0.3, lead: float = 2.0, noise: float = 0.0025
-) -> tuple[Planted, Pairs, Tensor]:
+) -> tuple[Planted, Matches, Tensor]:
     """Candidate pairs of 400 points in any order, a share of them true, and weights that favour these by `lead`."""
     planted, generator = plant(1, 400, noise=noise, seed=seed), torch.Generator().manual_seed(seed)
     order = torch.randperm(pairs, generator=generator)
@@ -30,12 +30,12 @@ def problem(
     second = torch.where(true, order % 400, other)
     first = torch.where(true, second, (second + other.roll(1)) % 400)
     weights = (torch.randn(pairs, generator=generator, dtype=torch.float64) + lead * true).exp()
-    chosen = Pairs(planted.points2d[:, planted.match3d[0, first]], planted.points3d[:, second], true.unsqueeze(0))
+    chosen = Matches(planted.points2d[:, planted.match3d[0, first]], planted.points3d[:, second], true.unsqueeze(0))
     return planted, chosen._replace(real=torch.ones(1, pairs, dtype=torch.bool)), weights.unsqueeze(0)
 
 
 def consensus(
-    pairs: Pairs, weights: Tensor, *, backend: str = "torch", hypotheses: int = 2048
+    pairs: Matches, weights: Tensor, *, backend: str = "torch", hypotheses: int = 2048
 ) -> tuple[Tensor, Tensor, SolveStats]:
     """The consensus of pairs (b, k): an assignment of each 2D point to the 3D point of the same index."""
     return ransac_pnp(
@@ -116,5 +116,5 @@ def test_neither_the_global_generator_nor_the_parts_nor_autocast_change_the_resu
 def test_no_step_reads_the_data(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("bpnp.layers.ransac.unpadded", lambda _mask: False)  # as on a GPU
     with FakeTensorMode():  # tensors without values: a read raises
-        pairs = Pairs(torch.zeros(2, 50, 2), torch.zeros(2, 50, 3), torch.ones(2, 50, dtype=torch.bool))
+        pairs = Matches(torch.zeros(2, 50, 2), torch.zeros(2, 50, 3), torch.ones(2, 50, dtype=torch.bool))
         assert consensus(pairs, torch.ones(2, 50))[0].shape == (2, 3, 3)

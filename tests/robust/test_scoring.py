@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import rotation_angle
 from bpnp.robust import consensus as scoring
-from bpnp.robust.consensus import Pairs, in_scene, normalised, refine_locally, residuals, truncated_scores
+from bpnp.robust.consensus import Matches, in_scene, normalised, refine_locally, residuals, truncated_scores
 
 
-def problem(noise: float = 0.002) -> tuple[Pairs, torch.Tensor]:
+def problem(noise: float = 0.002) -> tuple[Matches, torch.Tensor]:
     """Two samples of 40 pairs, ten of them wrong and the last five padding, and five poses near the planted ones."""
     planted = plant(2, 40, noise=noise, seed=2)
     points2d = planted.points2d.gather(1, planted.match3d.unsqueeze(-1).expand(-1, -1, 2)).clone()
@@ -23,10 +23,10 @@ def problem(noise: float = 0.002) -> tuple[Pairs, torch.Tensor]:
     for seed in range(5):
         rotation, translation = planted.near(0.003 * seed, seed=seed)
         poses.append(torch.cat([rotation, translation.unsqueeze(-1)], -1))
-    return Pairs(points2d, planted.points3d, real), torch.stack(poses, 1)
+    return Matches(points2d, planted.points3d, real), torch.stack(poses, 1)
 
 
-def by_opencv(pairs: Pairs, pose: torch.Tensor, i: int) -> np.ndarray:
+def by_opencv(pairs: Matches, pose: torch.Tensor, i: int) -> np.ndarray:
     vector = cv2.Rodrigues(pose[:, :3].numpy())[0]
     seen = cv2.projectPoints(pairs.points3d[i].numpy(), vector, pose[:, 3].numpy(), np.eye(3), None)[0][:, 0]
     return np.linalg.norm(seen - pairs.points2d[i].numpy(), axis=-1)
@@ -97,6 +97,6 @@ def test_the_refinement_ends_at_the_optimum_of_the_inliers() -> None:
 def test_poses_are_refined_independently() -> None:
     pairs, poses = problem()
     together = refine_locally(poses, pairs, 0.01**2, 4)
-    alone = refine_locally(poses[1:, 2:3], Pairs(*(v[1:] for v in pairs)), 0.01**2, 4)
+    alone = refine_locally(poses[1:, 2:3], Matches(*(v[1:] for v in pairs)), 0.01**2, 4)
     # Near the optimum, rounding of the score decides which of two iterates is returned.
     assert rotation_angle(alone[0, 0, :, :3], together[1, 2, :, :3]) < 1e-8

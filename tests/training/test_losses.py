@@ -258,7 +258,7 @@ def test_says_what_is_missing() -> None:
     batch = plant(1, 6).batch()
     with pytest.raises(ValueError, match="expected a solver with an assignment to train, got none"):
         matching_losses(Prediction(), batch, kind="likelihood", angle=None)
-    with pytest.raises(ValueError, match="expected pairs with `match3d` for matching_loss correspondence"):
+    with pytest.raises(ValueError, match="expected problems with `match3d` for matching_loss correspondence"):
         matching_losses(
             Prediction(plant(1, 6).permutation()), replace(batch, match3d=None), kind="correspondence", angle=None
         )

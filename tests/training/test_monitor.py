@@ -15,7 +15,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_pairs, watched_values
+from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_problems, watched_values
 
 
 class PlantedModule(LightningModule):
@@ -98,13 +98,13 @@ def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
     assert float(trainer.callback_metrics["val/feature_spread_2d"]) > 0.1
 
 
-def test_the_first_pairs_are_those_of_the_batch() -> None:
+def test_the_first_problems_are_those_of_the_batch() -> None:
     batch = planted(6)
-    few = first_pairs(batch, 2)
+    few = first_problems(batch, 2)
     assert few.ids == batch.ids[:2]
     assert len(few) == 2
     torch.testing.assert_close(few.points3d, batch.points3d[:2])
-    unknown = first_pairs(Batch.from_arrays(np.ones((1, 2)), np.ones((1, 3))), 3)
+    unknown = first_problems(Batch.from_arrays(np.ones((1, 2)), np.ones((1, 3))), 3)
     assert unknown.match3d is None
 
 

@@ -13,7 +13,7 @@ from bpnp.checks import check_positive
 from bpnp.geometry import MIN_POINTS, bearings, project, transform
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
-from bpnp.robust.consensus import Pairs, distinct_triples, refine_locally
+from bpnp.robust.consensus import Matches, distinct_triples, refine_locally
 from bpnp.robust.p3p import p3p
 
 TRIPLES = 256  # random ones, solved at a time
@@ -169,7 +169,7 @@ class Constellation(SingleSolver):
         index2d, index3d, squared = self._matches(problem, pose)
         if len(index2d) >= MIN_POINTS:
             real = torch.ones(1, len(index2d), dtype=torch.bool, device=pose.device)
-            matched = Pairs(problem.points2d[index2d].unsqueeze(0), problem.points3d[index3d].unsqueeze(0), real)
+            matched = Matches(problem.points2d[index2d].unsqueeze(0), problem.points3d[index3d].unsqueeze(0), real)
             refined = refine_locally(pose[None, None], matched, self.radius**2, REFINE_STEPS)[0, 0]
             again, _, squared_again = self._matches(problem, refined)
             if len(again) >= len(index2d):

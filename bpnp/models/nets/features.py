@@ -55,7 +55,7 @@ class PointFeatures(nn.Module):
         coordinates: 2 or 3.
         channels: width of the residual net.
         depth: its residual blocks.
-        batch_norm: batch norm after each context norm, as in the paper's text; the released code has none.
+        batch_norm: batch norm after each context norm, as in the paper's text; the authors' code has none.
         centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
             assignment (ours; off in the paper).
     """

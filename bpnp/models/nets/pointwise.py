@@ -154,7 +154,7 @@ def _pull_back(g: Any, y: Any, floor: float, mean: Any, slope: Any, factor: Any,
         out[j] = (passed - mean[j] - y[j] * slope[j]) * factor[j]
 
 
-CONTEXT_EPS = 1e-3  # as in the released code
+CONTEXT_EPS = 1e-3  # as in the authors' code
 
 
 def pointwise(x: Float[Tensor, "b k c"], weight: Float[Tensor, "d c"], bias: Tensor | None) -> Float[Tensor, "b k d"]:

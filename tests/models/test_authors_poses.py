@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from authors_network import Released, checkpoint, plan
 from numpy.typing import NDArray
-from released_network import Released, checkpoint, plan
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from torch import nn

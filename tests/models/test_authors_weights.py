@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from authors_network import Released, checkpoint, plan
 from lightning import Trainer
-from released_network import Released, checkpoint, plan
 from torch import Tensor, nn
 
 from bpnp import Batch, BPnPNet
 from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
-from bpnp.models.released import load_released, tensor_maps
+from bpnp.models.authors import load_authors_weights, tensor_maps
 from bpnp.training.task import BlindPnPTask
 
 
@@ -48,7 +48,7 @@ def test_counts_are_those_of_the_paper_code(reference: Released) -> None:
 def test_same_cost_and_assignment(reference: Released, tmp_path: Path, zipped: bool) -> None:
     file = tmp_path / "ModelNet40.pth.tar"
     torch.save(checkpoint(reference), file, _use_new_zipfile_serialization=zipped)
-    net = load_released(file).double()
+    net = load_authors_weights(file).double()
     reference = Released()
     reference.load_state_dict(torch.load(file, weights_only=False)["state_dict"])
     reference.double().eval()
@@ -82,7 +82,7 @@ def test_convert_weights_writes_our_checkpoint(
 
 def test_names_with_the_prefix_of_data_parallel(reference: Released, tmp_path: Path) -> None:
     torch.save(checkpoint(nn.DataParallel(reference)), tmp_path / "x")
-    assert isinstance(load_released(tmp_path / "x"), BPnPNet)
+    assert isinstance(load_authors_weights(tmp_path / "x"), BPnPNet)
 
 
 BIAS = "FeatureExtractor2d.conv_11.conv2.0.bias"
@@ -105,7 +105,7 @@ def test_a_wrong_tensor_is_named(
     state = {k: v for k, v in (reference.state_dict() | change).items() if v is not None}
     torch.save({"state_dict": state}, tmp_path / "x.pth.tar")
     with pytest.raises(ValueError, match=message):
-        load_released(tmp_path / "x.pth.tar")
+        load_authors_weights(tmp_path / "x.pth.tar")
 
 
 class Exploit:
@@ -119,13 +119,13 @@ def test_code_in_a_file_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     file = tmp_path / "x.pth.tar"
     torch.save({"state_dict": {}, "optimizer": Exploit()}, file, _use_new_zipfile_serialization=zipped)
     with pytest.raises(ValueError, match=r"system in it .*x\.pth\.tar"):
-        load_released(file)
+        load_authors_weights(file)
     assert not Path("hacked").exists()
 
 
 def test_numpy_scalars_stay_refused_elsewhere(reference: Released, tmp_path: Path) -> None:
     torch.save(checkpoint(reference), tmp_path / "x.pth.tar")
-    load_released(tmp_path / "x.pth.tar")
+    load_authors_weights(tmp_path / "x.pth.tar")
     with pytest.raises(Exception, match="Unsupported"):
         torch.load(tmp_path / "x.pth.tar", weights_only=True)
 
@@ -143,13 +143,13 @@ def test_foreign_and_broken_files(reference: Released, tmp_path: Path) -> None:
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
         with pytest.raises(ValueError, match=f"got .*{name};"):
-            load_released(tmp_path / name)
+            load_authors_weights(tmp_path / name)
     for name, value in {"list": [1], "bare": OrderedDict(a=torch.zeros(1)), "date": {"state_dict": 1}}.items():
         torch.save(value, tmp_path / name)
         with pytest.raises(ValueError, match=f"state_dict.*{name}"):
-            load_released(tmp_path / name)
+            load_authors_weights(tmp_path / name)
     torch.save({"state_dict": {}, "when": datetime.date(2020, 7, 1)}, tmp_path / "object")
     with pytest.raises(ValueError, match=r"datetime\.date in it"):
-        load_released(tmp_path / "object")
+        load_authors_weights(tmp_path / "object")
     with pytest.raises(FileNotFoundError, match="nowhere"):
-        load_released(tmp_path / "nowhere")
+        load_authors_weights(tmp_path / "nowhere")

@@ -1,4 +1,4 @@
-"""The weights that the authors of BPnPNet released (``*.pth.tar``), read into our network.
+"""The weights of BPnPNet's authors (``*.pth.tar``), read into our network.
 
 Source: Campbell, Liu, Gould, "Solving the Blind Perspective-n-Point Problem End-to-End with Robust Differentiable
 Geometric Optimization", ECCV 2020; the names and shapes of the 185 tensors are those of its public code.
@@ -63,8 +63,8 @@ def tensor_maps() -> dict[str, TensorMap]:
     return maps
 
 
-def load_released(path: str | Path, *, backend: Backend = "auto", method: Method = "newton") -> BPnPNet:
-    """The network of a ``*.pth.tar`` file in evaluation mode: the same assignment as the authors' for every pair.
+def load_authors_weights(path: str | Path, *, backend: Backend = "auto", method: Method = "newton") -> BPnPNet:
+    """The network of a ``*.pth.tar`` file in evaluation mode: the same assignment as the authors' for every problem.
 
     backend, method: of `bpnp.layers.RansacPnP` and `bpnp.layers.WeightedPnP`, which have no weights.
     Only tensors, plain containers and numbers are unpickled. Raises FileNotFoundError, or ValueError that names the
@@ -86,7 +86,7 @@ def load_released(path: str | Path, *, backend: Backend = "auto", method: Method
     if problems:
         more = f" and {len(problems) - 3} more problems" if len(problems) > 3 else ""
         raise ValueError(
-            f"expected the {len(maps)} tensors of BPnPNet's released code in {file}, got "
+            f"expected the {len(maps)} tensors of the authors' BPnPNet in {file}, got "
             f"{'; '.join(sorted(problems)[:3])}{more}; try the authors' file as it was downloaded"
         )
     net = BPnPNet(ransac=RansacPnP(backend=backend), pnp=WeightedPnP(method=method))
