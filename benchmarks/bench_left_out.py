@@ -79,16 +79,18 @@ def turn_rows(scene: PhotoScene, photo: str, full: SceneMap, methods: Sequence[s
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         turn, centre = there.pose(rotation, translation)
         found = bool(np.isfinite(rotation).all())
-        rows.append({
-            "photo": f"{scene.photos.name}/{photo}",
-            "method": method,
-            "map": [len(place.views), len(place.points3d)],
-            "rotation_deg": turned_by(turn @ true.rotation.T) if found else 180.0,
-            "centre_percent": float(100 * np.linalg.norm(centre - true.centre) / distance) if found else np.inf,
-            "verdict": verdict,
-            "seconds": seconds,
-            "cpu_seconds": cpu,
-        })  # fmt: skip
+        rows.append(
+            {
+                "photo": f"{scene.photos.name}/{photo}",
+                "method": method,
+                "map": [len(place.views), len(place.points3d)],
+                "rotation_deg": turned_by(turn @ true.rotation.T) if found else 180.0,
+                "centre_percent": float(100 * np.linalg.norm(centre - true.centre) / distance) if found else np.inf,
+                "verdict": verdict,
+                "seconds": seconds,
+                "cpu_seconds": cpu,
+            }
+        )
     return rows
 
 

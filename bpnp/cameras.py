@@ -91,7 +91,7 @@ def in_front(points: Array) -> Array:
         return points / depth
 
 
-def camera_from(given: Any) -> Camera:
+def camera_from(camera: Any) -> Camera:
     """The camera of a 3x3 matrix K, of OpenCV's (K, distortion), of (COLMAP model name, parameters) or (name, width,
     height, parameters), of a mapping with `model` and `params` (and `width`, `height`), or of a pycolmap.Camera; a
     `Camera` as it is.
@@ -99,27 +99,27 @@ def camera_from(given: Any) -> Camera:
     Raises ValueError for a singular or broken K, an unknown model, a wrong number of parameters, or no positive focal
     length.
     """
-    if isinstance(given, (Pinhole, Lens)):
-        return given
-    if hasattr(given, "cam_from_img") and hasattr(given, "img_from_cam"):
-        return _checked(Lens(given), f"{given.params}")
-    if isinstance(given, Mapping):
-        if not {"model", "params"} <= set(given):
-            raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(given)}")
-        return colmap_camera(str(given["model"]), given["params"], (given.get("width", 0), given.get("height", 0)))
-    if isinstance(given, (tuple, list)) and len(given) and isinstance(given[0], str):
-        if len(given) not in (2, 4):
+    if isinstance(camera, (Pinhole, Lens)):
+        return camera
+    if hasattr(camera, "cam_from_img") and hasattr(camera, "img_from_cam"):
+        return _checked(Lens(camera), f"{camera.params}")
+    if isinstance(camera, Mapping):
+        if not {"model", "params"} <= set(camera):
+            raise ValueError(f"expected `camera` with `model` and `params`, got a mapping with {', '.join(camera)}")
+        return colmap_camera(str(camera["model"]), camera["params"], (camera.get("width", 0), camera.get("height", 0)))
+    if isinstance(camera, (tuple, list)) and len(camera) and isinstance(camera[0], str):
+        if len(camera) not in (2, 4):
             raise ValueError(
-                f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(given)} "
+                f"expected `camera` as (model, parameters) or (model, width, height, parameters), got {len(camera)} "
                 "values"
             )
-        return colmap_camera(given[0], given[-1], given[1:-1] or (0, 0))
-    return _opencv(*given) if is_opencv(given) else _pinhole(given)
+        return colmap_camera(camera[0], camera[-1], camera[1:-1] or (0, 0))
+    return _opencv(*camera) if is_opencv(camera) else _pinhole(camera)
 
 
-def is_opencv(given: Any) -> bool:
+def is_opencv(camera: Any) -> bool:
     """Whether a camera is OpenCV's (K, distortion), whose pixels count from (0, 0), the centre of the first one."""
-    return isinstance(given, tuple) and len(given) == 2 and np.shape(given[0]) == (3, 3)
+    return isinstance(camera, tuple) and len(camera) == 2 and np.shape(camera[0]) == (3, 3)
 
 
 def image_size(camera: Camera) -> tuple[int, int] | None:
@@ -154,8 +154,8 @@ def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:
     """A camera as JSON can hold it, which `camera_from` reads again."""
     if isinstance(camera, Pinhole):
         return camera.matrix.tolist()
-    own = camera.camera
-    return {"model": own.model.name, "width": own.width, "height": own.height, "params": own.params.tolist()}
+    lens = camera.camera
+    return {"model": lens.model.name, "width": lens.width, "height": lens.height, "params": lens.params.tolist()}
 
 
 def colmap_camera(model: str, params: Any, size: Any = (0, 0)) -> Lens:
@@ -205,12 +205,12 @@ def camera_models() -> Mapping[int, tuple[str, int]]:
 
 @cache
 def _pycolmap() -> Any:
-    kept = signal.getsignal(signal.SIGTERM)
+    handler = signal.getsignal(signal.SIGTERM)
     import pycolmap
 
     if threading.current_thread() is threading.main_thread():
         # Restore the SIGTERM handler, which pycolmap replaces by one that prints a stack trace.
-        signal.signal(signal.SIGTERM, kept)
+        signal.signal(signal.SIGTERM, handler)
     return pycolmap
 
 
@@ -238,12 +238,12 @@ def _opencv(matrix: Any, distortion: Any) -> Camera:
     return colmap_camera("FULL_OPENCV" if count == 8 else "OPENCV", [fx, fy, cx, cy, *coefficients[:count].tolist()])
 
 
-def _pinhole(given: Any) -> Pinhole:
+def _pinhole(values: Any) -> Pinhole:
     try:
-        matrix = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given, dtype=np.float64)
+        matrix = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values, dtype=np.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(
-            f"expected `camera` as a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, got {given!r:.60}"
+            f"expected `camera` as a 3x3 matrix, (COLMAP model, parameters) or a pycolmap.Camera, got {values!r:.60}"
         ) from error
     if matrix.shape != (3, 3):
         raise ValueError(f"expected a `camera` matrix of shape (3, 3), got {matrix.shape}; try (model, parameters)")

@@ -11,7 +11,7 @@ from bpnp.commands.output import console, progress, say
 from bpnp.files import claimed, interruptions_later
 
 if TYPE_CHECKING:
-    from bpnp.maps.many_photos import PhotoOptions, PhotoTask, SolutionFolder
+    from bpnp.maps.many_photos import PhotoTask, SolutionFolder
     from bpnp.maps.scene_map import SceneMap
     from bpnp.solving.solution import Solution
 
@@ -61,7 +61,7 @@ def localize(
         time_limit: seconds a photo.
         seed: of the search.
     """
-    from bpnp.maps.many_photos import PhotoOptions, SolutionFolder, content_of_map, read_views
+    from bpnp.maps.many_photos import SolutionFolder, content_of_map, read_views
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
     from bpnp.solving.arguments import source_from
@@ -72,12 +72,12 @@ def localize(
     if keypoints is not None and not keypoints.is_file():
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would
-    wanted = None if views is None else read_views(views)
+    options: dict[str, Any] = {"solver": solver, "seed": seed, "time_limit": time_limit, "keypoints": keypoints}
+    options |= {"views": None if views is None else read_views(views), "leave_one_out": leave_one_out}
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
-    lens = None if camera is None else _camera(camera, map, scene)
-    options = PhotoOptions(lens, wanted, keypoints, leave_one_out, solver, seed, time_limit)
+    options |= {"camera": None if camera is None else _camera(camera, map, scene), "map_content": content_of_map(map)}
     with claimed(output):
-        run = _Run(scene, options, SolutionFolder(output, content_of_map(map)), pictures=not no_pictures)
+        run = _Run(scene, options, SolutionFolder(output, options["map_content"]), pictures=not no_pictures)
         run.localize(files, _attempts(cluster))
     run.report(files)
 
@@ -85,7 +85,7 @@ def localize(
 class _Run:
     """The photos of a call: which were kept or are solved again, and which could not be tried, and why."""
 
-    def __init__(self, scene: "SceneMap", options: "PhotoOptions", folder: "SolutionFolder", *, pictures: bool) -> None:
+    def __init__(self, scene: "SceneMap", options: dict[str, Any], folder: "SolutionFolder", *, pictures: bool) -> None:
         self.scene, self.options, self.folder, self.pictures = scene, options, folder, pictures
         self.kept: list[str] = []
         self.again: dict[str, str] = {}
@@ -115,7 +115,7 @@ class _Run:
 
         for name, photo in files.items():
             try:
-                task = photo_task(self.scene, self.folder.map_content, name, photo, self.options)
+                task = photo_task(self.scene, name, photo, **self.options)
             except (ValueError, OSError) as error:
                 self.fail(name, photo, error)
                 advance(name)

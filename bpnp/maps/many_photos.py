@@ -22,27 +22,10 @@ from bpnp.solving.pictures import pose_text
 from bpnp.solving.solution import Solution
 
 MADE_WITH = "made_with"  # beside the fields of a solution in its file
-REPORTED = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold", "log10_false_alarms",
-            "seconds", "rotation", "translation", "camera", MADE_WITH)  # fmt: skip
+REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
+REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", MADE_WITH)
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
 Record = dict[str, Any]  # what results.json has of a photo
-
-
-@dataclass(frozen=True)
-class PhotoOptions:
-    """What applies to all photos.
-
-    camera, keypoints: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for the
-    whole map. leave_one_out: the photos are views of the map and are taken out of it.
-    """
-
-    camera: Any = None
-    views: Mapping[str, Sequence[str]] | None = None
-    keypoints: Path | None = None
-    leave_one_out: bool = False
-    solver: str = "auto"
-    seed: int = 0
-    time_limit: float | None = None
 
 
 @dataclass(frozen=True)
@@ -59,32 +42,48 @@ class PhotoTask:
 Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or why it could not be tried
 
 
-def photo_task(scene: SceneMap, map_content: str, name: str, photo: Path, options: PhotoOptions) -> PhotoTask:
-    """What to localise a photo with. Raises ValueError for what is wrong with it, its camera, keypoints or views."""
-    content = content_of(photo)
-    chosen, source = options.camera, "--camera"
-    if chosen is None or isinstance(chosen, SceneMap):
-        chosen, source = (chosen or scene).camera_for(photo, exif=chosen is None)
-    views = None if options.views is None else list(options.views.get(name, ()))
-    if views is not None and not views:
+def photo_task(
+    scene: SceneMap,
+    name: str,
+    photo: Path,
+    *,
+    map_content: str = "",
+    camera: Any = None,
+    views: Mapping[str, Sequence[str]] | None = None,
+    keypoints: Path | None = None,
+    leave_one_out: bool = False,
+    solver: str = "auto",
+    **search: Any,
+) -> PhotoTask:
+    """What to localise a photo with.
+
+    camera, keypoints, solver: as for `SceneMap.localize_photo`. views: those to try by the name of the photo, None for
+    the whole map. leave_one_out: the photo is a view of the map and is taken out of it. search: seed and time_limit.
+    Raises ValueError for what is wrong with the photo, its camera, keypoints or views.
+    """
+    photo_content, source = content_of(photo), "--camera"
+    if camera is None or isinstance(camera, SceneMap):
+        camera, source = (camera or scene).camera_for(photo, exif=camera is None)
+    shown = None if views is None else list(views.get(name, ()))
+    if shown is not None and not shown:
         raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
-    detected = "detected"
-    if options.keypoints is not None:
-        points = photo_keypoints(photo, options.keypoints, name)
-        detected = fingerprint([points.pixels.tolist(), points.scores.tolist()])
-    solver = content_of(Path(options.solver)) if Path(options.solver).is_file() else options.solver
-    shared = {"views": views, "seed": options.seed, "time_limit": options.time_limit}
-    camera = plain_camera(camera_from(chosen))
-    return PhotoTask(
-        name,
-        photo.absolute(),
-        {"camera": camera, "keypoints": options.keypoints, "name": name, "solver": options.solver, **shared},
-        {
-            "photo": content, "map": map_content, "keypoints": detected, "camera": fingerprint(camera),
-            "camera_from": source, "solver": solver, "leave_one_out": options.leave_one_out, **shared,
-        },
-        options.leave_one_out,
-    )  # fmt: skip
+    points_content = "detected"
+    if keypoints is not None:
+        keypoints = keypoints.absolute()
+        points = photo_keypoints(photo, keypoints, name)
+        points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
+    lens, shared = plain_camera(camera_from(camera)), {"views": shown, **search}
+    made_with = {
+        "photo": photo_content,
+        "map": map_content,
+        "keypoints": points_content,
+        "camera": fingerprint(lens),
+        "camera_from": source,
+        "solver": content_of(Path(solver)) if Path(solver).is_file() else solver,
+        "leave_one_out": leave_one_out,
+    }
+    arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver}
+    return PhotoTask(name, photo.absolute(), arguments | shared, made_with | shared, leave_one_out)
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:

@@ -100,9 +100,16 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")
     error = fails(
-        "localize", str(model), str(photos / "0004.jpg"), "--camera", CAMERA, "--views", str(pairs),
-        "--output", str(tmp_path / "views"),
-    )  # fmt: skip
+        "localize",
+        str(model),
+        str(photos / "0004.jpg"),
+        "--camera",
+        CAMERA,
+        "--views",
+        str(pairs),
+        "--output",
+        str(tmp_path / "views"),
+    )
     assert "expected names of views of the map, got nowhere.jpg" in error
     assert json.loads((tmp_path / "views/results.json").read_text())["photos"] == {}
 

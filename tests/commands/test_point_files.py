@@ -85,12 +85,16 @@ def test_a_mesh_gives_its_corners_or_its_surface(suffix: str, tmp_path: Path) ->
         ("a.npy", b"", "rows of numbers in .*a.npy"),
         ("a.jpg", b"", "a file that ends in .npy, .csv, .txt, .xyz, .glb, .obj, .off, .ply, .stl"),
         ("a.ply", b"", "a.ply: expected a mesh, got an empty file"),
-        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-                  b"end_header\n0 0 0\n1 1 1\n", "a.ply: expected 4 points, got 2"),
+        (
+            "a.ply",
+            b"ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+            b"end_header\n0 0 0\n1 1 1\n",
+            "a.ply: expected 4 points, got 2",
+        ),
         ("a.stl", b"no mesh", "a.stl: expected"),
         ("a.off", b"OFF\n3 1 0\n0 0 0\n", "truncated"),
     ],
-)  # fmt: skip
+)
 def test_a_broken_file_is_named(name: str, content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(content)
     with pytest.raises(ValueError, match=message):

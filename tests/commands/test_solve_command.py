@@ -59,10 +59,12 @@ def test_json_is_all_that_is_printed(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_mesh_is_found_by_its_corners(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An L-shaped solid has no symmetry that a camera could not tell."""
     rng = np.random.default_rng(0)
-    mesh = trimesh.util.concatenate([
-        trimesh.creation.box(extents=extents).apply_translation(shift)
-        for extents, shift in zip(rng.uniform(0.3, 1, (6, 3)), rng.uniform(-2, 2, (6, 3)), strict=True)
-    ])  # fmt: skip
+    mesh = trimesh.util.concatenate(
+        [
+            trimesh.creation.box(extents=extents).apply_translation(shift)
+            for extents, shift in zip(rng.uniform(0.3, 1, (6, 3)), rng.uniform(-2, 2, (6, 3)), strict=True)
+        ]
+    )
     mesh.export(tmp_path / "solid.stl")
     rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, 0.2, 8.0])
     camera = np.unique(mesh.vertices, axis=0) @ rotation.T + translation

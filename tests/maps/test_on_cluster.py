@@ -17,7 +17,7 @@ from planted_model import HEIGHT, WIDTH, plant_model
 
 from bpnp import SceneMap, Solution
 from bpnp.cli import main
-from bpnp.maps.many_photos import PhotoOptions, PhotoTask, attempts, photo_task
+from bpnp.maps.many_photos import PhotoTask, attempts, photo_task
 from bpnp.maps.on_cluster import attempts_on_cluster
 from bpnp.maps.photos import photo_files
 
@@ -54,8 +54,8 @@ def cluster() -> Iterator[LocalCluster]:
 
 def tasks(place: tuple[Path, Path, Path], scene: SceneMap, **options: Any) -> list[PhotoTask]:
     _, photos, database = place
-    chosen = PhotoOptions(camera=CAMERA, keypoints=database, **options)
-    return [photo_task(scene, "", name, photo, chosen) for name, photo in photo_files([photos]).items()]
+    chosen = {"camera": CAMERA, "keypoints": database, "seed": 0, "time_limit": None, **options}
+    return [photo_task(scene, name, photo, **chosen) for name, photo in photo_files([photos]).items()]
 
 
 def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: LocalCluster) -> None:

@@ -15,9 +15,12 @@ from bpnp.cameras import camera_from
 from bpnp.maps.photos import focal_from_exif
 
 TAGS = {
-    "FocalLength": 0x920A, "FocalLengthIn35mmFilm": 0xA405, "FocalPlaneXResolution": 0xA20E,
-    "PixelXDimension": 0xA002, "PixelYDimension": 0xA003,
-}  # fmt: skip
+    "FocalLength": 0x920A,
+    "FocalLengthIn35mmFilm": 0xA405,
+    "FocalPlaneXResolution": 0xA20E,
+    "PixelXDimension": 0xA002,
+    "PixelYDimension": 0xA003,
+}
 # 5 mm on a sensor of 4 mm x 3 mm with 1000 pixels a mm: 5,000 pixels of 4,000; the same as 43.27 mm on film.
 TAKEN = {"FocalLength": 5.0, "FocalPlaneXResolution": 25400.0, "PixelXDimension": 4000, "PixelYDimension": 3000}
 PINHOLE = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
