@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from view_pairs import Array, scene_pairs
 
-from bpnp.datamodules.synthetic_maps.maps import KINDS, LONG_SIDE, MapOptions, draw_map_pair
+from bpnp.datamodules.synthetic_maps.maps import KINDS, LONG_SIDE, MapOptions, draw_map_problem
 
 SCENES = ("castle-P30", "fountain-P11", "south_building", "statue_of_liberty", "walkthrough", "sceaux_castle_txt")
 MOST = 300  # points that a density is measured with
@@ -58,7 +58,7 @@ def synthetic(kind: str, count: int) -> list[Points]:
     options = MapOptions(num_points=1024, outliers=1.0, views=(1, 1), kinds={kind: 1.0})
     drawn = []
     for number in range(count):
-        pair = draw_map_pair(kind, options, np.random.default_rng([7, number]))
+        pair = draw_map_problem(kind, options, np.random.default_rng([7, number]))
         match = np.where(np.arange(len(pair.points3d)) < pair.matched, np.arange(len(pair.points3d)), -1)
         camera = pair.points3d @ pair.rotation.T + pair.translation
         drawn.append(Points(pair.points2d.astype(float), pair.points3d.astype(float), match, camera))

@@ -21,7 +21,7 @@ import pandas as pd
 import torch
 
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
-from bpnp.datamodules.loader import PairDataset
+from bpnp.datamodules.loader import ProblemDataset
 from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
@@ -39,7 +39,7 @@ ALL_LIMIT, ALL_SECONDS = 10, 30.0  # images of a SCENE-all, and seconds a pair, 
 START, END = "<!-- table of bench_search.py -->", "<!-- end of the table -->"
 
 
-def source(name: str, data: Path, limit: int) -> PairDataset:
+def source(name: str, data: Path, limit: int) -> ProblemDataset:
     """The pairs of a set."""
     if name.startswith("psb"):
         rho = 0.0 if name in ("psb", "psb-so3") else float(name.removeprefix("psb-"))
@@ -67,7 +67,7 @@ def run(
     count = len(pairs)
     rows = []
     for i in sorted({int(k * count / limit) for k in range(limit)}) if count > limit else range(count):
-        batch = pairs.pair(i)
+        batch = pairs.problem(i)
         start, cpu = time.perf_counter(), time.process_time()
         found = search_poses(
             PointSets(bearings(batch.points2d)[0].double().numpy(), batch.points3d[0].double().numpy()),

@@ -59,8 +59,8 @@ def shuffled(data: Path, trials: int, rng: np.random.Generator) -> Iterator[tupl
     for size in SHUFFLED_SIZES:
         for _ in range(trials_of(size, trials)):
             first, second = (sources[name] for name in rng.choice(SHUFFLED, 2, replace=False))
-            image = first.pair(int(rng.integers(len(first)))).points2d[0].double().numpy()
-            scene = second.pair(int(rng.integers(len(second)))).points3d[0].double().numpy()
+            image = first.problem(int(rng.integers(len(first)))).points2d[0].double().numpy()
+            scene = second.problem(int(rng.integers(len(second)))).points3d[0].double().numpy()
             yield f"{size}", solve(rng.permutation(image)[:size], rng.permutation(scene)[:size]), np.nan
 
 

@@ -27,7 +27,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     for name in options.pairs:
         data, _, number = name.rpartition(":")
-        pair = source(data, options.data, 100).pair(int(number))
+        pair = source(data, options.data, 100).problem(int(number))
         assert pair.rotation is not None
         solution = solve(pair.points2d[0], pair.points3d[0], seed=options.seed)
         error = float(rotation_error(torch.as_tensor(solution.rotation), pair.rotation[0]))

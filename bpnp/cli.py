@@ -16,7 +16,11 @@ from bpnp.commands.parser import LIGHTNING, first_line, group_asked_for, parsed_
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
-RESUMED = ("localize", "prepare", "table")  # commands that find what an earlier call of theirs has finished
+AFTER_CTRL_C = {
+    "localize": "; run it again to go on",
+    "table": "; run it again to go on",
+    "prepare": "; nothing was written, run it again to start anew",
+}
 WIDTH = 80  # columns of the help
 
 
@@ -42,8 +46,7 @@ def main(args: Sequence[str] | None = None) -> None:
         print(f"bpnp: error: {error}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
-        again = "; run it again to go on" if arguments[0] in RESUMED else ""
-        print(f"bpnp: interrupted{again}", file=sys.stderr)
+        print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)
         raise SystemExit(130) from None
 
 

@@ -12,9 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageEnhance
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.procedural import procedural_shape
-from bpnp.datamodules.meshes.surfaces import sample_surface
-from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_pair
+from bpnp.datamodules.meshes.surfaces import procedural_shape, sample_surface
+from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
 Kind = Literal["mesh", "photo", "leds"]
 CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # of 1280 x 960 pixels
@@ -90,14 +89,11 @@ def _photo(rng: np.random.Generator) -> Example:
     options = MapOptions(
         num_points=300, min_points=150, outliers=0.33, views=(1, 1), kinds={"facades": 1.0}, noise_px=NOISE_PX
     )
-    problem = draw_map_pair("photo", options, rng)
+    problem = draw_map_problem("photo", options, rng)
     middle = LONG_SIDE / 2  # of the photo, upright or not
     camera = np.array([[problem.focal, 0.0, middle], [0.0, problem.focal, middle], [0.0, 0.0, 1.0]])
-    pixels = problem.focal * problem.points2d.astype(np.float64) + middle
-    return Example(
-        rng.permutation(pixels), problem.points3d.astype(np.float64), camera,
-        np.asarray(problem.rotation, np.float64), np.asarray(problem.translation, np.float64),
-    )  # fmt: skip
+    pixels = rng.permutation(problem.focal * problem.points2d.astype(np.float64) + middle)
+    return Example(pixels, problem.points3d.astype(np.float64), camera, problem.rotation, problem.translation)
 
 
 def _leds(rng: np.random.Generator) -> Example:

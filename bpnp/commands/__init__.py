@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 
 from bpnp.commands.localizing import localize
-from bpnp.commands.preparing import prepare_megadepth, prepare_modelnet40, prepare_released
+from bpnp.commands.preparing import prepare_authors, prepare_megadepth, prepare_modelnet40
 from bpnp.commands.reporting import report, view, wandb_results
 from bpnp.commands.solving import solve
 from bpnp.commands.tables import table
@@ -22,7 +22,7 @@ COMMANDS: Mapping[str, Command | Mapping[str, Command]] = {
     "prepare": {
         "modelnet40": prepare_modelnet40,
         "megadepth": prepare_megadepth,
-        "preprocessed": prepare_released,
+        "authors": prepare_authors,
     },
     "convert-weights": convert_weights,
 }

@@ -1,6 +1,8 @@
 """`bpnp prepare`: a data set as it was published, packed once as a memory-mapped store."""
 
 import os
+from collections import Counter
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -8,7 +10,7 @@ from bpnp.commands.output import say
 from bpnp.commands.parser import at_least
 
 if TYPE_CHECKING:
-    from bpnp.datamodules.prepare import Prepared
+    from bpnp.datamodules.store import Store
 
 PROCESSES = os.cpu_count() or 1
 
@@ -21,7 +23,7 @@ def prepare_modelnet40(
     normalisation: Literal["unit_sphere", "unit_cube", "none"] = "unit_sphere",
     processes: int = PROCESSES,
 ) -> None:
-    """Pack ModelNet40, or any folder or zip of meshes in its layout. A run that was killed resumes.
+    """Pack ModelNet40, or any folder or zip of meshes in its layout. A run that is stopped leaves nothing.
 
     Args:
         source: ModelNet40.zip, its folder, or the folder of ply_data_*.h5.
@@ -30,11 +32,12 @@ def prepare_modelnet40(
         normalisation: of each mesh.
         processes: worker processes.
     """
-    from bpnp.datamodules.meshes.prepare import prepare_meshes
+    from bpnp.datamodules.meshes.module import prepare_meshes
 
     at_least(4, points=points)
     at_least(1, processes=processes)
-    _show(prepare_meshes(source, output, points=points, normalisation=normalisation, processes=processes))
+    store = prepare_meshes(source, output, points=points, normalisation=normalisation, processes=processes)
+    _show(store, Counter(store.name(row).split("/")[-2] for row in range(len(store))))
 
 
 def prepare_megadepth(
@@ -45,24 +48,26 @@ def prepare_megadepth(
     clutter: float = 0.0,
     processes: int = PROCESSES,
 ) -> None:
-    """Pack MegaDepth, or any folder of COLMAP models. A run that was killed resumes.
+    """Pack MegaDepth, or any folder of COLMAP models. A run that is stopped leaves nothing.
 
     Args:
         source: the folder of scenes, <scene>/sparse/manhattan/<k>/{cameras,images,points3D}.bin.
         output: new folder.
-        min_points: fewest true pairs of an image.
-        clutter: natural clutter to keep, as a ratio to the true pairs; 0.5 adds half as many points.
+        min_points: fewest matches of an image.
+        clutter: natural clutter to keep, as a ratio to the matches; 0.5 adds half as many points.
         processes: worker processes.
     """
-    from bpnp.datamodules.colmap.prepare import prepare_colmap
+    from bpnp.datamodules.colmap.module import prepare_colmap
+    from bpnp.datamodules.stored import scene_rows
 
     at_least(4, min_points=min_points)
     at_least(1, processes=processes)
     at_least(0, clutter=clutter)
-    _show(prepare_colmap(source, output, min_points=min_points, clutter=clutter, processes=processes))
+    store = prepare_colmap(source, output, min_points=min_points, clutter=clutter, processes=processes)
+    _show(store, {"scenes": len(scene_rows(store)), "images": len(store)})
 
 
-def prepare_released(source: Path, *, output: Path = Path("data/preprocessed"), dataset: str | None = None) -> None:
+def prepare_authors(source: Path, *, output: Path = Path("data/authors"), dataset: str | None = None) -> None:
     """Pack the pickles that the authors of BPnPNet published.
 
     Args:
@@ -70,14 +75,15 @@ def prepare_released(source: Path, *, output: Path = Path("data/preprocessed"), 
         output: new folder.
         dataset: where there are several, such as data61_2d3d.
     """
-    from bpnp.datamodules.released.prepare import prepare_preprocessed
+    from bpnp.datamodules.authors import prepare_authors, split_rows
 
-    _show(prepare_preprocessed(source, output, dataset=dataset))
+    store = prepare_authors(source, output, dataset=dataset)
+    _show(store, {split: len(split_rows(store, split)) for split in ("train", "test")})
 
 
-def _show(prepared: "Prepared") -> None:
-    say(f"{prepared.folder}: {', '.join(f'{count:,} {what}' for what, count in prepared.counts.items())}")
-    if prepared.skipped:
-        say(f"left out {len(prepared.skipped)}, all listed in {prepared.folder / 'manifest.json'}; such as:")
-        for name, reason in list(prepared.skipped.items())[:10]:
+def _show(store: "Store", counts: Mapping[str, int]) -> None:
+    say(f"{store.folder}: {', '.join(f'{count:,} {what}' for what, count in counts.items())}")
+    if store.skipped:
+        say(f"left out {len(store.skipped)}, all listed in {store.folder / 'manifest.json'}; such as:")
+        for name, reason in list(store.skipped.items())[:10]:
             say(f"  {name}: {reason}")

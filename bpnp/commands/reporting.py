@@ -35,7 +35,7 @@ def report(
         photos: the COLMAP scenes, to put the images under the page's 2D views.
         recall: write the recall curves as .png, .svg or .pdf.
     """
-    from bpnp.datamodules.colmap.photos import photo_finder
+    from bpnp.datamodules.colmap.scenes import photo_finder
     from bpnp.report.figures import recall_curve, save_figure
     from bpnp.report.page.write import write_page
     from bpnp.report.runs import named_runs
@@ -71,7 +71,7 @@ def view(
         photos: the COLMAP scenes, with the images beside them.
         open: show the file with the system's viewer.
     """
-    from bpnp.datamodules.colmap.photos import photo_finder
+    from bpnp.datamodules.colmap.scenes import photo_finder
     from bpnp.report.figures import plot_pair, save_figure
     from bpnp.report.photos import box_of
     from bpnp.report.runs import named_runs

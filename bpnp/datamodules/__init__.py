@@ -1,34 +1,48 @@
-"""Sources of pairs: meshes and SfM-like scenes seen by virtual cameras, COLMAP models, and published pairs."""
+"""Sources of problems: meshes and random scenes seen by virtual cameras, COLMAP models, the authors' files, a store."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import lazy_loader
 
 if TYPE_CHECKING:
     from bpnp.datamodules.augment import Outliers
+    from bpnp.datamodules.authors import AuthorsDataModule
     from bpnp.datamodules.colmap.module import ColmapDataModule
     from bpnp.datamodules.meshes.module import MeshDataModule
-    from bpnp.datamodules.module import PairDataModule
-    from bpnp.datamodules.pair import Pair, PairSource
-    from bpnp.datamodules.released.module import PreprocessedDataModule
-    from bpnp.datamodules.stored_pairs import write_pairs
-    from bpnp.datamodules.synthetic_maps.module import SfmSceneDataModule
+    from bpnp.datamodules.module import ProblemDataModule
+    from bpnp.datamodules.problem import Problem, ProblemSource
+    from bpnp.datamodules.stored import StoredDataModule, write_problems
+    from bpnp.datamodules.synthetic_maps.maps import SyntheticMapDataModule
 
 __all__ = [
-    "ColmapDataModule", "MeshDataModule", "Outliers", "Pair", "PairDataModule", "PairSource", "PreprocessedDataModule",
-    "SfmSceneDataModule", "write_pairs",
-]  # fmt: skip
+    "AuthorsDataModule",
+    "ColmapDataModule",
+    "MeshDataModule",
+    "Outliers",
+    "Problem",
+    "ProblemDataModule",
+    "ProblemSource",
+    "StoredDataModule",
+    "SyntheticMapDataModule",
+    "write_problems",
+]
 
-__getattr__, __dir__, _ = lazy_loader.attach(
+_find, __dir__, _ = lazy_loader.attach(
     __name__,
     submod_attrs={
         "augment": ["Outliers"],
+        "authors": ["AuthorsDataModule"],
         "colmap.module": ["ColmapDataModule"],
         "meshes.module": ["MeshDataModule"],
-        "module": ["PairDataModule"],
-        "pair": ["Pair", "PairSource"],
-        "released.module": ["PreprocessedDataModule"],
-        "stored_pairs": ["write_pairs"],
-        "synthetic_maps.module": ["SfmSceneDataModule"],
+        "module": ["ProblemDataModule"],
+        "problem": ["Problem", "ProblemSource"],
+        "stored": ["StoredDataModule", "write_problems"],
+        "synthetic_maps.maps": ["SyntheticMapDataModule"],
     },
 )
+# What YAML files of earlier versions call them.
+RENAMED = {"PreprocessedDataModule": "AuthorsDataModule", "SfmSceneDataModule": "SyntheticMapDataModule"}
+
+
+def __getattr__(name: str) -> Any:
+    return _find(RENAMED.get(name, name))

@@ -1,4 +1,4 @@
-"""Pairs as they are trained and tested on: subsets, clutter, occlusion, outliers, rotation, and a random order."""
+"""Problems as they are trained and tested on: subsets, clutter, occlusion, outliers, rotation, a random order."""
 
 import math
 from dataclasses import dataclass, field, replace
@@ -12,27 +12,27 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from bpnp.datamodules.keyed_random import Purpose, permutations, rotations, stream, uniform
-from bpnp.datamodules.pair import Counts
+from bpnp.datamodules.problem import Counts
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 
 Side = Literal["both", "2d", "3d"]
 DrawnSide = Literal["both", "2d", "3d", "random"]
-Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each pair
+Drawn = float | tuple[float, float]  # a number, or (low, high) for one drawn uniformly for each problem
 SIDES = ("2d", "both", "3d")  # in this order, a side is numbered
 
 
 @dataclass(frozen=True)
 class Outliers:
-    """What is added to and taken from a pair. The defaults change nothing.
+    """What is added to and taken from a problem. The defaults change nothing.
 
     Args:
-        ratio: rho, synthetic outliers as a ratio to the true pairs: int(rho * pairs) points, uniform in the
-            axis-aligned bounding box of the true points of that side; 1 makes half of the points outliers. Two numbers,
-            [low, high], draw it for each pair, uniformly.
-        side: the side that gets them, both, 2d or 3d, or random for one of the three in each pair.
-        occlusion: share of the true pairs that lose one of their two points, so that the other has no partner; a number
-            or [low, high], as ratio. At least 4 true pairs are left.
+        ratio: rho, synthetic outliers as a ratio to the matches: int(rho * matches) points, uniform in the
+            axis-aligned bounding box of the matched points of that side; 1 makes half of the points outliers. Two
+            numbers, [low, high], draw it for each problem, uniformly.
+        side: the side that gets them, both, 2d or 3d, or random for one of the three in each problem.
+        occlusion: share of the matches that lose one of their two points, so that the other has no partner; a number
+            or [low, high], as ratio. At least 4 matches are left.
         occluded_side: where they lose it, 2d, 3d, or both for half of them here and half there; or random.
     """
 
@@ -59,10 +59,10 @@ class Outliers:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What `augment` does to the pairs of a source.
+    """What `augment` does to the problems of a source.
 
-    max_points: at most this many true pairs of a pair, a random subset of more; None for all.
-    clutter: points without a partner to keep, as a ratio to the true pairs kept, or as many as there are; inf for all.
+    max_points: at most this many matches of a problem, a random subset of more; None for all.
+    clutter: points without a partner to keep, as a ratio to the matches kept, or as many as there are; inf for all.
     clutter_side: which sides keep them, "both", "2d" or "3d".
     rotate: turn the 3D points by a uniformly random rotation about their origin.
     outliers: synthetic outliers and occlusion.
@@ -89,41 +89,41 @@ class Augmentation:
         return 0.0 if self.clutter_side == "3d" else self.clutter, 0.0 if self.clutter_side == "2d" else self.clutter
 
     def sizes(self, counts: Counts) -> NDArray[np.int64]:
-        """Most points of the larger side of each augmented pair (k,)."""
-        kept = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
+        """Most points of the larger side of each augmented problem (k,)."""
+        matched = counts.matched if self.max_points is None else np.minimum(counts.matched, self.max_points)
         extra2d, extra3d = (
-            np.minimum(count - counts.matched, np.rint(ratio * np.maximum(kept, 1)))
+            np.minimum(count - counts.matched, np.rint(ratio * np.maximum(matched, 1)))
             for count, ratio in zip((counts.points2d, counts.points3d), self.clutters, strict=True)
         )
-        added = np.floor(bounds(self.outliers.ratio)[1] * kept)
-        return (kept + np.maximum(extra2d, extra3d) + added).astype(np.int64)
+        added = np.floor(bounds(self.outliers.ratio)[1] * matched)
+        return (matched + np.maximum(extra2d, extra3d) + added).astype(np.int64)
 
 
 class SideCounts(NamedTuple):
-    """Points of one side of each augmented pair (b, 1).
+    """Points of one side of each augmented problem (b, 1).
 
-    kept: of the true pairs that were chosen, those whose point on this side is left. skipped: those after the true
-    pairs whose point is hidden. extra: clutter. outliers: synthetic ones.
+    matched: of the matches that were chosen, those whose point on this side is left. hidden: those after the matches
+    that are left whose point is hidden. extra: clutter. outliers: synthetic ones.
     """
 
-    kept: Tensor
-    skipped: Tensor
+    matched: Tensor
+    hidden: Tensor
     extra: Tensor
     outliers: Tensor
 
 
 def augment(batch: Batch, how: Augmentation, keys: Int[Tensor, " b"]) -> Batch:
-    """Choose the points of each pair, add outliers, and put both sides into random order.
+    """Choose the points of each problem, add outliers, and put both sides into random order.
 
-    batch: pairs as `stacked` makes them, on any device. keys: one a pair; a pair depends on its key alone, whatever
-    batch it is in and however it is padded. Rotations and translations keep their dtype.
+    batch: problems as `stacked` makes them, on any device. keys: one a problem, which depends on its key alone,
+    whatever batch it is in and however it is padded. Rotations and translations keep their dtype.
     """
     if batch.match3d is None or batch.rotation is None:
-        raise ValueError("expected pairs with `match3d` and a pose to augment, got none")
+        raise ValueError("expected problems with `match3d` and a pose to augment, got none")
     matched = batch.match3d >= 0
     total = matched.sum(-1, keepdim=True)
     true, side2d, side3d = _amounts(how, total, batch, stream(keys, Purpose.AMOUNTS))
-    # On both sides the true pairs in one random order, then the points without a partner.
+    # On both sides the matches in one random order, then the points without a partner.
     choice = stream(keys, Purpose.CHOICE)
     order3d = _matched_first(choice, matched, batch.mask3d)
     alike = torch.equal(batch.mask2d, batch.mask3d)
@@ -166,23 +166,23 @@ def bounds(value: Drawn) -> tuple[float, float]:
 
 
 def _amounts(how: Augmentation, total: Tensor, batch: Batch, keys: Tensor) -> tuple[Tensor, SideCounts, SideCounts]:
-    """True pairs (b, 1) that are left of `total`, and the points of either side."""
+    """Matches (b, 1) that are left of `total`, and the points of either side."""
     ratio, side, occlusion, occluded = uniform(keys, 4).unsqueeze(-1).unbind(1)
-    kept = total if how.max_points is None else total.clamp(max=how.max_points)
-    hidden = (_drawn(how.outliers.occlusion, occlusion) * kept).round().long()
-    hidden = torch.minimum(hidden, kept - MIN_POINTS).clamp(min=0)
-    true = kept - hidden
+    chosen = total if how.max_points is None else total.clamp(max=how.max_points)
+    hidden = (_drawn(how.outliers.occlusion, occlusion) * chosen).round().long()
+    hidden = torch.minimum(hidden, chosen - MIN_POINTS).clamp(min=0)
+    true = chosen - hidden
     hidden2d, hidden3d = _on_sides(how.outliers.occluded_side, occluded)
     hidden2d = torch.where(hidden3d, torch.where(hidden2d, hidden // 2, 0), hidden)
     added = (_drawn(how.outliers.ratio, ratio) * true).long()
     added2d, added3d = _on_sides(how.outliers.side, side)
     extra2d, extra3d = (
-        torch.minimum((clutter * kept.clamp(min=1)).round().clamp(max=2**31).long(), count[:, None] - total)
+        torch.minimum((clutter * chosen.clamp(min=1)).round().clamp(max=2**31).long(), count[:, None] - total)
         for clutter, count in zip(how.clutters, (batch.count2d, batch.count3d), strict=True)
     )
     return (
         true,
-        SideCounts(kept - hidden2d, hidden2d, extra2d, added * added2d),
+        SideCounts(chosen - hidden2d, hidden2d, extra2d, added * added2d),
         SideCounts(true + hidden2d, torch.zeros_like(hidden), extra3d, added * added3d),
     )
 
@@ -199,23 +199,23 @@ def _on_sides(side: DrawnSide, share: Tensor) -> tuple[Bool[Tensor, "b 1"], Bool
 
 
 def _matched_first(keys: Tensor, matched: Tensor, mask: Tensor) -> Int[Tensor, "b n"]:
-    """Places of the true pairs in random order, then those of the other points in random order, then padding."""
+    """Places of the matches in random order, then those of the other points in random order, then padding."""
     return permutations(keys, mask.shape[1], group=2 - mask.long() - matched.long())
 
 
 def _chosen(
     points: Float[Tensor, "b n d"], order: Tensor, true: Tensor, total: Tensor, side: SideCounts, keys: Tensor
 ) -> Float[Tensor, "b k d"]:
-    """The true pairs' points first, then those without a partner, then outliers; meaningless beyond their number."""
-    natural = side.kept + side.extra
+    """The matches' points first, then those without a partner, then outliers; meaningless beyond their number."""
+    natural = side.matched + side.extra
     slot = torch.arange(int((natural + side.outliers).max()), device=points.device)
-    rank = torch.where(slot < side.kept, slot + side.skipped * (slot >= true), total + slot - side.kept)
+    rank = torch.where(slot < side.matched, slot + side.hidden * (slot >= true), total + slot - side.matched)
     chosen = picked(points, order.gather(1, rank.clamp(max=order.shape[1] - 1)))
     if not side.outliers.any():
         return chosen
-    own = (slot < true)[..., None]
-    low = chosen.where(own, math.inf).amin(1, keepdim=True)
-    high = chosen.where(own, -math.inf).amax(1, keepdim=True)
+    is_match = (slot < true)[..., None]
+    low = chosen.where(is_match, math.inf).amin(1, keepdim=True)
+    high = chosen.where(is_match, -math.inf).amax(1, keepdim=True)
     share = uniform(keys, chosen[0].numel()).view_as(chosen).to(chosen)
     return torch.where((slot < natural)[..., None], chosen, low + (high - low) * share)
 
@@ -223,7 +223,7 @@ def _chosen(
 def _shuffled(points: Tensor, side: SideCounts, keys: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """The points in random order, zero beyond their number; which are real; and where each comes from."""
     slot = torch.arange(points.shape[1], device=points.device)
-    mask = slot < side.kept + side.extra + side.outliers
+    mask = slot < side.matched + side.extra + side.outliers
     place = permutations(keys, len(slot), group=1 - mask.long())
     return picked(points, place) * mask[..., None], mask, place
 

@@ -18,10 +18,8 @@ GOLDEN, FIRST, SECOND = (value - 2**64 for value in (0x9E3779B97F4A7C15, 0xBF584
 PLACE_BITS = 22  # of a number to be sorted: four million points; 39 random bits are left above them
 
 
-# What random numbers of a pair are for; see `stream`.
-Purpose = IntEnum(
-    "Purpose", "SUBSET POSE NOISE AMOUNTS CHOICE OUTLIERS2D OUTLIERS3D TURN ORDER2D ORDER3D", start=0
-)  # fmt: skip
+# What random numbers of a problem are for; see `stream`.
+Purpose = IntEnum("Purpose", "SUBSET POSE NOISE AMOUNTS CHOICE OUTLIERS2D OUTLIERS3D TURN ORDER2D ORDER3D", start=0)
 
 
 def row_keys(index: Int[Tensor, " b"], *seeds: int) -> Int[Tensor, " b"]:

@@ -1,4 +1,4 @@
-"""From a source of pairs to batches: which pairs are in a batch, in any number of processes, and exact resuming."""
+"""From a source of problems to batches: which are in a batch, in any number of processes, and exact resuming."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,31 +13,31 @@ from torch.utils.data import DataLoader, Dataset, DistributedSampler
 
 from bpnp.datamodules.augment import Augmentation, augment
 from bpnp.datamodules.keyed_random import row_keys
-from bpnp.datamodules.pair import PairSource
+from bpnp.datamodules.problem import ProblemSource
 from bpnp.types import Batch
 
-Key = tuple[int, int]  # (epoch, index): with the seed, all that a pair depends on
+Key = tuple[int, int]  # (epoch, index): with the seed, all that a problem depends on
 POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 
-class PairKeys(NamedTuple):
-    """A batch to be made: the position of each pair in its data set, and its name."""
+class ProblemKeys(NamedTuple):
+    """A batch to be made: the position of each problem in its data set, and its name."""
 
     epoch: int
     numbers: Int[Tensor, " b"]
     ids: tuple[str, ...]
 
 
-class PairDataset(Dataset[Any]):
+class ProblemDataset(Dataset[Any]):
     """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
 
-    augmentation: what is done to the pairs of `source`. seed: a pair is a function of (seed, index), and of the epoch
-    too if `fresh`. keys_only: give `PairKeys`, for `batch` to be called where the batch is needed.
+    augmentation: what is done to the problems of `source`. seed: a problem is a function of (seed, index), and of the
+    epoch too if `fresh`. keys_only: give `ProblemKeys`, for `batch` to be called where the batch is needed.
     """
 
     def __init__(
         self,
-        source: PairSource,
+        source: ProblemSource,
         augmentation: Augmentation | None = None,
         *,
         seed: Sequence[int] = (0,),
@@ -50,41 +50,41 @@ class PairDataset(Dataset[Any]):
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def __getitem__(self, keys: Sequence[Key]) -> Batch | PairKeys:
+    def __getitem__(self, keys: Sequence[Key]) -> Batch | ProblemKeys:
         index = [index for _, index in keys]
-        chosen = PairKeys(keys[0][0], torch.tensor(index), self.source.names(index))
+        chosen = ProblemKeys(keys[0][0], torch.tensor(index), self.source.names(index))
         return chosen if self.keys_only else self.batch(chosen)
 
-    def batch(self, keys: PairKeys) -> Batch:
-        """The pairs of `keys`, made on the device of its index."""
+    def batch(self, keys: ProblemKeys) -> Batch:
+        """The problems of `keys`, made on the device of its index."""
         epoch = keys.epoch if self.fresh else 0
-        pairs = replace(self.source.batch(keys.numbers, epoch), ids=tuple(keys.ids))  # a list after a DataLoader
-        pairs = augment(pairs, self.augmentation, row_keys(keys.numbers, *self.seed, epoch))
-        return replace(pairs, **{name: getattr(pairs, name).float() for name in ("rotation", "translation")})
+        problems = replace(self.source.batch(keys.numbers, epoch), ids=tuple(keys.ids))  # a list after a DataLoader
+        problems = augment(problems, self.augmentation, row_keys(keys.numbers, *self.seed, epoch))
+        return replace(problems, **{name: getattr(problems, name).float() for name in ("rotation", "translation")})
 
-    def pair(self, index: int, epoch: int = 0) -> Batch:
-        """One pair alone."""
-        return self.batch(PairKeys(epoch, torch.tensor([index]), self.source.names([index])))
+    def problem(self, index: int, epoch: int = 0) -> Batch:
+        """One problem alone."""
+        return self.batch(ProblemKeys(epoch, torch.tensor([index]), self.source.names([index])))
 
 
 class BucketSampler(DistributedSampler[list[Key]]):
     """Yields the keys of one batch after the other, this process's share of it.
 
-    `batch_size` counts the pairs of one step over all processes: any number of processes sees the same pairs in a
-    step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch) and
-    gives the epoch in the keys; evaluation always visits every pair, in the same batches, as epoch 0.
+    `batch_size` counts the problems of one step over all processes: any number of processes sees the same problems in
+    a step, each a contiguous slice of equal length. Training (`shuffle`) draws new batches for every (seed, epoch) and
+    gives the epoch in the keys; evaluation always visits every problem, in the same batches, as epoch 0.
     As a `DistributedSampler` it is left alone by Lightning, which calls `set_epoch`.
 
-    Pairs of a batch are of similar sizes, and the batches in random order, so that the first few, all that a limited
-    run sees, are a fair sample. Pairs are repeated where the processes do not divide the last batch.
+    Problems of a batch are of similar sizes, and the batches in random order, so that the first few, all that a limited
+    run sees, are a fair sample. Problems are repeated where the processes do not divide the last batch.
 
     Raises ValueError for an empty set, a `batch_size` that the processes do not divide, or `max_cells` in training
-    (a step keeps its number of pairs; a source bounds the size of its training pairs instead).
+    (a step keeps its number of problems; a source bounds the size of its training problems instead).
     """
 
     def __init__(
         self,
-        dataset: PairDataset,
+        dataset: ProblemDataset,
         *,
         batch_size: int,
         shuffle: bool,
@@ -94,10 +94,10 @@ class BucketSampler(DistributedSampler[list[Key]]):
         max_cells: int | None = None,
     ) -> None:
         if len(dataset) == 0:
-            raise ValueError("expected a source of at least one pair, got an empty one")
+            raise ValueError("expected a source of at least one problem, got an empty one")
         if batch_size < 1 or batch_size % num_replicas:
             raise ValueError(
-                f"expected a `batch_size` (pairs of one step over all processes) that {num_replicas} processes divide, "
+                f"expected a `batch_size` (problems a step over all processes) that {num_replicas} processes divide, "
                 f"got {batch_size}; try {max(1, round(batch_size / num_replicas)) * num_replicas}"
             )
         if shuffle and max_cells is not None:
@@ -119,7 +119,7 @@ class BucketSampler(DistributedSampler[list[Key]]):
     def _training_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
         """The shuffled set is cut into pools of 50 batches, each pool is sorted by size and cut into batches.
 
-        The pairs left over by `batch_size` sit out the epoch. A set smaller than one batch is one batch.
+        The problems left over by `batch_size` sit out the epoch. A set smaller than one batch is one batch.
         """
         whole = len(order) - len(order) % self.batch_size
         if whole == 0:
@@ -129,8 +129,8 @@ class BucketSampler(DistributedSampler[list[Key]]):
         return list(np.concatenate([self._largest_first(pool) for pool in pools]).reshape(-1, self.batch_size))
 
     def _evaluation_batches(self, order: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-        """A batch has at most `batch_size` pairs, as few as b * size^2 <= `max_cells` asks for (size: the larger side
-        of its largest pair), at least one for each process."""
+        """A batch has at most `batch_size` problems, as few as b * size^2 <= `max_cells` asks for (size: the larger
+        side of its largest problem), at least one for each process."""
         order = self._largest_first(order)
         batches: list[NDArray[np.int64]] = []
         start = 0
@@ -160,7 +160,7 @@ class BucketSampler(DistributedSampler[list[Key]]):
             yield [(epoch, int(i)) for i in batch[self.rank * share : (self.rank + 1) * share]]
 
 
-class PairLoader(DataLoader[Batch]):
+class ProblemLoader(DataLoader[Batch]):
     """A DataLoader of whole batches that resumes exactly, also inside an epoch.
 
     Its workers start at the first `next`, not at `iter`: Lightning calls `set_epoch` in between when it resumes.
@@ -191,18 +191,18 @@ class PairLoader(DataLoader[Batch]):
 class FixedBatches(Dataset[Any]):
     """The batches of a loader's first epoch, by their number: Lightning takes them in their order."""
 
-    def __init__(self, dataset: PairDataset, sampler: BucketSampler) -> None:
+    def __init__(self, dataset: ProblemDataset, sampler: BucketSampler) -> None:
         self.dataset, self.keys = dataset, list(sampler)
 
     def __len__(self) -> int:
         return len(self.keys)
 
-    def __getitem__(self, number: int) -> Batch | PairKeys:
+    def __getitem__(self, number: int) -> Batch | ProblemKeys:
         return self.dataset[self.keys[number]]
 
 
-def pair_loader(
-    dataset: PairDataset,
+def problem_loader(
+    dataset: ProblemDataset,
     *,
     batch_size: int,
     shuffle: bool,
@@ -228,7 +228,7 @@ def pair_loader(
     )
     if overfit:
         return DataLoader(FixedBatches(dataset, sampler), batch_size=None, num_workers=num_workers)
-    return PairLoader(
+    return ProblemLoader(
         dataset,
         sampler=sampler,
         batch_size=None,

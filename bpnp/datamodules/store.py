@@ -1,27 +1,35 @@
-"""The data store: a folder of .npy columns, memory-mapped, and a manifest. It is complete or not there at all.
+"""The data store: a folder of .npy columns, memory-mapped, and a manifest; and how a data set is made one.
 
-A row is one pair of point sets or one mesh. Its points lie in the bulk columns, one row after the other, with a
-checksum for each row that is compared whenever the row is read; `<bulk>_start.npy` says where the rows begin. All
-other columns have one entry a row and are compared with the manifest's checksums when the store is opened.
+A row is one problem or one mesh. Its points lie in the bulk columns, one row after the other; `<bulk>_start.npy` says
+where the rows begin. All other columns have one entry a row. A store is complete or not there at all, and every file is
+compared with the manifest's checksum when the store is opened.
 """
 
 import json
-import os
+import shutil
+import warnings
+import zlib
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from torch.utils.data import DataLoader, Dataset
 
-from bpnp.files import checksum, written_whole
+from bpnp.files import cache_folder, claimed, fingerprint, interruptions_later, written_whole
 
 MANIFEST = "manifest.json"
-FORMAT = 3  # raised whenever a column changes its meaning
+FORMAT = 4  # raised whenever a column changes its meaning
 BULK = np.dtype("<f4")
+Row = tuple[str, Mapping[str, NDArray[Any]], Mapping[str, Any]]  # name, points by bulk column, entries of the others
+Made = tuple[list[Row], dict[str, str]]  # rows, and by name what was left out and why
 
 
 class StoreError(ValueError):
@@ -53,7 +61,7 @@ class Store:
         return len(self.columns["name"])
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return open_store, (self.folder, self.kind)  # another process maps the files itself
+        return _mapped, (self.folder, self.kind)  # another process maps the files itself
 
     def counts(self, bulk: str) -> NDArray[np.int64]:
         """Points of each row (k,) in a bulk column."""
@@ -63,67 +71,61 @@ class Store:
         return bytes(self.columns["name"][row]).decode()
 
     def row(self, row: int) -> dict[str, NDArray[np.float32]]:
-        """The points of a row, views of the mapped files. StoreError if they are not what was written."""
-        points = {name: self.bulk[name][start[row] : start[row + 1]] for name, start in self.starts.items()}
-        if checksum(*(part.data for part in points.values())) != self.columns["checksum"][row]:
-            raise StoreError(
-                f"expected the points of {self.name(row)!r} as they were written, got other bytes in {self.folder}; "
-                "try copying or preparing it again"
-            )
-        return points
-
-    def verify(self) -> None:
-        """Read every row once. Raises StoreError as `row`."""
-        for row in range(len(self)):
-            self.row(row)
+        """The points of a row, views of the mapped files."""
+        return {name: self.bulk[name][start[row] : start[row + 1]] for name, start in self.starts.items()}
 
 
 def open_store(folder: str | Path, kind: str) -> Store:
-    """Open what `new_store` wrote.
+    """Open what `new_store` wrote, and read it once, to compare it with its checksums.
 
-    Raises StoreError that names the folder or the file: no manifest, another kind or format, a column that is missing,
+    Raises StoreError that names the folder or the file: no manifest, another kind or format, a file that is missing,
     cut, or not the one that was written.
     """
     path = Path(folder)
-    manifest = read_manifest(path)
-    if (manifest["format"], manifest["kind"]) != (FORMAT, kind):
-        raise StoreError(
-            f"expected {kind} in format {FORMAT}, got {manifest['kind']} in format {manifest['format']} in {path}; "
-            "try the other data module, or preparing again with this version"
-        )
-    columns = {name: _column(path / f"{name}.npy", entry) for name, entry in manifest["columns"].items()}
-    bulk = {name: columns.pop(name) for name, entry in manifest["columns"].items() if entry["bulk"]}
-    starts = {name: columns.pop(f"{name}_start") for name in bulk}
-    return Store(path, kind, bulk, starts, columns, manifest["parameters"], manifest["skipped"])
+    for name, (size, checksum) in _manifest(path, kind)["files"].items():
+        file = path / name
+        found = file.stat().st_size if file.is_file() else None
+        if found != size:
+            got = "no such file" if found is None else f"{found} bytes"
+            raise StoreError(f"expected {file} of {size} bytes, got {got}; try copying or preparing again")
+        if _checksum(file) != checksum:
+            raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")
+    return _mapped(path, kind)
 
 
-def _column(file: Path, entry: Mapping[str, Any]) -> NDArray[Any]:
-    """A column as its entry of the manifest describes it."""
-    size = file.stat().st_size if file.is_file() else None
-    if size != entry["bytes"]:
-        found = "no such file" if size is None else f"{size} bytes"
-        raise StoreError(f"expected {file} of {entry['bytes']} bytes, got {found}; try copying or preparing again")
-    with suppress(ValueError):  # of a broken header
-        mapped = entry["bulk"] and entry["shape"][0]  # no file can be mapped that has no points
-        column = np.asarray(np.load(file, mmap_mode="r" if mapped else None))  # no subclass: quicker
-        described = (column.dtype.str, list(column.shape)) == (entry["dtype"], entry["shape"])
-        if described and (entry["bulk"] or checksum(np.ascontiguousarray(column).data) == entry["checksum"]):
-            return column
-    raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")
+def _mapped(folder: Path, kind: str) -> Store:
+    manifest = _manifest(folder, kind)
+    bulk = {name: np.asarray(_loaded(folder / f"{name}.npy")) for name in manifest["bulk"]}
+    starts = {name: np.load(folder / f"{name}_start.npy") for name in manifest["bulk"]}
+    columns = {name: np.load(folder / f"{name}.npy") for name in manifest["columns"]}
+    return Store(folder, kind, bulk, starts, columns, manifest["parameters"], manifest["skipped"])
 
 
-def read_manifest(folder: Path) -> dict[str, Any]:
-    """The manifest of a store of any kind. Raises StoreError if it is missing, cut or edited."""
+def _loaded(file: Path) -> NDArray[Any]:
+    with suppress(ValueError):  # no file can be mapped that has no points
+        return np.load(file, mmap_mode="r")
+    return np.load(file)
+
+
+def _manifest(folder: Path, kind: str) -> dict[str, Any]:
+    """The manifest of a store. Raises StoreError if it is missing, cut or edited, or of another kind or format."""
     try:
-        manifest = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
-        whole = manifest.pop("checksum") == _checksum(manifest)
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        manifest = dict(json.loads((folder / MANIFEST).read_text(encoding="utf-8")))
+        whole = manifest.pop("checksum") == fingerprint(manifest)
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise StoreError(f"expected a folder made by `bpnp prepare`, got {folder} ({error})") from error
-    if not whole:
+    if (manifest.get("format"), manifest.get("kind")) != (FORMAT, kind):
         raise StoreError(
-            f"expected an unchanged {folder / MANIFEST}, got one that was edited or cut; try preparing again"
+            f"expected {kind} in format {FORMAT}, got {manifest.get('kind')} in format {manifest.get('format')} in "
+            f"{folder}; try the other data module, or preparing again with this version"
         )
-    return dict(manifest)
+    if not whole:
+        raise StoreError(f"expected an unchanged {folder / MANIFEST}, got an edited or cut one; try preparing again")
+    return manifest
+
+
+def _checksum(file: Path) -> int:
+    return zlib.crc32(np.memmap(file, mode="r").data)
 
 
 class StoreWriter:
@@ -134,67 +136,48 @@ class StoreWriter:
 
     def __init__(self, folder: Path, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
         self.folder, self._files, self._widths = folder, files, widths
-        self._columns: dict[str, list[NDArray[Any]]] = defaultdict(list)
+        self._columns: dict[str, list[Any]] = defaultdict(list, {f"{name}_start": [0] for name in widths}, name=[])
         self.parameters: dict[str, Any] = {}
         self.skipped: dict[str, str] = {}
         for name, width in widths.items():
-            self._columns[f"{name}_start"].append(np.zeros(1, np.int64))
-            _write_header(files[name], BULK, (0, width))
+            _write_header(files[name], (0, width))
 
     def __len__(self) -> int:
-        return sum(len(part) for part in self._columns["name"])
+        return len(self._columns["name"])
 
-    def add(self, name: str, bulk: Mapping[str, NDArray[Any]], **columns: Any) -> None:
+    def add(self, name: str, points: Mapping[str, NDArray[Any]], columns: Mapping[str, Any]) -> None:
         """Append one row: its points by bulk column, and its entries of the other columns."""
-        points = {key: np.ascontiguousarray(bulk[key], BULK) for key in self._widths}
-        columns |= {"checksum": np.uint32(checksum(*(part.data for part in points.values())))}
-        columns |= {"name": np.bytes_(name.encode())}
-        columns |= {f"{key}_start": self._end(key) + len(part) for key, part in points.items()}
-        for key, value in columns.items():
-            self._columns[key].append(np.asarray(value)[None])
-        for key, part in points.items():
+        for key in self._widths:
+            part = np.ascontiguousarray(points[key], BULK)
             self._files[key].write(part.data)
-
-    def extend(self, part: Store) -> None:
-        """Append all rows of another store, with their checksums."""
-        columns = part.columns | {f"{key}_start": self._end(key) + start[1:] for key, start in part.starts.items()}
-        for key, value in columns.items():
-            if len(value):
-                self._columns[key].append(value)
-        for key, points in part.bulk.items():
-            if len(points):
-                self._files[key].write(points.data)
-        self.skipped |= part.skipped
+            self._columns[f"{key}_start"].append(self._columns[f"{key}_start"][-1] + len(part))
+        for key, value in {"name": name.encode(), **columns}.items():
+            self._columns[key].append(value.encode() if isinstance(value, str) else value)
 
     def finish(self, kind: str) -> None:
         """Write what is left: the small columns, and the manifest last."""
-        entries: dict[str, dict[str, Any]] = {}
-        for name, file in self._files.items():
+        for key, file in self._files.items():
             file.seek(0)
-            entries[name] = {"bulk": True, **_write_header(file, BULK, (int(self._end(name)), self._widths[name]))}
-            entries[name]["bytes"] = file.seek(0, os.SEEK_END)
-        self._columns.setdefault("name", [np.empty(0, "S1")])
-        for name, parts in self._columns.items():
-            column = np.concatenate(parts)
-            with (self.folder / f"{name}.npy").open("wb") as file:
-                entries[name] = {"bulk": False, **_write_header(file, column.dtype, column.shape)}
-                file.write(column.data)  # np.save hides the reason why a write fails
-                entries[name] |= {"checksum": checksum(column.data), "bytes": file.tell()}
-        manifest = {"format": FORMAT, "kind": kind, "rows": entries["name"]["shape"][0], "columns": entries}
-        manifest |= {"parameters": self.parameters, "skipped": self.skipped}
-        content = json.dumps(manifest | {"checksum": _checksum(manifest)}, indent=1)
+            _write_header(file, (self._columns[f"{key}_start"][-1], self._widths[key]))
+            file.flush()
+        for key, values in self._columns.items():
+            column = np.array(values) if values else np.empty(0, "S1")
+            with (self.folder / f"{key}.npy").open("wb") as file:  # np.save hides the reason why a write fails
+                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(column))
+                file.write(np.ascontiguousarray(column).data)
+        files = {path.name: [path.stat().st_size, _checksum(path)] for path in sorted(self.folder.glob("*.npy"))}
+        small = [key for key in self._columns if key.removesuffix("_start") not in self._widths]
+        manifest = {"format": FORMAT, "kind": kind, "rows": len(self), "bulk": list(self._widths), "columns": small}
+        manifest |= {"files": files, "parameters": self.parameters, "skipped": self.skipped}
+        content = json.dumps(manifest | {"checksum": fingerprint(manifest)}, indent=1)
         (self.folder / MANIFEST).write_text(content, encoding="utf-8")
-
-    def _end(self, bulk: str) -> np.int64:
-        return np.int64(self._columns[f"{bulk}_start"][-1][-1])
 
 
 @contextmanager
-def new_store(folder: Path, kind: str, widths: Mapping[str, int], *, durable: bool = True) -> Iterator[StoreWriter]:
+def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[StoreWriter]:
     """A writer of the new `folder`, which is there, complete, when the block has ended without an error.
 
     widths: coordinates of a point in each bulk column. Points are written as they come; memory holds the other columns.
-    durable: wait until the disk has everything, so that not even a loss of power can cut the store.
     Raises StoreError if the folder exists, OSError that names it if the disk is full.
     """
     if folder.exists():
@@ -206,16 +189,121 @@ def new_store(folder: Path, kind: str, widths: Mapping[str, int], *, durable: bo
             writer = StoreWriter(temporary, files, widths)
             yield writer
             writer.finish(kind)
-        for path in temporary.iterdir() if durable else ():
-            with path.open("rb") as written:
-                os.fsync(written.fileno())
 
 
-def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) -> dict[str, Any]:
-    """Write the header of a .npy file and describe it; numpy pads it to the same size for any number of rows."""
-    np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
-    return {"dtype": dtype.str, "shape": list(shape)}
+def _write_header(file: BinaryIO, shape: tuple[int, ...]) -> None:
+    """Write the header of a .npy file; numpy pads it to the same size for any number of rows."""
+    np.lib.format.write_array_header_1_0(file, {"descr": BULK.str, "fortran_order": False, "shape": shape})
 
 
-def _checksum(content: Mapping[str, Any]) -> int:
-    return checksum(json.dumps(content, sort_keys=True).encode())
+@dataclass(frozen=True)
+class Recipe(Dataset[Made]):
+    """How a store is made: of the rows that `work(*job)` gives for one job after the other.
+
+    kind, widths: as in `new_store`. parameters: kept in the store; what was made with others is another store.
+    work and the jobs must be picklable if there are several processes. what, source: for messages.
+    """
+
+    kind: str
+    widths: Mapping[str, int]
+    parameters: Mapping[str, Any]
+    jobs: Sequence[tuple[Any, ...]]
+    work: Callable[..., Made]
+    what: str
+    source: str
+
+    def __len__(self) -> int:
+        return len(self.jobs)
+
+    def __getitem__(self, number: int) -> Made:
+        return self.work(*self.jobs[number])
+
+
+def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
+    """The store `output`, made unless it is there already; a run that is stopped leaves nothing.
+
+    Raises StoreError if `output` is something else or was made with other parameters, or if no job gives a row;
+    ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.
+    """
+    if not is_store(output):
+        if output.exists():
+            raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
+        claim = output.with_name(f".{output.name}.unfinished")
+        with claimed(claim, wait=wait_for_others):
+            if not is_store(output):  # another process may have made it
+                for left in output.parent.glob(f".{output.name}.[0-9]*"):  # by a process that was killed
+                    shutil.rmtree(left, ignore_errors=True)
+                _make(recipe, output, processes)
+        shutil.rmtree(claim, ignore_errors=True)
+    store = open_store(output, recipe.kind)
+    if different := sorted(key for key, value in recipe.parameters.items() if store.parameters.get(key) != value):
+        raise StoreError(
+            f"expected a new folder, or one made in the same way, got {output} of another {', '.join(different)}; "
+            "try another --output, or remove it"
+        )
+    return store
+
+
+def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
+    """The store of a recipe in the cache folder, made if it is not there, and made again if it is damaged.
+
+    Warns once about what was left out. Raises as `prepare`.
+    """
+    folder = Path(cache_dir) if cache_dir is not None else cache_folder()
+    output = folder / f"{label}-{fingerprint([recipe.kind, dict(recipe.parameters)])[:16]}"
+    try:
+        store = prepare(recipe, output, wait_for_others=True)
+    except StoreError as error:
+        if not is_store(output):
+            raise
+        warnings.warn(f"the cached store {output} is damaged ({error}); making it again", stacklevel=2)
+        shutil.rmtree(output)
+        store = prepare(recipe, output, wait_for_others=True)
+    if store.skipped:
+        some = "; ".join(list(store.skipped.values())[:3])  # the reasons name the files
+        warnings.warn(
+            f"left out {len(store.skipped)} of {len(store.skipped) + len(store)}, all listed in "
+            f"{output / MANIFEST}: {some}",
+            stacklevel=2,
+        )
+    return store
+
+
+def _make(recipe: Recipe, output: Path, processes: int) -> None:
+    made, console = _made(recipe, processes), Console(stderr=True)
+    with new_store(output, recipe.kind, recipe.widths) as writer:
+        writer.parameters |= recipe.parameters
+        for rows, skipped in track(made, f"reading {recipe.source}", len(recipe), console=console, transient=True):
+            writer.skipped |= skipped
+            for row in rows:
+                writer.add(*row)
+        if not len(writer):
+            first = next(iter(writer.skipped.values()), "none found")
+            raise StoreError(
+                f"expected at least one usable {recipe.what} in {recipe.source}, got {len(writer.skipped)} "
+                f"that are not; the first: {first}"
+            )
+
+
+def _made(recipe: Recipe, processes: int) -> Iterator[Made]:
+    """What the jobs give, in their order. A loader's workers end with this process, however it ends."""
+    if processes == 1:
+        return (recipe[number] for number in range(len(recipe)))
+    workers = min(processes, len(recipe))
+    generator = torch.Generator()  # else the seeds of the workers are drawn from the global one
+    loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=_unchanged, generator=generator)
+    with interruptions_later():  # the workers leave Ctrl-C to this process
+        return _of_workers(iter(loader), recipe.source)
+
+
+def _of_workers(made: Iterator[Made], source: str) -> Iterator[Made]:
+    try:
+        yield from made
+    except RuntimeError as error:
+        raise OSError(
+            f"a process that was reading {source} ended, possibly out of memory ({error}); try fewer --processes"
+        ) from error
+
+
+def _unchanged(made: Any) -> Any:
+    return made

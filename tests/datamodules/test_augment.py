@@ -1,4 +1,4 @@
-"""Augmentation: counts, bounds and distributions of the protocol; true pairs stay true; no leak between pairs."""
+"""Augmentation: counts, bounds and distributions of the protocol; matches stay true; no leak between problems."""
 
 from typing import Any
 
@@ -11,26 +11,26 @@ from small_data import check_pairs
 
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
-from bpnp.datamodules.pair import Counts, Pair, stacked
+from bpnp.datamodules.problem import Counts, Problem, stacked
 from bpnp.geometry import transform
 from bpnp.types import Batch
 
 FIELDS = ("points2d", "points3d", "mask2d", "mask3d", "match3d", "rotation", "translation", "origin")
 
 
-def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0) -> Pair:
-    """A camera's pair without noise; points without a partner have coordinates above 50."""
+def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0) -> Problem:
+    """A camera's problem without noise; points without a partner have coordinates above 50."""
     rng = np.random.default_rng(seed)
     points3d = rng.normal(size=(count, 3))
     rotation, translation = cv2.Rodrigues(rng.normal(size=3))[0], np.array([0.1, -0.2, 9.0])
     camera = points3d @ rotation.T + translation
     points2d = np.concatenate([camera[:, :2] / camera[:, 2:], 50 + rng.random((free2d, 2))])
     points3d = np.concatenate([points3d, 50 + rng.random((free3d, 3))])
-    return Pair(f"p{seed}", np.float32(points2d), np.float32(points3d), count, rotation, translation, 800.0)
+    return Problem(f"p{seed}", np.float32(points2d), np.float32(points3d), count, rotation, translation, 800.0)
 
 
-def raw(*pairs: Pair) -> Batch:
-    return stacked(pairs, torch.arange(len(pairs)))
+def raw(*problems: Problem) -> Batch:
+    return stacked(problems, torch.arange(len(problems)))
 
 
 def augmented(batch: Batch, *seeds: int, **options: Any) -> Batch:
@@ -44,23 +44,23 @@ def true_pairs(batch: Batch) -> torch.Tensor:
 @pytest.mark.parametrize("ratio", [0.1, 0.5, 1.0, 2.5])
 @pytest.mark.parametrize("side", ["both", "2d", "3d"])
 def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
-    pair = planted()
-    result = augmented(raw(pair), outliers=Outliers(ratio=ratio, side=side))
+    problem = planted()
+    result = augmented(raw(problem), outliers=Outliers(ratio=ratio, side=side))
     added = int(ratio * 60)
     assert int(result.count2d) == 60 + added * (side != "3d")
     assert int(result.count3d) == 60 + added * (side != "2d")
     assert int(true_pairs(result)) == 60
     check_pairs(result)
-    assert result.points2d[0].amin(0).tolist() == pair.points2d.min(0).tolist()
-    assert result.points3d[0].amax(0).tolist() == pair.points3d.max(0).tolist()
+    assert result.points2d[0].amin(0).tolist() == problem.points2d.min(0).tolist()
+    assert result.points3d[0].amax(0).tolist() == problem.points3d.max(0).tolist()
 
 
 def test_outliers_are_uniform_in_the_box_and_nowhere_first() -> None:
-    pair = planted(400)
-    result = augmented(raw(pair), outliers=Outliers(ratio=5.0))
+    problem = planted(400)
+    result = augmented(raw(problem), outliers=Outliers(ratio=5.0))
     false = result.match3d[0] < 0
     outliers = result.points3d[0, false].numpy()
-    low, high = pair.points3d.min(0), pair.points3d.max(0)
+    low, high = problem.points3d.min(0), problem.points3d.max(0)
     for axis in range(3):
         assert stats.kstest((outliers[:, axis] - low[axis]) / (high - low)[axis], "uniform").pvalue > 1e-3
     for positions in (false.nonzero()[:, 0], result.match3d[0, ~false]):
@@ -94,7 +94,7 @@ def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str,
 
 
 def test_every_pair_and_every_clutter_point_is_as_likely() -> None:
-    """How often each of 10 true pairs and 6 free points is among 5 and 2 chosen, over 4000 draws."""
+    """How often each of 10 matches and 6 free points is among 5 and 2 chosen, over 4000 draws."""
     batch = raw(*[planted(10, free3d=6)] * 4000)
     result = augmented(batch, max_points=5, clutter=0.4)
     for points, count in ((batch.points3d[0, :10], 5), (batch.points3d[0, 10:], 2)):
@@ -104,7 +104,7 @@ def test_every_pair_and_every_clutter_point_is_as_likely() -> None:
 
 
 def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
-    """camera = R (p + origin) + t - R origin is the same however the pair is turned."""
+    """camera = R (p + origin) + t - R origin is the same however the problem is turned."""
     batch = raw(planted(), planted(seed=1))
     batch.origin = torch.tensor([[5e5, -3e6, 40.0], [0.0, 0.0, 0.0]], dtype=torch.float64)
     straight, turned = augmented(batch), augmented(batch, rotate=True)
@@ -125,16 +125,18 @@ HARD: dict[str, Any] = {
 
 
 def test_a_pair_depends_on_its_key_alone_not_on_neighbours_or_padding() -> None:
-    pairs = [planted(n, free2d=n // 2, free3d=9, seed=n) for n in (8, 60, 25)]
-    together = augmented(raw(*pairs), 1, 2, **HARD)
+    problems = [planted(n, free2d=n // 2, free3d=9, seed=n) for n in (8, 60, 25)]
+    together = augmented(raw(*problems), 1, 2, **HARD)
     check_pairs(together)
-    for row, pair in enumerate(pairs):
-        alone = augment(stacked([pair], torch.tensor([row])), Augmentation(**HARD), row_keys(torch.tensor([row]), 1, 2))
+    for row, problem in enumerate(problems):
+        alone = augment(
+            stacked([problem], torch.tensor([row])), Augmentation(**HARD), row_keys(torch.tensor([row]), 1, 2)
+        )
         for name in FIELDS:
             whole, own = getattr(together, name)[row], getattr(alone, name)[0]
             assert torch.equal(whole[: len(own)], own), name
             assert name in ("rotation", "translation", "origin") or not (whole[len(own) :] > 0).any()
-    again, other = (augmented(raw(*pairs), 1, epoch, **HARD) for epoch in (2, 3))
+    again, other = (augmented(raw(*problems), 1, epoch, **HARD) for epoch in (2, 3))
     assert torch.equal(again.points2d, together.points2d)
     assert other.points2d.shape != together.points2d.shape or not torch.equal(other.points2d, together.points2d)
 
@@ -154,14 +156,14 @@ def test_ranges_are_drawn_uniformly_for_each_pair() -> None:
 
 
 def test_sizes_are_upper_bounds_that_are_reached() -> None:
-    pairs = [planted(n, free2d=2 * n, free3d=7, seed=n) for n in (8, 60, 25)]
+    problems = [planted(n, free2d=2 * n, free3d=7, seed=n) for n in (8, 60, 25)]
     counts = Counts(*(np.array(x) for x in ([8, 60, 25], [24, 180, 75], [15, 67, 32])))
     hard = dict(HARD, outliers=Outliers(ratio=(0.0, 1.0)))
     for options in ({}, {"max_points": 30}, {"clutter": 0.0}, {"clutter": 0.5, "clutter_side": "3d"}, hard):
         bound = Augmentation(**options).sizes(counts)
         largest = np.zeros(3)
         for seed in range(60 if "outliers" in options else 1):
-            result = augmented(raw(*pairs), seed, **options)
+            result = augmented(raw(*problems), seed, **options)
             sides = torch.maximum(result.count2d, result.count3d).numpy()
             assert (sides <= bound).all()
             largest = np.maximum(largest, sides)

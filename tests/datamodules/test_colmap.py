@@ -11,7 +11,8 @@ from small_data import check_pairs, recorded
 
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.module import ColmapDataModule
-from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
+from bpnp.datamodules.colmap.scenes import find_scenes
+from bpnp.datamodules.stored import split_scenes
 
 
 def test_models_are_found_in_every_layout(tmp_path: Path) -> None:
@@ -112,8 +113,8 @@ def test_the_loaders_serve_disjoint_scenes(tmp_path: Path) -> None:
     assert max(data.datasets["train"].sizes) == 22 + round(0.2 * 22)
     predicted, tested = (data.datasets[part] for part in ("predict", "test"))
     image = predicted.source.images[0][1]
-    np.testing.assert_allclose(predicted.pair(0).rotation[0].numpy(), image.rotation, atol=1e-6)
-    assert not np.allclose(tested.pair(0).rotation[0].numpy(), image.rotation, atol=0.1)
+    np.testing.assert_allclose(predicted.problem(0).rotation[0].numpy(), image.rotation, atol=1e-6)
+    assert not np.allclose(tested.problem(0).rotation[0].numpy(), image.rotation, atol=0.1)
 
 
 WRONG: list[tuple[dict[str, Any], str]] = [
@@ -141,7 +142,7 @@ def test_only_training_draws_anew(tmp_path: Path) -> None:
     data = ColmapDataModule(str(tmp_path), eval_max_points=10)
     data.setup()
     for part, changes in (("train", True), ("val", False), ("test", False)):
-        first, second = (data.datasets[part].pair(0, epoch).points2d for epoch in (0, 1))
+        first, second = (data.datasets[part].problem(0, epoch).points2d for epoch in (0, 1))
         assert torch.equal(first, second) != changes
     assert max(data.datasets["test"].sizes) == 10
 

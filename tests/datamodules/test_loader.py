@@ -12,13 +12,13 @@ from lightning.pytorch.callbacks import ModelCheckpoint
 from small_data import recorded
 from torch.utils.data import DataLoader, SequentialSampler
 
-from bpnp.datamodules.loader import BucketSampler, PairDataset, PairLoader, pair_loader
-from bpnp.datamodules.pair import Counts, Pair, stacked
+from bpnp.datamodules.loader import BucketSampler, ProblemDataset, ProblemLoader, problem_loader
+from bpnp.datamodules.problem import Counts, Problem, stacked
 from bpnp.types import Batch
 
 
 class Numbered:
-    """Pair i at epoch e is named "i" and has e in its points, so that a batch tells which keys it was made of."""
+    """Problem i at epoch e is named "i" and has e in its points, so that a batch tells which keys it was made of."""
 
     def __init__(self, sizes: Sequence[int]) -> None:
         self.sizes = np.asarray(sizes, dtype=np.int64)
@@ -31,17 +31,17 @@ class Numbered:
         return tuple(map(str, index))
 
     def batch(self, index: torch.Tensor, epoch: int) -> Batch:
-        return stacked([self.pair(i, epoch) for i in index.tolist()], index)
+        return stacked([self.problem(i, epoch) for i in index.tolist()], index)
 
-    def pair(self, index: int, epoch: int) -> Pair:
+    def problem(self, index: int, epoch: int) -> Problem:
         rng = np.random.default_rng([epoch, index])
         n = int(self.sizes[index])
         points2d, points3d = rng.random((n, 2), dtype=np.float32), np.full((n, 3), epoch, np.float32)
-        return Pair(str(index), points2d, points3d, n, np.eye(3), np.ones(3), 800.0)
+        return Problem(str(index), points2d, points3d, n, np.eye(3), np.ones(3), 800.0)
 
 
-def dataset(sizes: Sequence[int]) -> PairDataset:
-    return PairDataset(Numbered(sizes), fresh=True)
+def dataset(sizes: Sequence[int]) -> ProblemDataset:
+    return ProblemDataset(Numbered(sizes), fresh=True)
 
 
 def random_sizes(count: int, *, largest: int = 400) -> list[int]:
@@ -55,9 +55,9 @@ def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options
 
 def test_stacked_pairs_are_padded_and_masked() -> None:
     source = Numbered([2, 5, 3])
-    pairs = [source.pair(i, 0) for i in (1, 2)]
-    pairs[1] = replace(pairs[1], matched=2, origin=np.array([1.0, 2.0, 3.0]))
-    batch = stacked(pairs, torch.tensor([1, 2]))
+    problems = [source.problem(i, 0) for i in (1, 2)]
+    problems[1] = replace(problems[1], matched=2, origin=np.array([1.0, 2.0, 3.0]))
+    batch = stacked(problems, torch.tensor([1, 2]))
     assert batch.points2d.dtype == batch.focal.dtype == torch.float32
     assert batch.rotation.dtype == torch.float64
     assert batch.index.tolist() == [1, 2]
@@ -65,11 +65,11 @@ def test_stacked_pairs_are_padded_and_masked() -> None:
     assert batch.focal.tolist() == [800.0, 800.0]
     assert batch.origin.tolist() == [[0, 0, 0], [1, 2, 3]]
     assert batch.match3d.tolist() == [[0, 1, 2, 3, 4], [0, 1, -1, -1, -1]]
-    for row, pair in enumerate(pairs):
-        n = len(pair.points3d)
+    for row, problem in enumerate(problems):
+        n = len(problem.points3d)
         assert batch.mask3d[row].tolist() == batch.mask2d[row].tolist() == [True] * n + [False] * (5 - n)
-        np.testing.assert_array_equal(batch.points3d[row, :n], pair.points3d)
-        np.testing.assert_array_equal(batch.points2d[row, :n], pair.points2d)
+        np.testing.assert_array_equal(batch.points3d[row, :n], problem.points3d)
+        np.testing.assert_array_equal(batch.points2d[row, :n], problem.points2d)
 
 
 @pytest.mark.parametrize("count", [1, 7, 24, 1003])
@@ -134,39 +134,39 @@ def test_max_cells_bounds_padding_and_buckets_waste_little() -> None:
 
 def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
     source = dataset(random_sizes(20))
-    whole = [batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)]
+    whole = [batch.ids for batch in problem_loader(source, batch_size=4, shuffle=False, seed=1)]
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
     halves = []
     for rank in (0, 1):
         monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
-        halves.append([batch.ids for batch in pair_loader(source, batch_size=4, shuffle=False, seed=1)])
+        halves.append([batch.ids for batch in problem_loader(source, batch_size=4, shuffle=False, seed=1)])
     assert [a + b for a, b in zip(*halves, strict=True)] == whole
 
 
 def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"2 processes divide, got 15; try 16"):
         sampler([4] * 20, batch_size=15, shuffle=True, replicas=2)
-    with pytest.raises(ValueError, match="at least one pair"):
+    with pytest.raises(ValueError, match="at least one problem"):
         sampler([], batch_size=4, shuffle=False)
     with pytest.raises(ValueError, match=r"max_cells.*shuffle=False"):
         sampler([4], batch_size=4, shuffle=True, max_cells=100)
-    pairs = dataset([4, 4])
+    problems = dataset([4, 4])
     with pytest.raises(ValueError, match="expected the loader's BucketSampler, got SequentialSampler"):
-        next(iter(PairLoader(pairs, sampler=SequentialSampler(pairs), batch_size=None)))
+        next(iter(ProblemLoader(problems, sampler=SequentialSampler(problems), batch_size=None)))
 
 
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.filterwarnings("ignore")
 def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers: int) -> None:
-    class Pairs(LightningDataModule):
+    class Problems(LightningDataModule):
         def train_dataloader(self) -> DataLoader:
-            return pair_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=workers)
+            return problem_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=workers)
 
     def fit(*callbacks: ModelCheckpoint, checkpoint: Path | None = None) -> list[tuple[str, ...]]:
-        """ "epoch:index" of each pair of each batch."""
+        """ "epoch:index" of each problem of each batch."""
         options = {"max_epochs": 2, "enable_checkpointing": bool(callbacks), "callbacks": list(callbacks)}
-        batches = recorded(Pairs(), checkpoint=checkpoint, **options)
+        batches = recorded(Problems(), checkpoint=checkpoint, **options)
         return [tuple(f"{int(p[0, 0])}:{i}" for p, i in zip(b.points3d, b.ids, strict=True)) for b in batches]
 
     whole = fit(ModelCheckpoint(tmp_path, filename="{step}", save_top_k=-1, every_n_train_steps=1))

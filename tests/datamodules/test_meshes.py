@@ -13,11 +13,11 @@ from scipy.spatial.transform import Rotation
 from small_data import check_pairs, recorded
 
 from bpnp.datamodules.augment import Augmentation, Outliers
-from bpnp.datamodules.loader import PairDataset, PairKeys
+from bpnp.datamodules.loader import ProblemDataset, ProblemKeys
 from bpnp.datamodules.meshes.module import MeshDataModule
-from bpnp.datamodules.meshes.prepare import WIDTHS
-from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, Views, hold_out
-from bpnp.datamodules.pair import PairSource
+from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, RandomCameras
+from bpnp.datamodules.module import hold_out
+from bpnp.datamodules.problem import ProblemSource
 from bpnp.datamodules.store import Store, new_store, open_store
 from bpnp.types import Batch
 
@@ -26,20 +26,20 @@ def cloud(folder: Path, models: int = 5, samples: int = 400) -> Store:
     """Points of unit spheres."""
     points = np.random.default_rng(0).normal(size=(models, samples, 3))
     points /= np.linalg.norm(points, axis=-1, keepdims=True)
-    with new_store(folder / "cloud", SURFACES, WIDTHS) as writer:
+    with new_store(folder / "cloud", SURFACES, {POINTS: 3}) as writer:
         for i, one in enumerate(points):
-            writer.add(f"c/train/m{i}", {POINTS: one}, radius=1.0)
+            writer.add(f"c/train/m{i}", {POINTS: one}, {"radius": 1.0})
     return open_store(folder / "cloud", SURFACES)
 
 
-def source(folder: Path, views: Views | None = None, *, num_pairs: int = 200, **options: Any) -> MeshSource:
+def source(folder: Path, cameras: RandomCameras | None = None, *, num_pairs: int = 200, **options: Any) -> MeshSource:
     store = open_store(folder / "cloud", SURFACES) if (folder / "cloud").exists() else cloud(folder)
     options = {"num_points": 300, "pool_size": 400, "seed": (0, 0), "label": "train"} | options
-    return MeshSource(store, np.arange(5), num_pairs=num_pairs, views=views or Views(), **options)
+    return MeshSource(store, np.arange(5), num_pairs=num_pairs, cameras=cameras or RandomCameras(), **options)
 
 
-def drawn(pairs: MeshSource, count: int, epoch: int = 0) -> Batch:
-    return pairs.batch(torch.arange(count), epoch)
+def drawn(problems: MeshSource, count: int, epoch: int = 0) -> Batch:
+    return problems.batch(torch.arange(count), epoch)
 
 
 def module(folder: Path, root: Path | None = None, **options) -> MeshDataModule:
@@ -79,7 +79,7 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
         assert stats.kstest(angles[:, axis], stats.uniform(0, 45).cdf).pvalue > 1e-3
         assert stats.kstest(offsets[:, axis], stats.uniform(-0.5, 1).cdf).pvalue > 1e-3
     assert np.abs(np.corrcoef(np.hstack([angles, offsets]).T)[np.triu_indices(6, 1)]).max() < 0.13
-    # R = Rz Ry Rx, written out for one pair
+    # R = Rz Ry Rx, written out for one problem
     (a, b, c), turn = np.deg2rad(angles[0]), batch.rotation[0].numpy()
     assert turn[2] == pytest.approx([-np.sin(b), np.cos(b) * np.sin(a), np.cos(b) * np.cos(a)])
     assert turn[:2, 0] == pytest.approx([np.cos(b) * np.cos(c), np.cos(b) * np.sin(c)])
@@ -87,7 +87,7 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
 
 def test_so3_is_uniform(tmp_path: Path) -> None:
     """The angle of a uniform rotation has the distribution function (a - sin a) / pi, its axes are uniform too."""
-    batch = drawn(source(tmp_path, Views(rotation="so3"), num_pairs=1000, num_points=4), 1000)
+    batch = drawn(source(tmp_path, RandomCameras(rotation="so3"), num_pairs=1000, num_points=4), 1000)
     rotations = Rotation.from_matrix(batch.rotation)
     assert stats.kstest(rotations.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
     assert stats.kstest(rotations.as_matrix()[:, 2, 2], stats.uniform(-1, 2).cdf).pvalue > 1e-3
@@ -95,7 +95,7 @@ def test_so3_is_uniform(tmp_path: Path) -> None:
 
 def test_a_pair_depends_on_seed_epoch_and_index_alone(tmp_path: Path) -> None:
     one, reseeded, split = (source(tmp_path, seed=seed) for seed in ((0, 0), (1, 0), (0, 1)))
-    assert isinstance(one, PairSource)
+    assert isinstance(one, ProblemSource)
     index = torch.tensor([3, 7, 12])
     whole, alone = one.batch(index, 2), one.batch(index[1:2], 2)
     others = [reseeded.batch(index[1:2], 2), split.batch(index[1:2], 2), one.batch(index[1:2], 3)]
@@ -110,9 +110,9 @@ def test_a_pair_depends_on_seed_epoch_and_index_alone(tmp_path: Path) -> None:
 
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="reach 1 from their origin"):
-        inside = source(tmp_path, Views(distance=0.0, noise_px=0.0), num_pairs=5)
-    batch = PairDataset(inside, Augmentation(outliers=Outliers(ratio=0.2))).batch(
-        PairKeys(0, torch.arange(5), inside.names(range(5)))
+        inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), num_pairs=5)
+    batch = ProblemDataset(inside, Augmentation(outliers=Outliers(ratio=0.2))).batch(
+        ProblemKeys(0, torch.arange(5), inside.names(range(5)))
     )
     natural = drawn(inside, 5)
     depth = (natural.points3d.double() @ natural.rotation.mT + natural.translation[:, None])[..., 2]
@@ -122,11 +122,11 @@ def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     assert torch.equal(batch.count2d, true.sum(-1) + (0.2 * true.sum(-1)).long())
     assert torch.equal(batch.count3d, 300 + (0.2 * true.sum(-1)).long())
     check_pairs(batch, 1e-4)
-    blind = Views(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
+    blind = RandomCameras(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
     with pytest.warns(UserWarning, match="reach 1"):
-        pairs = source(tmp_path, blind, num_points=4, pool_size=4, num_pairs=1)
+        problems = source(tmp_path, blind, num_points=4, pool_size=4, num_pairs=1)
     with pytest.raises(ValueError, match=r"4 points in front of the camera, got \d in c/.*#0"):
-        drawn(pairs, 1)
+        drawn(problems, 1)
 
 
 def test_splits_are_by_model(folder: Path, tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         module(tmp_path, euler_range=(45.0, 0.0))
     with pytest.raises(ValueError, match="`noise_px`, got nan"):
         module(tmp_path, noise_px=float("nan"))
-    with pytest.raises(ValueError, match="at least one train pair, got 0"):
+    with pytest.raises(ValueError, match="at least one train problem, got 0"):
         module(tmp_path, train_pairs=0).setup("fit")
     with pytest.raises(ValueError, match="`val_fraction` between 0 and 1, got 1"):
         hold_out(10, 1.0, seed=0)

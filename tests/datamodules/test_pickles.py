@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bpnp.datamodules.released.pickles import PickleError, load_pickle
+from bpnp.datamodules.authors import PickleError, load_pickle
 
 
 def arrays() -> dict[str, object]:

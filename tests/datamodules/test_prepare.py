@@ -20,16 +20,16 @@ import trimesh
 from planted_model import plant_model
 from small_data import check_pairs
 
+import bpnp.datamodules.store
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
-from bpnp.datamodules.colmap.prepare import prepare_colmap
+from bpnp.datamodules.colmap.module import prepare_colmap
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.datamodules.meshes.archives import MeshFiles
-from bpnp.datamodules.meshes.prepare import prepare_meshes
+from bpnp.datamodules.meshes.module import prepare_meshes
 from bpnp.datamodules.meshes.source import POINTS, SURFACES
 from bpnp.datamodules.meshes.surfaces import normalise, read_mesh, sample_surface
-from bpnp.datamodules.prepare import Prepared
-from bpnp.datamodules.store import Store, StoreError, is_store, open_store
+from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
@@ -56,7 +56,7 @@ def meshes(tmp_path: Path) -> Path:
     return root
 
 
-def run(source: Path, output: Path, **changes: object) -> Prepared:
+def run(source: Path, output: Path, **changes: object) -> Store:
     options = {"points": 32, "normalisation": "unit_sphere", "processes": 1} | changes
     return prepare_meshes(source, output, **options)
 
@@ -109,7 +109,7 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
         zipfile.ZipFile(source).extractall(tmp_path / "unpacked")
         source = tmp_path / "unpacked"
     prepared = run(source, tmp_path / "out" / "store")
-    assert prepared.counts == {"train": 8, "test": 4}
+    assert len(prepared) == 12
     check(opened(tmp_path / "out" / "store"), meshes)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["store"]
     data = MeshDataModule(str(prepared.folder), num_points=16, pool_size=32, train_pairs=8, val_fraction=0.2)
@@ -117,10 +117,14 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
     assert (len(data.datasets["train"].source.rows), len(data.datasets["test"])) == (6, 4)
 
 
-def test_several_processes_give_the_same_bytes(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    run(meshes, tmp_path / "one")
-    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 3)
-    run(meshes, tmp_path / "two", processes=2)
+@pytest.mark.parametrize("packed", [False, True])
+def test_several_processes_give_the_same_bytes(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, packed: bool
+) -> None:
+    source = zipped(meshes) if packed else meshes
+    run(source, tmp_path / "one")
+    monkeypatch.setattr("bpnp.datamodules.meshes.module.MESHES_A_PART", 1)
+    run(source, tmp_path / "two", processes=2)
     check_same_bytes(tmp_path / "two", tmp_path / "one")
 
 
@@ -203,7 +207,7 @@ def test_a_damaged_entry_of_a_zip_is_skipped(meshes: Path, tmp_path: Path) -> No
 def test_again_does_nothing_and_otherwise_is_refused(meshes: Path, tmp_path: Path) -> None:
     run(meshes, tmp_path / "store")
     before = (tmp_path / "store" / "manifest.json").stat().st_mtime_ns
-    assert run(meshes, tmp_path / "store").counts == {"train": 8, "test": 4}
+    assert len(run(meshes, tmp_path / "store")) == 12
     assert (tmp_path / "store" / "manifest.json").stat().st_mtime_ns == before
     with pytest.raises(StoreError, match="another points"):
         run(meshes, tmp_path / "store", points=16)
@@ -227,7 +231,7 @@ def killed(work: object, seconds: float) -> bool:
 def test_no_kill_leaves_a_wrong_store(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:  # fmt: skip
-    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
+    monkeypatch.setattr("bpnp.datamodules.meshes.module.MESHES_A_PART", 2)
     scenes(tmp_path / "scenes", 8)
 
     def work(output: str = "store") -> None:
@@ -270,31 +274,41 @@ class Stopping:
         monkeypatch.setattr(MeshFiles, "samples", samples)
 
 
-def test_finished_parts_are_kept(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
-    with monkeypatch.context() as patch:
-        first = Stopping(patch, 9)
-        with pytest.raises(KeyboardInterrupt):
-            run(meshes, tmp_path / "store")
-    rest = Stopping(monkeypatch)
-    run(meshes, tmp_path / "store")
-    assert len(first.names) + len(rest.names) == 19 + 1  # the ninth mesh was sampled twice
-    assert set(first.names) & set(rest.names) == {first.names[-1]}
-    check(opened(tmp_path / "store"), meshes)
-
-
-def test_parts_of_another_preparation_are_not_used(
+def test_a_run_that_is_stopped_leaves_nothing_and_starts_again(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    run(meshes, tmp_path / "whole")
-    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
+) -> None:
     with monkeypatch.context() as patch:
         Stopping(patch, 9)
         with pytest.raises(KeyboardInterrupt):
-            run(meshes, tmp_path / "store", normalisation="none")
-    assert len([path for path in (tmp_path / ".store.unfinished").iterdir() if path.is_dir()]) == 4
-    run(meshes, tmp_path / "store")
-    check_same_bytes(tmp_path / "store", tmp_path / "whole")
+            run(meshes, tmp_path / "out" / "store")
+    assert not (tmp_path / "out" / "store").exists()
+    assert [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
+    run(meshes, tmp_path / "out" / "store")
+    check(opened(tmp_path / "out" / "store"), meshes)
+
+
+def test_ctrl_c_says_that_nothing_was_written(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Stopping(monkeypatch, 9)
+    with pytest.raises(SystemExit) as ended:
+        main(["prepare", "modelnet40", str(meshes), "--output", str(tmp_path / "store"), "--processes", "1"])
+    assert ended.value.code == 130
+    assert "bpnp: interrupted; nothing was written, run it again to start anew" in capsys.readouterr().err
+
+
+def test_a_worker_that_is_killed_is_one_error(meshes: Path, tmp_path: Path) -> None:
+    """As the system ends a process that takes too much memory."""
+    recipe = Recipe("toy", {"points": 3}, {}, [(os.getpid(),)] * 4, end_worker, "mesh", "here")
+    with pytest.raises(OSError, match="a process that was reading here ended, .* try fewer --processes"):
+        prepare(recipe, tmp_path / "store", processes=2)
+    assert not (tmp_path / "store").exists()
+
+
+def end_worker(parent: int) -> Made:
+    assert os.getpid() != parent
+    os.kill(os.getpid(), signal.SIGKILL)
+    return [], {}
 
 
 def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -306,7 +320,7 @@ def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pyte
 PREPARE = """
 import sys
 from pathlib import Path
-from bpnp.datamodules.meshes.prepare import prepare_meshes
+from bpnp.datamodules.meshes.module import prepare_meshes
 if __name__ == "__main__":
     print("ready", flush=True)
     try:
@@ -323,7 +337,7 @@ def test_ctrl_c_while_processes_start_is_one_clean_end(meshes: Path, tmp_path: P
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     with subprocess.Popen(words, text=True, start_new_session=True, **pipes) as process:  # type: ignore[call-overload]
         assert process.stdout.readline() == "ready\n"
-        time.sleep(0.7)
+        time.sleep(0.03)
         os.killpg(process.pid, signal.SIGINT)
         said = process.stderr.read()
     assert (process.returncode, "Traceback" in said) == (130, False), said
@@ -342,7 +356,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
     broken.write_bytes(broken.read_bytes()[:-9])
     arguments = [str(tmp_path / "MegaDepth_v1_SfM"), "--output", str(tmp_path / "store"), "--clutter", "0.5"]
     main(["prepare", "megadepth", *arguments, "--processes", "1", "--min-points", "31"])
-    assert "4 scenes, 12 pairs" in capsys.readouterr().out
+    assert "4 scenes, 12 images" in capsys.readouterr().out
     (tmp_path / "test.txt").write_text("0005\n\n0001\n")
     options = {"test_scenes": str(tmp_path / "test.txt"), "clutter": 0.4, "eval_max_points": 32, "min_points": 31}
     batches = []
@@ -357,7 +371,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
     stored = batches[1]
     assert sorted((stored.match3d >= 0).sum(-1).tolist()) == [31, 31, 31, 32, 32, 32]
     check_pairs(stored, 2e-5)
-    assert set(open_store(tmp_path / "store", "pairs").skipped) == {"0003", "0000"}
+    assert set(open_store(tmp_path / "store", "problems").skipped) == {"0003", "0000"}
     with pytest.raises(StoreError, match="clutter.*0.5.*--clutter 0.6"):
         ColmapDataModule(str(tmp_path / "store"), **(options | {"clutter": 0.6})).setup("test")
     with pytest.raises(ValueError, match="nothing.txt"):
@@ -383,27 +397,6 @@ def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="at least one usable image.*min_points"):
         prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=50, clutter=0.0, processes=1)
     assert not (tmp_path / "store").exists()
-
-
-def test_what_is_left_of_removed_parts_is_not_used(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:  # fmt: skip
-    """A kill while the parts are removed, after the store has got its name."""
-    run(meshes, tmp_path / "whole")
-    monkeypatch.setattr("bpnp.datamodules.meshes.prepare.MESHES_A_PART", 2)
-
-    def remove_one_file_and_stop(folder: Path, *, ignore_errors: bool = False) -> None:
-        if folder.name == ".store.unfinished":
-            next(folder.glob("*/points.npy")).unlink()
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "rmtree", remove_one_file_and_stop)
-        with pytest.raises(KeyboardInterrupt):
-            run(meshes, tmp_path / "store")
-    shutil.rmtree(tmp_path / "store")
-    run(meshes, tmp_path / "store")
-    check_same_bytes(tmp_path / "store", tmp_path / "whole")
 
 
 def module(meshes: Path, cache: Path) -> MeshDataModule:
@@ -444,12 +437,14 @@ def test_a_cached_store_is_compared_with_its_checksums_once_a_run(
         warnings.simplefilter("ignore")  # of the seven bad files
         MeshDataModule(source, **options).setup("fit")
         read: list[Path] = []
-        whole = Store.verify
-        monkeypatch.setattr(Store, "verify", lambda store: (read.append(store.folder), whole(store))[1])
+        whole = bpnp.datamodules.store.open_store
+        monkeypatch.setattr(
+            "bpnp.datamodules.store.open_store", lambda folder, kind: (read.append(folder), whole(folder, kind))[1]
+        )
         data = MeshDataModule(source, **options)
         data.prepare_data()
         data.setup("fit")
-    assert len(set(read)) == len(read) == (1 if root else 2)  # the test shapes are made now
+    assert len(set(read)) == len(read) == (1 if root else 3)  # of training, validation and test
 
 
 def test_the_cache_is_the_users_wherever_the_work_is(

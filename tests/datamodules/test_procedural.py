@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.prepare import open_surfaces
-from bpnp.datamodules.meshes.procedural import ProceduralShapes, procedural_shape
+from bpnp.datamodules.meshes.module import open_surfaces
 from bpnp.datamodules.meshes.source import POINTS
-from bpnp.datamodules.meshes.surfaces import normalise, sample_surface
+from bpnp.datamodules.meshes.surfaces import ProceduralShapes, normalise, procedural_shape, sample_surface
 from bpnp.datamodules.store import Store
 
 

@@ -92,7 +92,7 @@ def test_of_repeated_keypoints_the_better_one_is_kept(tmp_path: Path, monkeypatc
 
 
 def test_bad_points_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None:
-    """A NaN point leaves the scene, a point behind a camera leaves its pairs, an unknown one is no clutter."""
+    """A NaN point leaves the scene, a point behind a camera leaves its matches, an unknown one is no clutter."""
     truth = plant_model(tmp_path, images=1)
     records = editable(tmp_path, monkeypatch)
     nan, behind, unknown = (np.flatnonzero(records.point_ids == seen + 1) for seen in truth.seen[0][:3])
@@ -103,7 +103,7 @@ def test_bad_points_are_dropped_and_counted(tmp_path: Path, monkeypatch) -> None
     assert found.lost == {
         "points that are not finite": 1,
         "keypoints of a point that is missing": 2,
-        "pairs with the point behind or in the camera": 1,
+        "matches with the point behind or in the camera": 1,
     }
     image = found.images[0]
     assert (len(found.points3d), len(image.seen), len(image.observed), len(image.clutter2d)) == (59, 37, 38, 12)
@@ -160,7 +160,7 @@ def test_zlib_works_after_the_reading(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("scene", ["castle-P30", "sceaux_castle_txt", "statue_of_liberty", "walkthrough"])
 def test_real_residuals_are_those_of_the_reconstruction(scene: str, shared_data: Path, tmp_path: Path) -> None:
-    """Every pair's residual, sent back through the lens into pixels, is the one that pycolmap computes there."""
+    """Every problem's residual, sent back through the lens into pixels, is the one that pycolmap computes there."""
     folder = shared_data / "colmap" / scene / "sparse" / "0"
     model = pycolmap.Reconstruction(folder)
     ids = np.sort(np.fromiter(model.points3D, dtype=np.int64))

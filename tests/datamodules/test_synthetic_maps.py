@@ -8,11 +8,15 @@ import torch
 from jsonargparse import ArgumentParser
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules import Outliers, Pair, PairSource, SfmSceneDataModule
-from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, MapOptions, draw_map_pair, triangulated
-from bpnp.datamodules.synthetic_maps.module import MapSource
-from bpnp.datamodules.synthetic_maps.objects import blob_points
-from bpnp.datamodules.synthetic_maps.photos import camera_at, details, look
+from bpnp.datamodules import Outliers, Problem, ProblemSource, SyntheticMapDataModule
+from bpnp.datamodules.synthetic_maps.maps import (
+    KINDS,
+    MOST_ERROR_PX,
+    MapOptions,
+    MapSource,
+    draw_map_problem,
+    triangulated,
+)
 from bpnp.datamodules.synthetic_maps.scene import (
     NO_BLOBS,
     NO_WALLS,
@@ -20,75 +24,81 @@ from bpnp.datamodules.synthetic_maps.scene import (
     Scene,
     Viewpoint,
     Walls,
+    camera_at,
+    details,
     hidden_by_blobs,
     hidden_by_walls,
+    look,
 )
+from bpnp.datamodules.synthetic_maps.surfaces import blob_points
 
 
 def source(*, seed: tuple[int, ...] = (0, 0), **options: object) -> MapSource:
     return MapSource(MapOptions(**options), num_pairs=100, seed=seed, label="train")
 
 
-def pairs(count: int, **options: object) -> list[Pair]:
+def problems(count: int, **options: object) -> list[Problem]:
     rngs = (np.random.default_rng([0, 0, 0, i]) for i in range(count))
-    return [draw_map_pair(f"map/{i}", MapOptions(**options), rng) for i, rng in enumerate(rngs)]
+    return [draw_map_problem(f"map/{i}", MapOptions(**options), rng) for i, rng in enumerate(rngs)]
 
 
-def shown(pair: Pair) -> np.ndarray:
+def shown(problem: Problem) -> np.ndarray:
     """Image points of all 3D points, NaN behind the camera."""
-    x, y, z = (pair.points3d @ pair.rotation.T + pair.translation).T
+    x, y, z = (problem.points3d @ problem.rotation.T + problem.translation).T
     return np.stack([x, y], 1) / np.where(z > 0, z, np.nan)[:, None]
 
 
-def errors_px(pair: Pair) -> np.ndarray:
-    """Of each coordinate of the true pairs' keypoints."""
-    return (shown(pair)[: pair.matched] - pair.points2d[: pair.matched]).ravel() * pair.focal
+def errors_px(problem: Problem) -> np.ndarray:
+    """Of each coordinate of the matches' keypoints."""
+    return (shown(problem)[: problem.matched] - problem.points2d[: problem.matched]).ravel() * problem.focal
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_true_pairs_reproject_within_the_noise(kind: str) -> None:
-    for pair in pairs(4, num_points=100, kinds={kind: 1.0}, noise_px=0.0):
-        assert np.abs(errors_px(pair)).max() < 0.1  # float32
-        np.testing.assert_allclose(pair.rotation @ pair.rotation.T, np.eye(3), atol=1e-12)
-        assert np.linalg.det(pair.rotation) == pytest.approx(1)
-    noise = np.concatenate([errors_px(pair) for pair in pairs(12, num_points=200, kinds={kind: 1.0}, noise_px=0.8)])
+    for problem in problems(4, num_points=100, kinds={kind: 1.0}, noise_px=0.0):
+        assert np.abs(errors_px(problem)).max() < 0.1  # float32
+        np.testing.assert_allclose(problem.rotation @ problem.rotation.T, np.eye(3), atol=1e-12)
+        assert np.linalg.det(problem.rotation) == pytest.approx(1)
+    noise = np.concatenate(
+        [errors_px(problem) for problem in problems(12, num_points=200, kinds={kind: 1.0}, noise_px=0.8)]
+    )
     assert 0.75 < np.median(np.abs(noise)) / (0.8 * 0.6745) < 2.0  # the keypoint's, and more from the triangulation
     assert np.abs(noise).max() < MOST_ERROR_PX
 
 
 @pytest.mark.parametrize("limit", [0.0, 0.5, 0.8])
 def test_of_each_side_at_most_a_share_has_no_partner(limit: float) -> None:
-    for pair in pairs(15, num_points=120, outliers=limit):
-        for count in (len(pair.points2d), len(pair.points3d)):
-            assert 16 <= pair.matched <= count <= 120
-            assert 1 - pair.matched / count <= limit + 1 / pair.matched
-    everything = pairs(15, num_points=120, outliers=1.0)
-    without = [1 - pair.matched / len(pair.points2d) for pair in everything]
+    for problem in problems(15, num_points=120, outliers=limit):
+        for count in (len(problem.points2d), len(problem.points3d)):
+            assert 16 <= problem.matched <= count <= 120
+            assert 1 - problem.matched / count <= limit + 1 / problem.matched
+    everything = problems(15, num_points=120, outliers=1.0)
+    without = [1 - problem.matched / len(problem.points2d) for problem in everything]
     assert np.median(without) > 0.6  # most keypoints of a photo are in no other photo, or not in the view's
 
 
 def test_a_pair_is_a_function_of_seed_epoch_and_index() -> None:
     options = {"num_points": 40}
     first, index = source(**options), torch.tensor([3, 4])
-    assert isinstance(first, PairSource)
-    pair = first.batch(index[1:], 2)
-    size = int(pair.count3d)
-    assert torch.equal(pair.points3d[0], source(**options).batch(index, 2).points3d[1, :size])
+    assert isinstance(first, ProblemSource)
+    problem = first.batch(index[1:], 2)
+    size = int(problem.count3d)
+    assert torch.equal(problem.points3d[0], source(**options).batch(index, 2).points3d[1, :size])
     others = [first.batch(index[1:], 1), first.batch(index[:1], 2)]
     others += [source(seed=seed, **options).batch(index[1:], 2) for seed in ((1, 0), (0, 1))]
-    assert not any(torch.equal(pair.points3d[0, :16], other.points3d[0, :16]) for other in others)
+    assert not any(torch.equal(problem.points3d[0, :16], other.points3d[0, :16]) for other in others)
 
 
 def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
-    plenty = pairs(60, num_points=40, noise_px=0.0)
-    for pair in plenty:
-        half = 600 / pair.focal
+    plenty = problems(60, num_points=40, noise_px=0.0)
+    for problem in plenty:
+        half = 600 / problem.focal
         assert 24 <= 2 * np.degrees(np.arctan(half)) <= 115
-        assert np.abs(pair.points2d).max() <= half * (1 + 1e-6)
-        assert np.abs(pair.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
+        assert np.abs(problem.points2d).max() <= half * (1 + 1e-6)
+        assert np.abs(problem.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
     for frame in ("any", "upright", "view"):
         kinds = {"facades": 1.0}
-        data = SfmSceneDataModule(num_points=40, test_pairs=60, eval_batch_size=60, frame=frame, kinds=kinds)
+        data = SyntheticMapDataModule(num_points=40, test_pairs=60, eval_batch_size=60, frame=frame, kinds=kinds)
         data.setup("test")
         (batch,) = data.test_dataloader()
         if frame == "any":
@@ -102,13 +112,13 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         else:
             assert batch.rotation[:, 1, 2].quantile(0.75) < -0.8  # the third axis is upwards in the image
             assert batch.rotation[:, 2, :2].mean(0).norm() < 0.35  # and any horizontal direction is ahead
-    extents = [np.median(np.ptp(pair.points3d, axis=0)) for pair in plenty]
+    extents = [np.median(np.ptp(problem.points3d, axis=0)) for problem in plenty]
     assert max(extents) / min(extents) > 20
 
 
 def test_an_upright_frame_is_tilted_by_so_many_degrees() -> None:
     kinds = {"facades": 1.0}
-    level, tilted = (pairs(60, num_points=60, noise_px=0.0, kinds=kinds, tilt_deg=tilt) for tilt in (0.0, 10.0))
+    level, tilted = (problems(60, num_points=60, noise_px=0.0, kinds=kinds, tilt_deg=tilt) for tilt in (0.0, 10.0))
     angles = []
     for straight, turned in zip(level, tilted, strict=True):
         turn = turned.rotation.T @ straight.rotation
@@ -235,9 +245,9 @@ def test_the_map_has_no_point_that_one_photo_alone_has_a_keypoint_of() -> None:
 def test_density_is_uneven_as_that_of_keypoints() -> None:
     """Counts in cells of the image vary several times as much as those of uniform points would."""
     spread = []
-    for pair in pairs(20, num_points=250, min_points=40):
-        half = np.abs(pair.points2d).max(0)
-        cells = np.histogram2d(*pair.points2d.T, bins=6, range=[(-h, h) for h in half])[0]
+    for problem in problems(20, num_points=250, min_points=40):
+        half = np.abs(problem.points2d).max(0)
+        cells = np.histogram2d(*problem.points2d.T, bins=6, range=[(-h, h) for h in half])[0]
         spread.append(cells.var() / cells.mean())
     assert np.median(spread) > 2.5
 
@@ -248,7 +258,7 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
         " train_pairs: 8, val_pairs: 3, test_pairs: 3, batch_size: 4, train_outliers: {ratio: [0, 1]}}"
     )
     parser = ArgumentParser()
-    parser.add_class_arguments(SfmSceneDataModule, "data")
+    parser.add_class_arguments(SyntheticMapDataModule, "data")
     data = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'sfm.yaml'}"])).data
     with pytest.raises(ValueError, match="expected `setup` before the train loader"):
         data.train_dataloader()
@@ -271,10 +281,10 @@ WRONG: list[tuple[str, object]] = [
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_wrong_options_are_named(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match="at least one train pair" if name == "train_pairs" else name):
-        SfmSceneDataModule(**{name: value}).setup("fit")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="at least one train problem" if name == "train_pairs" else name):
+        SyntheticMapDataModule(**{name: value}).setup("fit")  # type: ignore[arg-type]
 
 
 def test_a_photo_that_never_shares_enough_is_an_error() -> None:
     with pytest.raises(ValueError, match="expected a photo that shares 500 points with its map in 50 scenes"):
-        pairs(1, num_points=500, min_points=500, field_of_view=5.0)
+        problems(1, num_points=500, min_points=500, field_of_view=5.0)

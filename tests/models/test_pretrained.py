@@ -12,7 +12,7 @@ import torch
 from small_data import small_net
 
 from bpnp import Batch, BPnPNet, Matcher, solve
-from bpnp.datamodules import MeshDataModule, Outliers, SfmSceneDataModule
+from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error
 from bpnp.models.weights import LEARNED, described, pretrained_names, pretrained_path
 
@@ -130,7 +130,7 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
 
 def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
     """Of synthetic maps; a partner is worth as little as any other point if the points are turned away."""
-    data = SfmSceneDataModule(frame="view", num_points=128, outliers=0.5, test_pairs=8, seed=7)
+    data = SyntheticMapDataModule(frame="view", num_points=128, outliers=0.5, test_pairs=8, seed=7)
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     net = Matcher.from_pretrained("matcher-maps")

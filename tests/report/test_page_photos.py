@@ -11,7 +11,7 @@ from planted_model import HEIGHT, WIDTH, plant_model
 from report_data import inflated, view, write_run
 
 from bpnp.cli import main
-from bpnp.datamodules.colmap.photos import photo_finder
+from bpnp.datamodules.colmap.scenes import photo_finder
 from bpnp.report import plot_pair, write_page
 from bpnp.report.photos import Box, box_of
 from bpnp.report.samples import write_views

@@ -1,153 +1,212 @@
 """Photos with known poses in COLMAP models: MegaDepth, or scenes of your own."""
 
+import logging
 import warnings
-from collections.abc import Mapping
-from dataclasses import replace
-from functools import partial
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from lightning.pytorch.trainer.states import TrainerFn
+from jaxtyping import Int
+from numpy.typing import NDArray
+from torch import Tensor
 
-from bpnp.datamodules.augment import Augmentation, Side
-from bpnp.datamodules.colmap.model_files import ColmapError
-from bpnp.datamodules.colmap.pairs import ColmapSource
-from bpnp.datamodules.colmap.reconstruction import Reconstruction, read_reconstruction
-from bpnp.datamodules.colmap.scenes import find_scenes, split_scenes
-from bpnp.datamodules.module import STAGES, PairDataModule
-from bpnp.datamodules.pair import PairSource
-from bpnp.datamodules.store import Store, StoreError, is_store, open_store
-from bpnp.datamodules.stored_pairs import PAIRS, StoredPairs, check_limits, scene_rows
+from bpnp.datamodules.augment import check_clutter
+from bpnp.datamodules.colmap.model_files import FILES, ColmapError
+from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
+from bpnp.datamodules.colmap.scenes import find_scenes
+from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
+from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, prepare
+from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, large_enough, problem_row
+from bpnp.files import files_as_they_are, fingerprint
+from bpnp.types import Batch
+
+FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
+logger = logging.getLogger(__name__)
 
 
-class ColmapDataModule(PairDataModule):
-    """Photos with known poses in COLMAP models: MegaDepth, or scenes of your own.
+class ColmapDataModule(StoredDataModule):
+    """Photos with known poses in COLMAP models, read as they are, or once by `bpnp prepare megadepth`.
 
-    Scenes are split, not images, so that no landmark is both trained and tested on, as in Campbell et al. (ECCV 2020).
-    A setup reads only the scenes of its stage. Works without a Trainer: `setup()`, then the loaders.
+    Of models that are read as they are a setup reads only the scenes of its stage. A model that cannot be read is
+    skipped with a warning if the part (train, val, test) has others.
 
     Args:
         root: folder that `bpnp prepare megadepth` made; or folder of scenes, <scene>/sparse/0 or
             <scene>/sparse/manhattan/0 with cameras, images and points3D (.bin or .txt) in it; or one scene, one model,
             or a list of any of these.
-        train_scenes: scenes to train on, or a text file with one a line; none for all that are left by the others.
-        val_scenes: scenes to validate on, or a file; none to draw val_fraction.
-        test_scenes: scenes to test and predict on, or a file; none to draw test_fraction.
-        val_fraction: share of the scenes to validate on, drawn by seed.
-        test_fraction: share of the scenes to test and predict on, drawn by seed; 1 for all.
-        min_points: images that see fewer points are skipped; at least 4.
-        max_points: largest number of true pairs of a training image, a random subset of more; none for all.
-        fresh_subsets: draw new subsets, clutter and rotations every epoch in training.
-        eval_max_points: the same in validation, testing and prediction, where it is fixed; none for all.
-        clutter: natural clutter, as a ratio to the true pairs: keypoints without a 3D point, and points of the scene
-            that the image does not see.
-        clutter_side: the side that gets clutter, both, 2d or 3d.
-        rotate: turn each pair's scene by a random rotation; never in prediction.
-        loading: options of `PairDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        options: those of `StoredDataModule`.
+    """
+
+    def __init__(self, root: str | list[str], **options: Any) -> None:
+        super().__init__(root, **options)  # type: ignore[arg-type]
+        self.models: dict[str, Reconstruction] = {}  # that have been read
+
+    def _open(self) -> dict[str, Any]:
+        return super()._open() if self._is_store() else find_scenes(self.root)
+
+    def _is_store(self) -> bool:
+        return isinstance(self.root, str) and is_store(self.root)
+
+    def _problems(self, scenes: Sequence[Any], seed: tuple[int, int]) -> ProblemSource:
+        if self._is_store():
+            return super()._problems(scenes, seed)
+        folders = {name: folder for models in scenes for name, folder in models.items()}
+        return ColmapSource(self._read(folders), min_points=self.min_points, clutter=self.clutter, seed=seed)
+
+    def _read(self, folders: Mapping[str, Path]) -> list[Reconstruction]:
+        readable, failures = [], []
+        for name, folder in folders.items():
+            try:
+                if name not in self.models:
+                    self.models[name] = read_reconstruction(folder, name=name)
+                readable.append(self.models[name])
+            except ColmapError as error:
+                failures.append(error)
+        if not readable:
+            raise failures[0]
+        if failures:
+            some = "; ".join(map(str, failures[:4]))
+            warnings.warn(f"skipped {len(failures)} of {len(folders)} COLMAP models: {some}", stacklevel=3)
+        return readable
+
+
+class ColmapSource:
+    """A `ProblemSource`: the keypoints of each image with a 3D point, those points, and points without a partner.
+
+    reconstructions: the models, see `read_reconstruction`.
+    min_points: an image with fewer matches is skipped, with a warning.
+    clutter: points without a partner, as a ratio to the matches, or as many as there are: keypoints without a 3D
+        point, and points of the scene that the image does not see; drawn uniformly, by (seed, epoch, index).
+
+    Units are the scene's. An image whose points lie more than 100 times their extent from the origin (in a geo-
+    referenced scene, say) gets their median as its origin, for float32 has 7 digits; how many did is logged as a
+    warning.
     """
 
     def __init__(
         self,
-        root: str | list[str],
+        reconstructions: Sequence[Reconstruction],
         *,
-        train_scenes: list[str] | str | None = None,
-        val_scenes: list[str] | str | None = None,
-        test_scenes: list[str] | str | None = None,
-        val_fraction: float = 0.1,
-        test_fraction: float = 0.2,
         min_points: int = 4,
-        max_points: int | None = 1000,
-        fresh_subsets: bool = True,
-        eval_max_points: int | None = None,
         clutter: float = 0.0,
-        clutter_side: Side = "both",
-        rotate: bool = False,
-        **loading: Any,
+        seed: Sequence[int] = (0,),
     ) -> None:
-        super().__init__(**loading)
-        check_limits(min_points, max_points, eval_max_points)
-        if not clutter < np.inf:
-            raise ValueError(f"expected a finite `clutter`, got {clutter}; 0.5 adds half as many points")
-        self.root, self.min_points, self.fresh = root, min_points, fresh_subsets
-        training = Augmentation(max_points, clutter, clutter_side, rotate)
-        evaluation = replace(training, max_points=eval_max_points)
-        self.augmentations = {"train": training, "val": evaluation, "test": evaluation}
-        self.augmentations["predict"] = replace(evaluation, rotate=False)
-        self.clutter = clutter
-        self._split = partial(
-            split_scenes,
-            train=_scene_list("train_scenes", train_scenes),
-            val=_scene_list("val_scenes", val_scenes),
-            test=_scene_list("test_scenes", test_scenes),
-            val_fraction=val_fraction,
-            test_fraction=test_fraction,
-            seed=self.seed,
+        check_clutter(clutter)
+        images = [(scene, image) for scene in reconstructions for image in scene.images]
+        names = ", ".join(scene.name for scene in reconstructions)
+        matched = np.array([len(image.seen) for _, image in images])
+        self.images = [images[i] for i in large_enough(matched, min_points, names)]
+        self.clutter, self.seed = clutter, tuple(seed)
+        self.origins = [_origin(scene.points3d[image.seen]) for scene, image in self.images]
+        if moved := sum(bool(origin.any()) for origin in self.origins):
+            logger.warning(
+                "%d of %d images of %s see points that are far from the origin for float32: points and poses of these "
+                "problems are relative to the median of the points",
+                moved,
+                len(self.images),
+                names,
+            )
+
+    @property
+    def counts(self) -> Counts:
+        matched = np.array([len(image.seen) for _, image in self.images])
+        free = np.array([self._free(scene, image) for scene, image in self.images])
+        return Counts(matched, matched + free[:, 0], matched + free[:, 1])
+
+    def names(self, index: Sequence[int]) -> tuple[str, ...]:
+        return tuple(f"{scene.name}/{image.name}" for scene, image in (self.images[i] for i in index))
+
+    def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
+        return stacked([self.problem(i, epoch) for i in index.tolist()], index)
+
+    def problem(self, index: int, epoch: int = 0) -> Problem:
+        """The points of image `index`."""
+        scene, image = self.images[index]
+        rng = np.random.default_rng([*self.seed, epoch, index])
+        free2d, free3d = self._free(scene, image)
+        clutter2d = image.clutter2d[rng.choice(len(image.clutter2d), free2d, replace=False)]
+        unseen = np.delete(np.arange(len(scene.points3d)), image.observed) if free3d else image.seen[:0]
+        chosen = np.concatenate([image.seen, rng.choice(unseen, free3d, replace=False)])
+        origin = self.origins[index]
+        return Problem(
+            name=f"{scene.name}/{image.name}",
+            points2d=np.concatenate([image.points2d, clutter2d]),
+            points3d=(scene.points3d[chosen] - origin).astype(np.float32),
+            matched=len(image.seen),
+            rotation=image.rotation,
+            translation=image.translation + image.rotation @ origin,
+            focal=image.camera.focal,
+            origin=origin,
         )
-        self._store: Store | None = None
-        self._scenes: dict[str, Any] = {}  # of each scene its rows in the store, or its models
-        self._read: dict[str, Reconstruction] = {}
 
-    def setup(self, stage: str | None = None) -> None:
-        """Read the scenes of a stage (fit, validate, test, predict; none for all).
-
-        Raises ColmapError for folders without a usable model, ValueError for a split that does not fit the scenes or
-        leaves none for the stage; fit does without validation scenes. A model that cannot be read is skipped with a
-        warning if the part (train, val, test) has others.
-        """
-        self._store = open_store(self.root, PAIRS) if isinstance(self.root, str) and is_store(self.root) else None
-        self._scenes = scene_rows(self._store) if self._store else find_scenes(self.root)
-        self._parts = self._split(list(self._scenes))
-        if self._store and self.clutter > (kept := self._store.parameters.get("clutter", np.inf)):
-            raise StoreError(
-                f"expected `clutter` of at most {kept}, what {self.root} was made with, got {self.clutter}; try that, "
-                f"or preparing again with --clutter {self.clutter}"
-            )
-        super().setup(stage)
-        if stage is not None and STAGES[stage][0] not in self.datasets:
-            name = stage.value if isinstance(stage, TrainerFn) else stage
-            raise ValueError(
-                f"expected scenes for {name}, got none left of {', '.join(self._scenes)}; try to name them in the "
-                "*_scenes arguments, or other fractions"
-            )
-
-    def _source(self, part: str, seed: tuple[int, int]) -> PairSource | None:
-        """The pairs of a part's scenes; None if it has no scenes."""
-        scenes = [self._scenes[scene] for scene in self._parts["test" if part == "predict" else part]]
-        if not scenes:
-            return None
-        if self._store is not None:
-            return StoredPairs(self._store, np.sort(np.concatenate(scenes)), min_points=self.min_points)
-        models = {name: folder for models in scenes for name, folder in models.items()}
-        return ColmapSource(self._models(models), min_points=self.min_points, clutter=self.clutter, seed=seed)
-
-    def _models(self, folders: Mapping[str, Path]) -> list[Reconstruction]:
-        found, failures = [], []
-        for name, folder in folders.items():
-            try:
-                if name not in self._read:
-                    self._read[name] = read_reconstruction(folder, name=name)
-                found.append(self._read[name])
-            except ColmapError as error:
-                failures.append(error)
-        if not found:
-            raise failures[0]
-        if failures:
-            warnings.warn(
-                f"skipped {len(failures)} of {len(folders)} COLMAP models: {'; '.join(map(str, failures[:4]))}",
-                stacklevel=3,
-            )
-        return found
+    def _free(self, scene: Reconstruction, image: ImagePoints) -> tuple[int, int]:
+        """Points without a partner on the 2D side, and on the 3D side."""
+        wanted = self.clutter * len(image.seen)
+        free3d = len(scene.points3d) - len(image.observed)
+        return round(min(wanted, len(image.clutter2d))), round(min(wanted, free3d))
 
 
-def _scene_list(name: str, scenes: list[str] | str | None) -> list[str] | None:
-    """The scenes of a list, or of the lines of a text file."""
-    if not isinstance(scenes, str):
-        return scenes
-    path = Path(scenes)
-    if not path.is_file():
-        raise ValueError(f"expected `{name}` as a list of scenes or a text file with one a line, got no file {path}")
-    found = [line.strip() for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    if not found:
-        raise ValueError(f"expected `{name}` to name scenes, got {path} without a line; try none for no list")
-    return found
+def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The median of the points if they are far from the origin, else the origin."""
+    median = np.median(points3d, axis=0)
+    extent = np.median(np.linalg.norm(points3d - median, axis=-1))
+    return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
+
+
+def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: float, processes: int) -> Store:
+    """The problems of every image of every COLMAP model below `source`, for `ColmapDataModule(root=output)`.
+
+    Images with fewer than `min_points` matches, and models that cannot be read, are left out and listed. `clutter`:
+    natural clutter to keep on both sides, as a ratio to the matches. Output and errors as `prepare_meshes`.
+    """
+    models = [(scene, *model) for scene, models in find_scenes(source).items() for model in models.items()]
+    files = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))
+    names = [name for _, name, _ in models]
+    recipe = Recipe(
+        kind=PROBLEMS,
+        widths=WIDTHS,
+        parameters={
+            "min_points": min_points,
+            "clutter": clutter,
+            "source": fingerprint([names, files_as_they_are(file for file in files if file.is_file())]),
+        },
+        jobs=[(*model, min_points, clutter) for model in models],
+        work=model_rows,
+        what="image",
+        source=str(source),
+    )
+    return prepare(recipe, output, processes=processes)
+
+
+def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> Made:
+    """The problems of one COLMAP model; none if it cannot be used.
+
+    What was not used of it is listed, not logged: there may be hundreds of models.
+    """
+    with silent(logging.getLogger(__package__)):
+        try:
+            reconstruction = read_reconstruction(folder, name=name)
+            source = ColmapSource([reconstruction], min_points=min_points, clutter=clutter)
+        except (ColmapError, StoreError) as error:
+            return [], {name: str(error)}
+    total, skipped = len(reconstruction.images), {}
+    if left_out := total - len(source.images):
+        skipped[f"{name}/*"] = f"{left_out} of {total} images with fewer than {min_points} points"
+    if reconstruction.notable:
+        skipped[f"{name}/points"] = reconstruction.notable
+    return [problem_row(scene, source.problem(i)) for i in range(len(source.images))], skipped
+
+
+@contextmanager
+def silent(logger: logging.Logger) -> Iterator[None]:
+    """No messages below errors of a logger and of those under it, and no warnings."""
+    level = logger.level
+    logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logger.setLevel(level)

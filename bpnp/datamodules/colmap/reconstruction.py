@@ -65,7 +65,7 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
     keypoints: whether to read them at all; without, images know the points that they observe, in a tenth of the time.
 
     Not used, and counted in `lost`: keypoints whose undistortion does not project back to within 0.01 pixels (outside
-    the field of view of the camera model); pairs with a point that is not finite, missing from points3D, behind the
+    the field of view of the camera model); matches with a point that is not finite, missing from points3D, behind the
     camera, or nearer than 1e-4 of the image's median depth; a second keypoint of the same point (the one of smaller
     reprojection error is kept); images with a broken pose. All but the repeated keypoints, which are common, are
     logged as a warning.
@@ -169,7 +169,7 @@ def _with_keypoints(
     camera_points = points3d[place[matched]] @ image.rotation.T + image.translation
     depth = camera_points[:, 2]
     in_front = depth > (NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else 0)
-    lost["pairs with the point behind or in the camera"] += int((~in_front).sum())
+    lost["matches with the point behind or in the camera"] += int((~in_front).sum())
     matched, camera_points = matched[in_front], camera_points[in_front]
 
     error = np.linalg.norm(camera_points[:, :2] / camera_points[:, 2:] - undistorted[matched], axis=-1)

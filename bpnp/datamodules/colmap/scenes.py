@@ -1,20 +1,32 @@
-"""Which COLMAP models there are below a folder, which scene each belongs to, and which scenes train and test."""
+"""Which COLMAP models there are below a folder, which scene each belongs to, and its photos, undistorted."""
 
 import itertools
+import logging
 import os
 import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.ndimage import map_coordinates
 
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, model_format
+from bpnp.datamodules.colmap.reconstruction import read_projections
 
 # What lies between the folder of a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
 # <scene>/dense/0/sparse.
 LAYOUT = re.compile(r"sparse|dense\d*")
 INSIDE_LAYOUT = re.compile(r"sparse|dense\d*|manhattan|\d+")
+PHOTO_FOLDERS = ("images", "imgs", "dense/images", "dense0/imgs", "dense0/images")
+UP = 4  # levels above a model: <scene>/sparse/manhattan/0
+WIDTH = 480  # pixels of a crop
+Pixels = NDArray[np.uint8]
+Box = tuple[float, float, float, float]  # left, top, right, bottom of the normalised image plane
+logger = logging.getLogger(__name__)
 
 
 def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str, Path]]:
@@ -44,44 +56,6 @@ def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str,
         scene: {scene: next(iter(models.values()))} if len(models) == 1 else dict(sorted(models.items()))
         for scene, models in sorted(scenes.items())
     }
-
-
-def split_scenes(
-    scenes: Sequence[str],
-    *,
-    train: Sequence[str] | None = None,
-    val: Sequence[str] | None = None,
-    test: Sequence[str] | None = None,
-    val_fraction: float = 0.1,
-    test_fraction: float = 0.2,
-    seed: int = 0,
-) -> dict[str, list[str]]:
-    """Deal `scenes` to "train", "val" and "test" without overlap, so that no landmark is trained and tested on.
-
-    Lists that are given are taken as they are. The scenes in none of them are shuffled by `seed`, and where a list is
-    None it gets its share: test, then val, `fraction` of all scenes, at least one if the fraction is not 0 (val only if
-    one is left to train), then train the rest.
-
-    Raises ValueError for a name that is not in `scenes`, a scene in two lists, or a fraction outside [0, 1].
-    """
-    lists = {"train": train, "val": val, "test": test}
-    split = {part: list(names) for part, names in lists.items() if names is not None}
-    named = [name for names in split.values() for name in names]
-    if unknown := [name for name in named if name not in scenes]:
-        raise ValueError(f"expected scenes among {', '.join(scenes)}, got {', '.join(unknown)}; try one of those")
-    if twice := sorted({name for name in named if named.count(name) > 1}):
-        raise ValueError(f"expected each scene once in the lists of scenes, got {', '.join(twice)} more than once")
-    for name, fraction in (("val_fraction", val_fraction), ("test_fraction", test_fraction)):
-        if not 0 <= fraction <= 1:
-            raise ValueError(f"expected `{name}` between 0 and 1, got {fraction}")
-    rest = sorted(set(scenes) - set(named))
-    rest = [rest[i] for i in np.random.default_rng(seed).permutation(len(rest))]
-    for part, fraction in (("test", test_fraction), ("val", val_fraction)):
-        if part not in split:
-            share = max(round(fraction * len(scenes)), fraction > 0)
-            share = min(share, len(rest) - (part == "val" and train is None)) if rest else 0
-            split[part], rest = sorted(rest[:share]), rest[share:]
-    return {"train": sorted(rest), **split}
 
 
 def _find_models(top: Path) -> list[Path]:
@@ -127,3 +101,51 @@ def _scene_folder(top: Path, folder: Path) -> Path:
         if LAYOUT.fullmatch(folder.parts[depth]):
             return Path(*folder.parts[:depth])
     return folder
+
+
+def photo_finder(root: Path) -> Callable[[str, Box], Pixels | None]:
+    """A function of an image's name, <scene>/<image>, and a box of the normalised image plane.
+
+    It gives the undistorted photo in that box (h, 480, 3), black where there is none, or None without a photo: in
+    `images`, `imgs`, `dense/images` or `dense0/imgs` beside or above the model. Photos that cannot be read are logged.
+    Raises ColmapError if `root` holds no COLMAP model.
+    """
+    models = {name: folder for scene in find_scenes(root).values() for name, folder in scene.items()}
+    projections = cache(read_projections)
+
+    def find(name: str, box: Box) -> Pixels | None:
+        model = max((model for model in models if name.startswith(f"{model}/")), key=len, default=None)
+        if model is None:
+            return None
+        image = name[len(model) + 1 :]
+        path = image_file(models[model], image)
+        project = projections(models[model]).get(image)
+        if path is None or project is None:
+            return None
+        try:
+            with Image.open(path) as file:
+                photo = np.asarray(file.convert("RGB"))
+        except (OSError, ValueError) as error:
+            logger.warning("photo %s cannot be read: %s", path, error)
+            return None
+        return _resampled(photo, project, box)
+
+    return find
+
+
+def image_file(model: Path, image: str) -> Path | None:
+    """The photo of a model's image, if it is where COLMAP's or MegaDepth's layout has it."""
+    paths = (folder / name / image for folder in [model, *model.parents][: UP + 1] for name in PHOTO_FOLDERS)
+    return next((path for path in paths if path.is_file()), None)
+
+
+def _resampled(photo: Pixels, project: Callable[[NDArray[np.float64]], NDArray[np.float64]], box: Box) -> Pixels:
+    left, top, right, bottom = box
+    height = int(np.clip(round(WIDTH * (bottom - top) / (right - left)), 16, 2 * WIDTH))
+    x = left + (np.arange(WIDTH) + 0.5) / WIDTH * (right - left)
+    y = top + (np.arange(height) + 0.5) / height * (bottom - top)
+    rays = np.stack([*np.meshgrid(x, y), np.ones((height, WIDTH))], -1).reshape(-1, 3)
+    size = np.array(photo.shape[1::-1])
+    column, row = (project(rays) * size - 0.5).T  # COLMAP's origin is the corner of the first pixel
+    channels = [map_coordinates(photo[..., c], [row, column], order=1, cval=0) for c in range(3)]
+    return np.stack(channels, -1).reshape(height, WIDTH, 3)

@@ -1,6 +1,7 @@
 """Where a data set of meshes comes from: a folder, a zip that stays packed, or HDF5 files of sampled points."""
 
 import importlib
+import os
 import re
 import zipfile
 import zlib
@@ -130,12 +131,12 @@ def _sampled_archive(folder: Path) -> MeshFiles:
 
 
 def _open(path: Path) -> Any:
-    """A file of many meshes, kept open for the next one; a file that has changed is another."""
-    return _opened(path, *files_as_they_are([path]))
+    """A file of many meshes, kept open for the next one of this process; a file that has changed is another."""
+    return _opened(path, os.getpid(), *files_as_they_are([path]))
 
 
 @lru_cache(maxsize=8)
-def _opened(path: Path, _: tuple[str, int, int]) -> Any:
+def _opened(path: Path, process: int, stamp: tuple[str, int, int]) -> Any:
     if path.suffix != ".h5":
         return zipfile.ZipFile(path)
     try:

@@ -7,36 +7,39 @@ import numpy as np
 from numpy.typing import NDArray
 from torch.utils.data import DataLoader
 
-from bpnp.datamodules.meshes.prepare import open_surfaces
-from bpnp.datamodules.meshes.procedural import ProceduralShapes
-from bpnp.datamodules.meshes.source import POINTS, MeshSource, Views, hold_out
-from bpnp.datamodules.meshes.surfaces import Normalisation
-from bpnp.datamodules.module import STAGES, PairDataModule
-from bpnp.datamodules.store import Store, StoreError
+from bpnp.datamodules.meshes.archives import MeshFiles, open_archive
+from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, RandomCameras
+from bpnp.datamodules.meshes.surfaces import MeshError, Normalisation, ProceduralShapes
+from bpnp.datamodules.module import STAGES, ProblemDataModule, hold_out
+from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store, prepare
 from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 
+MESHES_A_PART = 64
+MeshArchive = MeshFiles | ProceduralShapes
 
-class MeshDataModule(PairDataModule):
+
+class MeshDataModule(ProblemDataModule):
     """Virtual cameras around meshes, by default as in Campbell et al. (ECCV 2020), or around procedural shapes.
 
-    Every pair is a subset of a mesh's surface samples, seen by a random camera. Validation meshes are held out of the
-    training split; test meshes serve testing and prediction only. Works without a Trainer: `setup()`, then the loaders.
+    Every problem is a subset of a mesh's surface samples, seen by a random camera. Validation meshes are held out of
+    the training split; test meshes serve testing and prediction only. Works without a Trainer: `setup()`, then the
+    loaders.
 
     Args:
         root: folder that `bpnp prepare modelnet40` made, or folder of meshes in ModelNet40's layout,
             <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
-        train_pairs: training pairs; pair i shows training mesh i modulo their number.
-        fresh_views: draw new cameras, points and noise every epoch; false for the fixed pairs of the paper.
+        train_pairs: training problems; problem i shows training mesh i modulo their number.
+        fresh_views: draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
         views_on_device: let a Trainer make the training views in batches on its device; none for wherever that is not a
             CPU. They are those that the loader makes, up to rounding.
         val_fraction: share of the training meshes that is held out for validation.
-        val_pairs: validation pairs, fixed; none for one per held-out mesh.
-        test_pairs: test pairs, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
+        val_pairs: validation problems, fixed; none for one per held-out mesh.
+        test_pairs: test problems, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
             further views.
-        num_points: 3D points of a pair.
-        pool_size: surface samples kept of each mesh, at least num_points; every pair draws its own num_points of them
-            (pool_size equal to num_points: all pairs of a mesh have the same points, as in the paper).
+        num_points: 3D points of a problem.
+        pool_size: surface samples kept of each mesh, at least num_points; every problem draws its own num_points of
+            them (pool_size equal to num_points: all problems of a mesh have the same points, as in the paper).
         normalisation: of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance 1;
             unit_cube: bounding box centred, longest side 1; none: units of the file.
         rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
@@ -49,7 +52,7 @@ class MeshDataModule(PairDataModule):
         val_shapes: procedural validation shapes; with root val_fraction counts.
         test_shapes: procedural test shapes.
         cache_dir: where the surface samples are kept; none for BPNP_CACHE, else the user's cache folder.
-        loading: options of `PairDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
     """
 
     def __init__(
@@ -86,7 +89,7 @@ class MeshDataModule(PairDataModule):
         self.root, self.cache_dir = None if root is None else Path(root), cache_dir
         self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
         self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
-        self.views = Views(rotation, euler_range, translation_range, distance, focal, noise_px)
+        self.cameras = RandomCameras(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
         self._stores: dict[str, Store] = {}
         self.fresh, self.views_on_device, self.val_fraction = fresh_views, views_on_device, val_fraction
@@ -117,7 +120,7 @@ class MeshDataModule(PairDataModule):
             num_pairs=self.num_pairs[split],
             num_points=self.num_points,
             pool_size=self.pool_size,
-            views=self.views,
+            cameras=self.cameras,
             seed=seed,
             label=split,
         )
@@ -130,9 +133,9 @@ class MeshDataModule(PairDataModule):
             raise StoreError(
                 f"expected meshes <class>/{{train,test}}/* in {root}, got none for {folder!r}; try another `root`"
             )
-        if self.pool_size > (kept := int(store.counts(POINTS)[0])):
+        if self.pool_size > (most := int(store.counts(POINTS)[0])):
             raise StoreError(
-                f"expected `pool_size` of at most {kept}, the samples in {store.folder}, got {self.pool_size}; try "
+                f"expected `pool_size` of at most {most}, the samples in {store.folder}, got {self.pool_size}; try "
                 f"that, or preparing again with --points {self.pool_size}"
             )
         if split == "test":
@@ -151,3 +154,64 @@ class MeshDataModule(PairDataModule):
                 cache_dir=self.cache_dir,
             )
         return self._stores[split]
+
+
+def prepare_meshes(source: Path, output: Path, *, points: int, normalisation: Normalisation, processes: int) -> Store:
+    """Keep `points` surface samples of every mesh of `source` (see `open_archive`), for `MeshDataModule(root=output)`.
+
+    Meshes that cannot be used are left out and listed. If `output` has been made from the same source in the same way
+    it is left as it is. Raises ValueError, StoreError or OSError: unusable source, no usable mesh, another `output`.
+    """
+    recipe = surfaces_recipe(open_archive(source), points=points, normalisation=normalisation, label=str(source))
+    return prepare(recipe, output, processes=processes)
+
+
+def surfaces_recipe(archive: MeshArchive, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
+    """How the store of an archive's meshes is made. label: what the meshes are, for messages."""
+    starts = range(0, len(archive.names), MESHES_A_PART)
+    return Recipe(
+        kind=SURFACES,
+        widths={POINTS: 3},
+        parameters={"points": points, "normalisation": normalisation, "source": archive.identity},
+        jobs=[(archive.part(start, start + MESHES_A_PART), points, normalisation) for start in starts],
+        work=sampled_rows,
+        what="mesh",
+        source=label,
+    )
+
+
+def sampled_rows(archive: MeshArchive, count: int, mode: Normalisation) -> Made:
+    """Samples of all meshes of an archive."""
+    rows: list[Row] = []
+    skipped = {}
+    for name in archive.names:
+        try:
+            samples = archive.samples(name, count, mode)
+        except (MeshError, OSError) as error:
+            skipped[name] = str(error)
+        else:
+            rows.append((name, {POINTS: samples}, {"radius": float(np.linalg.norm(samples, axis=-1).max())}))
+    return rows, skipped
+
+
+def open_surfaces(
+    source: Path | ProceduralShapes, *, points: int, normalisation: Normalisation, cache_dir: str | None
+) -> Store:
+    """The store `source`, or the cached store of its meshes, made if it is not there.
+
+    Raises ValueError as `open_archive`; StoreError for a store of another `normalisation`.
+    """
+    if isinstance(source, ProceduralShapes):
+        archive: MeshArchive = source
+        label = f"procedural-{source.split}"
+    elif not is_store(source):
+        archive, label = open_archive(source), source.resolve().name
+    else:
+        store = open_store(source, SURFACES)
+        if (stored := store.parameters["normalisation"]) != normalisation:
+            raise StoreError(
+                f"expected meshes of `normalisation` {normalisation}, got {stored} in {source}; try {stored}, or "
+                f"preparing again with --normalisation {normalisation}"
+            )
+        return store
+    return cached(surfaces_recipe(archive, points=points, normalisation=normalisation, label=label), label, cache_dir)

@@ -1,4 +1,4 @@
-"""Pairs of meshes' surface samples and what virtual cameras, drawn at random, see of them."""
+"""Problems of meshes' surface samples and what virtual cameras, drawn at random, see of them."""
 
 import math
 import warnings
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from bpnp.datamodules.augment import picked
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
-from bpnp.datamodules.pair import Counts
+from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.store import Store
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
@@ -26,7 +26,7 @@ MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
 
 
 @dataclass(frozen=True)
-class Views:
+class RandomCameras:
     """How cameras are drawn. The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40.
 
     rotation: "euler" draws R = Rz Ry Rx with each angle uniform in `euler_range` (degrees); "so3" draws R uniformly.
@@ -68,12 +68,12 @@ class Views:
 
 
 class MeshSource:
-    """A `PairSource`: pair i is view i // k of mesh rows[i % k] of a store of surface samples, k meshes in all.
+    """A `ProblemSource`: problem i is view i // k of mesh rows[i % k] of a store of surface samples, k meshes in all.
 
-    Fewer pairs than meshes are a random choice of the meshes. A pair draws its points from the first `pool_size`
+    Fewer problems than meshes are a random choice of the meshes. A problem draws its points from the first `pool_size`
     samples of its mesh; it is a function of (seed, epoch, index).
 
-    Warns if cameras may come too near to some points. Raises ValueError for no pairs.
+    Warns if cameras may come too near to some points. Raises ValueError for no problems.
     """
 
     def __init__(
@@ -84,25 +84,25 @@ class MeshSource:
         num_pairs: int | None,
         num_points: int,
         pool_size: int,
-        views: Views,
+        cameras: RandomCameras,
         seed: Sequence[int],
         label: str,
     ) -> None:
         if num_pairs is not None and num_pairs < 1:
-            raise ValueError(f"expected at least one {label} pair, got {num_pairs}")
+            raise ValueError(f"expected at least one {label} problem, got {num_pairs}")
         radius = float(store.columns["radius"][rows].max())
-        self.sees_all = views.distance - views.translation_range - radius > MIN_DEPTH
+        self.sees_all = cameras.distance - cameras.translation_range - radius > MIN_DEPTH
         if not self.sees_all:
             warnings.warn(
                 f"the {label} meshes reach {radius:.3g} from their origin: points that fall behind a camera at "
-                f"`distance` {views.distance} get no 2D point; try normalisation unit_sphere or a larger distance",
+                f"`distance` {cameras.distance} get no 2D point; try normalisation unit_sphere or a larger distance",
                 stacklevel=2,
             )
         self.num_pairs = len(rows) if num_pairs is None else num_pairs
         if self.num_pairs < len(rows):  # the first meshes would all be of one class
             rows = np.sort(np.random.default_rng(seed[0]).choice(rows, self.num_pairs, replace=False))
         self.store, self.rows, self.num_points, self.pool_size = store, rows, num_points, pool_size
-        self.views, self.seed = views, tuple(seed)
+        self.cameras, self.seed = cameras, tuple(seed)
         self._on_device: Tensor | None = None
 
     @property
@@ -118,13 +118,13 @@ class MeshSource:
         """A random camera's view of `num_points` samples of each mesh, drawn without replacement.
 
         2D points are x/z and y/z plus noise, computed in float64. A point behind the camera, or less than 0.1 in front
-        of it, has no 2D point and -1 in match3d. Raises ValueError that names a pair of which fewer than 4 are left.
+        of it, has no 2D point and -1 in match3d. Raises ValueError that names a problem of which fewer than 4 are left.
         """
         count, size, device = self.num_points, len(index), index.device
         keys = row_keys(index, *self.seed, epoch)
         samples = self._samples(index % len(self.rows))
         points3d = picked(samples, permutations(stream(keys, Purpose.SUBSET), samples.shape[1])[:, :count])
-        rotation, translation = self.views.poses(stream(keys, Purpose.POSE))
+        rotation, translation = self.cameras.poses(stream(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
         seen = camera[..., 2] > MIN_DEPTH
         if not self.sees_all and bool((few := seen.sum(-1) < MIN_POINTS).any()):
@@ -134,13 +134,13 @@ class MeshSource:
                 f"{self.names(index.tolist())[first]}; try normalisation unit_sphere or a larger `distance`"
             )
         noise = normal(stream(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
-        points2d = project(camera) + noise * (self.views.noise_px / self.views.focal)
+        points2d = project(camera) + noise * (self.cameras.noise_px / self.cameras.focal)
         return Batch(
             points2d=(points2d.where(seen[..., None], 0.0)).float(),
             points3d=points3d,
             mask2d=seen,
             mask3d=torch.ones_like(seen),
-            focal=torch.full((size,), self.views.focal, device=device),
+            focal=torch.full((size,), self.cameras.focal, device=device),
             index=index,
             ids=(),
             rotation=rotation,
@@ -164,17 +164,3 @@ class MeshSource:
     def _stacked(self, meshes: Sequence[int]) -> Float[Tensor, "b k 3"]:
         rows = (self.store.row(int(self.rows[mesh])) for mesh in meshes)
         return torch.from_numpy(np.stack([row[POINTS][: self.pool_size] for row in rows]))
-
-
-def hold_out(count: int, fraction: float, *, seed: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Split range(count) at random into training rows and validation rows, at least one of each, both sorted.
-
-    Raises ValueError for a fraction outside (0, 1) or fewer than two rows.
-    """
-    if not 0 < fraction < 1:
-        raise ValueError(f"expected `val_fraction` between 0 and 1, got {fraction}")
-    if count < 2:
-        raise ValueError(f"expected at least 2 training rows, to hold one out for validation, got {count}")
-    held = min(count - 1, max(1, round(fraction * count)))
-    order = np.random.default_rng(seed).permutation(count)
-    return np.sort(order[held:]), np.sort(order[:held])

@@ -1,1 +1,1 @@
-"""Random scenes, photos of them and the sparse maps that such photos give: pairs without a download."""
+"""Random scenes, photos of them and the sparse maps that such photos give: problems without a download."""

@@ -1,33 +1,48 @@
-"""The sparse map that photos of a scene give, and a photo's keypoints against a part of it: one pair."""
+"""Any number of random scenes, their sparse maps and one more photo of each: problems without a download."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
+from jaxtyping import Int
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from torch import Tensor
 
-from bpnp.datamodules.augment import Drawn, bounds
-from bpnp.datamodules.pair import Pair
-from bpnp.datamodules.synthetic_maps.buildings import facades, from_the_air, several_buildings
-from bpnp.datamodules.synthetic_maps.objects import statue, table_top
-from bpnp.datamodules.synthetic_maps.photos import Camera, camera_at, details, image_shape, look, nearby_camera
-from bpnp.datamodules.synthetic_maps.scene import Array, Kind, Scene, Viewpoint
-from bpnp.datamodules.synthetic_maps.surrounded import courtyard, interior, street
+from bpnp.datamodules.augment import Augmentation, Drawn, bounds
+from bpnp.datamodules.module import PARTS, ProblemDataModule
+from bpnp.datamodules.problem import Counts, Problem, stacked
+from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
+from bpnp.datamodules.synthetic_maps.scene import (
+    Array,
+    Camera,
+    Kind,
+    Scene,
+    Viewpoint,
+    camera_at,
+    details,
+    image_shape,
+    look,
+    nearby_camera,
+)
+from bpnp.types import Batch
 
 Frame = Literal["upright", "view"]
 LONG_SIDE = 1200.0  # of an image, pixels
 LEAST_POINTS = 1500  # feature points of a scene
-MOST_ERROR_PX = 5.0  # of a true pair, pixels; beyond, a reconstruction drops the keypoint from its point
+MOST_ERROR_PX = 5.0  # of a match, pixels; beyond, a reconstruction drops the keypoint from its point
 CHANGED = 0.8  # share of the points that were not matched of which the photo has no keypoint
-ATTEMPTS = 50  # scenes drawn, until enough true pairs are found
+ATTEMPTS = 50  # scenes drawn, until enough matches are found
 
 
 class KindOfScene(NamedTuple):
-    """A kind of scene; its default weight; feature points of a scene for each point of a pair, of which a photo sees a
-    part; and whether the camera is within the scene: then its field of view is in the upper half of the range."""
+    """How a kind of scene is drawn.
+
+    density: feature points of a scene for each point of a problem; a photo sees a part of them. within: the camera is
+    within the scene, so its field of view is in the upper half of the range.
+    """
 
     draw: Kind
     weight: float
@@ -36,21 +51,16 @@ class KindOfScene(NamedTuple):
 
 
 KINDS = {
-    "facades": KindOfScene(facades, 0.25, 16),
-    "several_buildings": KindOfScene(several_buildings, 0.12, 24),
-    "from_the_air": KindOfScene(from_the_air, 0.08, 8),
-    "street": KindOfScene(street, 0.12, 24, within=True),
-    "courtyard": KindOfScene(courtyard, 0.08, 20, within=True),
-    "interior": KindOfScene(interior, 0.12, 20, within=True),
-    "statue": KindOfScene(statue, 0.16, 12),
-    "table_top": KindOfScene(table_top, 0.07, 10),
+    "facades": KindOfScene(facades, 0.5, 16),
+    "street": KindOfScene(street, 0.25, 24, within=True),
+    "statue": KindOfScene(statue, 0.25, 12),
 }
 WEIGHTS = {name: kind.weight for name, kind in KINDS.items()}
 
 
 @dataclass(frozen=True)
 class MapOptions:
-    """How pairs of synthetic maps are drawn; see `SfmSceneDataModule`.
+    """How problems of synthetic maps are drawn; see `SyntheticMapDataModule`.
 
     frame: of the map, "upright" for the third axis upwards and any heading, "view" for the coordinates of the first of
     the cameras whose map points are taken. tilt_deg: standard deviation of the upright frame's turn about each of its
@@ -88,9 +98,8 @@ class MapOptions:
             raise ValueError(f"expected `frame` among {', '.join(get_args(Frame))}, got {self.frame!r}")
         if not 1 <= self.views[0] <= self.views[1]:
             raise ValueError(f"expected `views` (low, high) of 1 or more, got {self.views}")
-        if not set(self.kinds) <= set(KINDS) or not all(w >= 0 for w in self.kinds.values()) or not any(
-            self.kinds.values()
-        ):  # fmt: skip
+        weights = list(self.kinds.values())
+        if not set(self.kinds) <= set(KINDS) or not all(weight >= 0 for weight in weights) or not any(weights):
             raise ValueError(f"expected `kinds` as weights of {', '.join(KINDS)}, got {dict(self.kinds)}")
 
 
@@ -101,7 +110,7 @@ class MapPoints(NamedTuple):
     points: Array
 
 
-def draw_map_pair(name: str, options: MapOptions, rng: np.random.Generator) -> Pair:
+def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -> Problem:
     """A new scene, a map of it by some photos, and one more photo's keypoints.
 
     A scene whose photo shares fewer than `min_points` points with the map is drawn anew. Raises ValueError if 50 are.
@@ -113,17 +122,17 @@ def draw_map_pair(name: str, options: MapOptions, rng: np.random.Generator) -> P
         low, high = bounds(options.field_of_view)
         view = (math.sqrt(low * high), high) if kind.within else (low, high)
         half = math.tan(math.radians(_log_uniform(view, rng)) / 2)
-        pair = _draw(name, kind, half, options, rng)
-        if pair is not None:
-            return pair
+        problem = _draw(name, kind, half, options, rng)
+        if problem is not None:
+            return problem
     raise ValueError(
         f"expected a photo that shares {options.min_points} points with its map in {ATTEMPTS} scenes, got none in "
         f"{name}; try a smaller `min_points` or a larger `num_points`"
     )
 
 
-def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: np.random.Generator) -> Pair | None:
-    """A pair of a scene of this kind; None if photo and map share too few points."""
+def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: np.random.Generator) -> Problem | None:
+    """A problem of a scene of this kind; None if photo and map share too few points."""
     scene, view = kind.draw(max(LEAST_POINTS, kind.density * options.num_points), half, rng)
     reach = details(scene, view, half, rng)
     shape = image_shape(half, rng)
@@ -137,16 +146,16 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     mapped = triangulated(scene, view, cameras, reach, noise_px / focal, rng)
 
     _, place2d, place3d = np.intersect1d(sight.of, mapped.of, assume_unique=True, return_indices=True)
-    found = _matched(photo, cameras[0], mapped.points[place3d], keypoints[place2d], MOST_ERROR_PX / focal, rng)
-    true2d, true3d = place2d[found], place3d[found]
-    if len(true2d) < options.min_points:
+    matched = _matched(photo, cameras[0], mapped.points[place3d], keypoints[place2d], MOST_ERROR_PX / focal, rng)
+    matched2d, matched3d = place2d[matched], place3d[matched]
+    if len(matched2d) < options.min_points:
         return None
     # A point that is seen from another side mostly has no keypoint either.
-    changed = place2d[~found & (rng.random(len(found)) < CHANGED)]
-    others2d = np.setdiff1d(np.arange(len(keypoints)), np.concatenate([true2d, changed]))
-    others3d = np.setdiff1d(np.arange(len(mapped.of)), true3d)
-    kept, extra2d, extra3d = _amounts(len(true2d), len(others2d), len(others3d), options, rng)
-    if kept < options.min_points:
+    changed = place2d[~matched & (rng.random(len(matched)) < CHANGED)]
+    others2d = np.setdiff1d(np.arange(len(keypoints)), np.concatenate([matched2d, changed]))
+    others3d = np.setdiff1d(np.arange(len(mapped.of)), matched3d)
+    matches, extra2d, extra3d = _amounts(len(matched2d), len(others2d), len(others3d), options, rng)
+    if matches < options.min_points:
         return None
     heading = Rotation.from_rotvec([0.0, 0.0, rng.uniform(0, 2 * np.pi)]).as_matrix()
     tilt = Rotation.from_rotvec([*(math.radians(options.tilt_deg) * rng.standard_normal(2)), 0.0]).as_matrix()
@@ -154,15 +163,14 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     turn, origin = tilt @ heading, 20 * scale * rng.standard_normal(3)  # of the map's axes
     if options.frame == "view":
         turn, origin = cameras[0].rotation, scale * cameras[0].translation
-    pick = rng.permutation(len(true2d))[:kept]
-    chosen2d = np.concatenate([true2d[pick], rng.permutation(others2d)[:extra2d]])
-    chosen3d = np.concatenate([true3d[pick], rng.permutation(others3d)[:extra3d]])
+    pick = rng.permutation(len(matched2d))[:matches]
+    chosen2d = np.concatenate([matched2d[pick], rng.permutation(others2d)[:extra2d]])
+    chosen3d = np.concatenate([matched3d[pick], rng.permutation(others3d)[:extra3d]])
     points3d = scale * mapped.points[chosen3d] @ turn.T + origin
     rotation = photo.rotation @ turn.T
     translation = scale * photo.translation - rotation @ origin
-    return Pair(
-        name, keypoints[chosen2d].astype(np.float32), points3d.astype(np.float32), kept, rotation, translation, focal
-    )  # fmt: skip
+    points2d = keypoints[chosen2d].astype(np.float32)
+    return Problem(name, points2d, points3d.astype(np.float32), matches, rotation, translation, focal)
 
 
 def triangulated(
@@ -182,11 +190,11 @@ def triangulated(
     for camera in cameras:
         sight = look(scene, camera, reach, rng, alone=False)
         track = rng.binomial(photos, scene.repeatability[sight.of])
-        keep = (track >= least) & ~known[sight.of]
-        seen = sight.of[keep]
+        is_new = (track >= least) & ~known[sight.of]
+        seen = sight.of[is_new]
         known[seen] = True
-        depth = sight.depth[keep]
-        inverse = 1 / depth + noise / (baseline * np.sqrt(track[keep])) * rng.standard_normal(len(seen))
+        depth = sight.depth[is_new]
+        inverse = 1 / depth + noise / (baseline * np.sqrt(track[is_new])) * rng.standard_normal(len(seen))
         along = 1 / (depth * np.maximum(inverse, 1e-5 / depth))
         index.append(seen)
         points.append(camera.centre + along[:, None] * (scene.points[seen] - camera.centre))
@@ -211,14 +219,14 @@ def _matched(
 
 
 def _amounts(
-    true: int, others2d: int, others3d: int, options: MapOptions, rng: np.random.Generator
+    matches: int, others2d: int, others3d: int, options: MapOptions, rng: np.random.Generator
 ) -> tuple[int, int, int]:
-    """True pairs, and points of each side without a partner: thinned alike to `num_points` of the larger side."""
+    """Matches, and points of each side without a partner: thinned alike to `num_points` of the larger side."""
     outliers = _uniform(options.outliers, rng)
-    allowed = np.inf if outliers >= 1 else true * outliers / (1 - outliers)
+    allowed = np.inf if outliers >= 1 else matches * outliers / (1 - outliers)
     extra2d, extra3d = min(others2d, allowed), min(others3d, allowed)
-    share = min(1.0, options.num_points / (true + max(extra2d, extra3d)))
-    return int(true * share), int(extra2d * share), int(extra3d * share)
+    share = min(1.0, options.num_points / (matches + max(extra2d, extra3d)))
+    return int(matches * share), int(extra2d * share), int(extra3d * share)
 
 
 def _uniform(value: Drawn, rng: np.random.Generator) -> float:
@@ -229,3 +237,102 @@ def _uniform(value: Drawn, rng: np.random.Generator) -> float:
 def _log_uniform(value: Drawn, rng: np.random.Generator) -> float:
     low, high = bounds(value)
     return float(low * (high / low) ** rng.random()) if 0 < low < high else _uniform(value, rng)
+
+
+class MapSource:
+    """A `ProblemSource` of scenes, one a problem, drawn when it is asked for: a function of (seed, epoch, index).
+
+    Raises ValueError for no problems.
+    """
+
+    def __init__(self, options: MapOptions, *, num_pairs: int, seed: Sequence[int], label: str) -> None:
+        if num_pairs < 1:
+            raise ValueError(f"expected at least one {label} problem, got {num_pairs}")
+        self.options, self.num_pairs, self.seed, self.label = options, num_pairs, tuple(seed), label
+
+    @property
+    def counts(self) -> Counts:
+        """Most points of each problem; most have fewer."""
+        most = np.full(self.num_pairs, self.options.num_points)
+        return Counts(most, most, most)
+
+    def names(self, index: Sequence[int]) -> tuple[str, ...]:
+        return tuple(f"map/{self.label}/{i:06d}" for i in index)
+
+    def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
+        problems = [
+            draw_map_problem(name, self.options, np.random.default_rng([*self.seed, epoch, i]))
+            for name, i in zip(self.names(index.tolist()), index.tolist(), strict=True)
+        ]
+        return stacked(problems, index)
+
+
+class SyntheticMapDataModule(ProblemDataModule):
+    """A photo's keypoints against the part of a sparse map that some other photos see, all of it drawn at random.
+
+    Every problem has a scene of its own, drawn when it is asked for. A point is in the map if enough photos have a
+    keypoint of it; it is off along its ray by the error of its triangulation. Keypoints of one photo alone, points out
+    of the photo's sight and matches that were missed are the points without a partner. Works without a Trainer:
+    `setup()`, then the loaders.
+
+    Args:
+        train_pairs: training problems of an epoch.
+        fresh_views: draw new scenes and cameras every epoch; false for fixed problems.
+        val_pairs: validation problems, fixed.
+        test_pairs: problems to test and predict on, fixed.
+        num_points: largest number of points of a side; matches and others are thinned alike where there are more.
+        min_points: a scene with fewer matches is drawn anew; at least 4.
+        outliers: of each side at most this share of all points has no partner; 1 for all that there are. Two numbers,
+            [low, high], draw it for each problem, uniformly.
+        views: lowest and highest number of photos whose map points are taken.
+        kinds: weight of each kind of scene; none for half facades, and a quarter each street and statue.
+        frame: of the map: any, turned by a random rotation; upright, the third axis upwards and any heading; view, the
+            coordinates of the first of the cameras whose map points are taken.
+        tilt_deg: by how much an upright frame is off, about each of its horizontal axes, standard deviation in degrees.
+        scale_range: lowest and highest number of scene units in a metre, drawn for each scene, uniformly in its
+            logarithm.
+        field_of_view: of the longer side of an image, degrees; a number or [low, high], uniform in the logarithm.
+        noise_px: standard deviation of the noise on 2D points, pixels of an image with 1200 on its longer side; a
+            number or [low, high], uniform in the logarithm.
+        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+    """
+
+    def __init__(
+        self,
+        *,
+        train_pairs: int = 40_000,
+        fresh_views: bool = True,
+        val_pairs: int = 200,
+        test_pairs: int = 200,
+        num_points: int = 256,
+        min_points: int = 16,
+        outliers: Drawn = (0.25, 1.0),
+        views: tuple[int, int] = (1, 3),
+        kinds: Mapping[str, float] | None = None,
+        frame: Literal["any", "upright", "view"] = "any",
+        tilt_deg: float = 0.0,
+        scale_range: tuple[float, float] = (0.1, 10.0),
+        field_of_view: Drawn = (24.0, 115.0),
+        noise_px: Drawn = (0.1, 1.5),
+        **loading: Any,
+    ) -> None:
+        super().__init__(**loading)
+        self.options = MapOptions(
+            num_points=num_points,
+            min_points=min_points,
+            outliers=outliers,
+            views=views,
+            kinds=WEIGHTS if kinds is None else kinds,
+            frame="upright" if frame == "any" else frame,
+            tilt_deg=tilt_deg,
+            scale_range=scale_range,
+            field_of_view=field_of_view,
+            noise_px=noise_px,
+        )
+        self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
+        self.fresh = fresh_views
+        self.augmentations = dict.fromkeys(PARTS, Augmentation(rotate=frame == "any"))
+
+    def _source(self, part: str, seed: tuple[int, int]) -> MapSource:
+        split = "test" if part == "predict" else part
+        return MapSource(self.options, num_pairs=self.num_pairs[split], seed=seed, label=split)

@@ -1,4 +1,4 @@
-"""One pair of point sets as a source gives it, and how pairs become a batch."""
+"""A problem, one set of image points and one of scene points, as a source gives it; and how problems become a batch."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,11 +14,11 @@ from bpnp.types import Batch
 
 
 @dataclass(frozen=True)
-class Pair:
+class Problem:
     """One image's points and the scene's points; see `bpnp.types` for the conventions.
 
     points2d (m, 2) normalised, points3d (n, 3), rotation (3, 3), translation (3,), focal pixels per unit of normalised
-    coordinates. The first `matched` points of both sides are the true pairs, in the same order; the others have no
+    coordinates. The first `matched` points of both sides are the matches, in the same order; the others have no
     partner. origin (3,): what was subtracted from the scene's coordinates, for scenes so far from theirs that float32
     would lose digits; None for nothing.
     """
@@ -43,10 +43,10 @@ class Pair:
         match3d: NDArray[np.integer],
         focal: float,
         origin: NDArray[np.float64] | None = None,
-    ) -> "Pair":
-        """The pair of two sets in any order; match3d (n,) is the 2D point of each 3D point, -1 for none.
+    ) -> "Problem":
+        """The problem of two sets in any order; match3d (n,) is the 2D point of each 3D point, -1 for none.
 
-        Raises ValueError that names the pair: shapes that do not fit, NaN or infinity, or a match3d that holds no
+        Raises ValueError that names the problem: shapes that do not fit, NaN or infinity, or a match3d that holds no
         integers, an index that is no 2D point, or one 2D point twice.
         """
         m, n, match = len(points2d), len(points3d), np.asarray(match3d)
@@ -66,17 +66,15 @@ class Pair:
         numbers = (points2d, points3d, rotation, translation, focal, 0.0 if origin is None else origin)
         if not all(np.isfinite(values).all() for values in numbers):
             raise ValueError(f"expected finite points, pose and focal, got NaN or infinity in {name!r}")
-        true3d = np.flatnonzero(match >= 0)
-        true2d = match[true3d]
-        if len(np.unique(true2d)) < len(true2d):
+        matched3d = np.flatnonzero(match >= 0)
+        matched2d = match[matched3d]
+        if len(np.unique(matched2d)) < len(matched2d):
             raise ValueError(f"expected at most one 3D point for each 2D point, got two in `match3d` of {name!r}")
-        order2d = np.concatenate([true2d, np.setdiff1d(np.arange(m), true2d)])
-        order3d = np.concatenate([true3d, np.flatnonzero(match < 0)])
         return cls(
             name,
-            points2d[order2d].astype(np.float32),
-            points3d[order3d].astype(np.float32),
-            len(true3d),
+            points2d[np.concatenate([matched2d, np.setdiff1d(np.arange(m), matched2d)])].astype(np.float32),
+            points3d[np.concatenate([matched3d, np.flatnonzero(match < 0)])].astype(np.float32),
+            len(matched3d),
             np.asarray(rotation, np.float64),
             np.asarray(translation, np.float64),
             focal,
@@ -85,7 +83,7 @@ class Pair:
 
 
 class Counts(NamedTuple):
-    """True pairs, 2D points and 3D points of each pair of a source (k,)."""
+    """Matches, 2D points and 3D points of each problem of a source (k,)."""
 
     matched: NDArray[np.int64]
     points2d: NDArray[np.int64]
@@ -93,43 +91,44 @@ class Counts(NamedTuple):
 
 
 @runtime_checkable
-class PairSource(Protocol):
-    """An indexed set of pairs, before their augmentation."""
+class ProblemSource(Protocol):
+    """An indexed set of problems, before their augmentation."""
 
     @property
     def counts(self) -> Counts:
-        """Points of each pair."""
+        """Points of each problem."""
 
     def names(self, index: Sequence[int]) -> tuple[str, ...]: ...
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        """Pairs as `stacked` makes them, ids apart: each a function of its index, the epoch and the source's seed."""
+        """Problems as `stacked` makes them: each a function of its index, the epoch and the source's seed."""
 
 
-def stacked(pairs: Sequence[Pair], index: Int[Tensor, " b"]) -> Batch:
-    """Pad and mask pairs: 3D point j of the batch was seen as 2D point j, or (match3d -1) not at all.
+def stacked(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:
+    """Pad and mask problems: 3D point j of the batch was seen as 2D point j, or (match3d -1) not at all.
 
     Points are float32, poses float64.
     """
-    size = len(pairs)
-    count2d, count3d = (torch.tensor([len(getattr(p, f"points{d}d")) for p in pairs])[:, None] for d in (2, 3))
-    matched = torch.tensor([pair.matched for pair in pairs])[:, None]
-    points2d = np.zeros((size, int(count2d.max()), 2), np.float32)
-    points3d = np.zeros((size, int(count3d.max()), 3), np.float32)
-    for i, pair in enumerate(pairs):
-        points2d[i, : len(pair.points2d)] = pair.points2d
-        points3d[i, : len(pair.points3d)] = pair.points3d
+    count2d = torch.tensor([len(problem.points2d) for problem in problems])[:, None]
+    count3d = torch.tensor([len(problem.points3d) for problem in problems])[:, None]
+    matched = torch.tensor([problem.matched for problem in problems])[:, None]
+    points2d = torch.zeros(len(problems), int(count2d.max()), 2)
+    points3d = torch.zeros(len(problems), int(count3d.max()), 3)
+    for i, problem in enumerate(problems):
+        points2d.numpy()[i, : len(problem.points2d)] = problem.points2d
+        points3d.numpy()[i, : len(problem.points3d)] = problem.points3d
     places = torch.arange(points3d.shape[1])
+    origins = [np.zeros(3) if problem.origin is None else problem.origin for problem in problems]
     return Batch(
-        points2d=torch.from_numpy(points2d),
-        points3d=torch.from_numpy(points3d),
+        points2d=points2d,
+        points3d=points3d,
         mask2d=torch.arange(points2d.shape[1]) < count2d,
         mask3d=places < count3d,
-        focal=torch.tensor([pair.focal for pair in pairs], dtype=torch.float32),
+        focal=torch.tensor([problem.focal for problem in problems], dtype=torch.float32),
         index=index,
-        ids=tuple(pair.name for pair in pairs),
-        rotation=torch.from_numpy(np.stack([pair.rotation for pair in pairs])),
-        translation=torch.from_numpy(np.stack([pair.translation for pair in pairs])),
+        ids=tuple(problem.name for problem in problems),
+        rotation=torch.from_numpy(np.stack([problem.rotation for problem in problems])),
+        translation=torch.from_numpy(np.stack([problem.translation for problem in problems])),
         match3d=torch.where(places < matched, places, -1),
-        origin=torch.from_numpy(np.stack([np.zeros(3) if p.origin is None else p.origin for p in pairs])),
+        origin=torch.from_numpy(np.stack(origins)),
     )

@@ -1,4 +1,4 @@
-"""Pairs in a store: every pair comes back, small ones are left out, and what does not fit is refused."""
+"""Problems in a store: every problem comes back, small ones are left out, and what does not fit is refused."""
 
 import pickle
 from pathlib import Path
@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from bpnp.datamodules import ColmapDataModule, Pair, PairSource, write_pairs
+from bpnp.datamodules import ColmapDataModule, Problem, ProblemSource, write_problems
 from bpnp.datamodules.augment import Augmentation
-from bpnp.datamodules.loader import PairDataset, pair_loader
+from bpnp.datamodules.loader import ProblemDataset, problem_loader
 from bpnp.datamodules.store import Store, StoreError, open_store
-from bpnp.datamodules.stored_pairs import PAIRS, StoredPairs, scene_rows, stored_pair
+from bpnp.datamodules.stored import PROBLEMS, StoredProblems, scene_rows, stored_problem
 
 
 def sets(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """4 to 60 true pairs with clutter on both sides, shuffled; the x of both points of a pair are equal."""
+    """4 to 60 matches with clutter on both sides, shuffled; the x of both points of a problem are equal."""
     rng = np.random.default_rng(i)
     k, free2d, free3d = rng.integers(4, 60), rng.integers(0, 40), rng.integers(0, 40)
     values = rng.random(k)
@@ -26,32 +26,32 @@ def sets(i: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return points2d[order2d], points3d[order3d], match[order3d]
 
 
-def pairs(count: int = 12) -> list[tuple[str, Pair]]:
+def problems(count: int = 12) -> list[tuple[str, Problem]]:
     result = []
     for i in range(count):
         rng = np.random.default_rng(100 + i)
         pose = np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=3)
         points2d, points3d, match = sets(i)
         origin = rng.normal(size=3) if i % 2 else None
-        pair = Pair.from_matches(f"scène {i % 3}/{i}", points2d, points3d, *pose, match, float(i + 1), origin)
-        result.append((f"s{i % 3}", pair))
+        problem = Problem.from_matches(f"scène {i % 3}/{i}", points2d, points3d, *pose, match, float(i + 1), origin)
+        result.append((f"s{i % 3}", problem))
     return result
 
 
 @pytest.fixture
 def store(tmp_path: Path) -> Store:
-    write_pairs(tmp_path / "store", pairs(), parameters={"clutter": 1.0})
-    return open_store(tmp_path / "store", PAIRS)
+    write_problems(tmp_path / "store", problems(), parameters={"clutter": 1.0})
+    return open_store(tmp_path / "store", PROBLEMS)
 
 
 def test_matches_put_the_true_pairs_first_and_lose_no_point() -> None:
-    for i, (_, pair) in enumerate(pairs()):
+    for i, (_, problem) in enumerate(problems()):
         points2d, points3d, match = sets(i)
-        assert pair.matched == (match >= 0).sum()
-        np.testing.assert_array_equal(pair.points2d[: pair.matched, 0], pair.points3d[: pair.matched, 0])
-        assert (pair.points2d[pair.matched :, 0] < 0).all()
-        assert (pair.points3d[pair.matched :, 0] >= 2).all()
-        for ours, given in ((pair.points2d, points2d), (pair.points3d, points3d)):
+        assert problem.matched == (match >= 0).sum()
+        np.testing.assert_array_equal(problem.points2d[: problem.matched, 0], problem.points3d[: problem.matched, 0])
+        assert (problem.points2d[problem.matched :, 0] < 0).all()
+        assert (problem.points3d[problem.matched :, 0] >= 2).all()
+        for ours, given in ((problem.points2d, points2d), (problem.points3d, points3d)):
             assert {tuple(p) for p in ours} == {tuple(p) for p in given.astype("f4")}
 
 
@@ -59,12 +59,12 @@ def test_pairs_come_back(store: Store) -> None:
     assert {name: rows.tolist() for name, rows in scene_rows(store).items()} == {
         f"s{s}": list(range(s, 12, 3)) for s in range(3)
     }
-    for i, (_, pair) in enumerate(pairs()):
-        back = stored_pair(store, i)
-        assert (back.name, back.focal, back.matched) == (pair.name, pair.focal, pair.matched)
+    for i, (_, problem) in enumerate(problems()):
+        back = stored_problem(store, i)
+        assert (back.name, back.focal, back.matched) == (problem.name, problem.focal, problem.matched)
         for name in ("points2d", "points3d", "rotation", "translation"):
-            np.testing.assert_array_equal(getattr(back, name), getattr(pair, name))
-        np.testing.assert_array_equal(back.origin, np.zeros(3) if pair.origin is None else pair.origin)
+            np.testing.assert_array_equal(getattr(back, name), getattr(problem, name))
+        np.testing.assert_array_equal(back.origin, np.zeros(3) if problem.origin is None else problem.origin)
 
 
 WRONG = [
@@ -81,34 +81,38 @@ WRONG = [
 def test_arrays_that_do_not_fit_are_named(change: dict[str, np.ndarray], message: str) -> None:
     points = np.ones((4, 3))
     given = {"points2d": points[:, :2], "points3d": points, "rotation": np.eye(3), "translation": np.zeros(3)}
-    create = Pair.from_matches.__func__
+    create = Problem.from_matches.__func__
     create = getattr(create, "__wrapped__", create)  # past the type checks of the tests, which users do not have
     with pytest.raises(ValueError, match=message):
-        create(Pair, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | given | change))
+        create(Problem, "a/1", **({"match3d": np.arange(4), "focal": 1.0} | given | change))
 
 
 def test_small_pairs_are_left_out(store: Store) -> None:
-    with pytest.warns(UserWarning, match=r"skipped \d+ of 12 pairs"):
-        source = StoredPairs(store, np.arange(12), min_points=30)
-    assert isinstance(source, PairSource)
-    assert set(source.names(range(len(source.rows)))) == {pair.name for _, pair in pairs() if pair.matched >= 30}
-    assert source.counts.matched.tolist() == [pair.matched for _, pair in pairs() if pair.matched >= 30]
+    with pytest.warns(UserWarning, match=r"skipped \d+ of 12 problems"):
+        source = StoredProblems(store, np.arange(12), min_points=30)
+    assert isinstance(source, ProblemSource)
+    assert set(source.names(range(len(source.rows)))) == {
+        problem.name for _, problem in problems() if problem.matched >= 30
+    }
+    assert source.counts.matched.tolist() == [problem.matched for _, problem in problems() if problem.matched >= 30]
     with pytest.raises(StoreError, match="min_points"):
-        StoredPairs(store, np.arange(12), min_points=100)
+        StoredProblems(store, np.arange(12), min_points=100)
 
 
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) -> None:
-    dataset = PairDataset(StoredPairs(store, np.arange(12), min_points=4), Augmentation(max_points=20, clutter=0.5))
-    loader = pair_loader(dataset, batch_size=5, shuffle=False, seed=0, num_workers=num_workers)
+    dataset = ProblemDataset(
+        StoredProblems(store, np.arange(12), min_points=4), Augmentation(max_points=20, clutter=0.5)
+    )
+    loader = problem_loader(dataset, batch_size=5, shuffle=False, seed=0, num_workers=num_workers)
     served, state = {}, torch.get_rng_state()
     for batch in loader:
         for row, name in enumerate(batch.ids):
             served[name] = batch.points3d[row, batch.mask3d[row]]
     assert torch.equal(state, torch.get_rng_state())
-    assert sorted(served) == sorted(pair.name for _, pair in pairs())
-    for i, (_, pair) in enumerate(pairs()):
-        assert torch.equal(served[pair.name], pickle.loads(pickle.dumps(dataset)).pair(i).points3d[0])
+    assert sorted(served) == sorted(problem.name for _, problem in problems())
+    for i, (_, problem) in enumerate(problems()):
+        assert torch.equal(served[problem.name], pickle.loads(pickle.dumps(dataset)).problem(i).points3d[0])
 
 
 def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:

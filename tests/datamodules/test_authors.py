@@ -1,4 +1,4 @@
-"""The authors' pickles: planted pairs come back with their matches, copies dropped, both directions of W_gt."""
+"""The authors' pickles: planted problems come back with their matches, copies dropped, both directions of W_gt."""
 
 import os
 import pickle
@@ -10,35 +10,33 @@ from released_pickles import Sample, sample, write
 
 from bpnp.cli import main
 from bpnp.datamodules.augment import Outliers
-from bpnp.datamodules.released.module import PreprocessedDataModule
-from bpnp.datamodules.released.pickles import PickleError
-from bpnp.datamodules.released.prepare import prepare_preprocessed
+from bpnp.datamodules.authors import AuthorsDataModule, PickleError, prepare_authors, split_rows
 from bpnp.datamodules.store import Store, StoreError, open_store
-from bpnp.datamodules.stored_pairs import PAIRS, scene_rows, stored_pair
+from bpnp.datamodules.stored import PROBLEMS, scene_rows, stored_problem
 
 
 def check(store: Store, samples: list[Sample]) -> None:
     assert len(store) == 2 * len(samples)
     for i in range(len(store)):
-        pair, expected = stored_pair(store, i), samples[i % len(samples)]
+        problem, expected = stored_problem(store, i), samples[i % len(samples)]
         count = expected["num_points_2d"][0]
-        assert (len(pair.points2d), len(pair.points3d)) == (count, count)
-        assert pair.matched == count
-        camera = pair.points3d @ pair.rotation.T + pair.translation
-        assert pair.points2d == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
-        assert pair.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
+        assert (len(problem.points2d), len(problem.points3d)) == (count, count)
+        assert problem.matched == count
+        camera = problem.points3d @ problem.rotation.T + problem.translation
+        assert problem.points2d == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
+        assert problem.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
 
 
 def test_preprocessed_pickles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     samples = [sample(i) for i in range(8)]
     write(tmp_path / "data", samples)
-    main(["prepare", "preprocessed", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
+    main(["prepare", "authors", str(tmp_path / "data"), "--output", str(tmp_path / "store")])
     assert "8 train, 8 test" in capsys.readouterr().out
-    store = open_store(tmp_path / "store", PAIRS)
+    store = open_store(tmp_path / "store", PROBLEMS)
     check(store, samples)
     assert list(scene_rows(store)) == ["train", "test"]
-    assert stored_pair(store, 0).focal == 800
-    assert prepare_preprocessed(tmp_path / "data", tmp_path / "store").counts == {"train": 8, "test": 8}
+    assert stored_problem(store, 0).focal == 800
+    assert len(prepare_authors(tmp_path / "data", tmp_path / "store")) == 16
 
 
 def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
@@ -47,8 +45,8 @@ def test_correspondences_indexed_by_2d_points(tmp_path: Path) -> None:
         count = s["num_points_2d"][0]
         s["W_gt"] = np.resize(np.argsort(s["W_gt"][:count]), 40)
     write(tmp_path, samples, "data61_2d3d")
-    prepare_preprocessed(tmp_path, tmp_path / "store")
-    check(open_store(tmp_path / "store", PAIRS), samples)
+    prepare_authors(tmp_path, tmp_path / "store")
+    check(open_store(tmp_path / "store", PROBLEMS), samples)
 
 
 def test_the_form_before_preprocessing(tmp_path: Path) -> None:
@@ -61,8 +59,8 @@ def test_the_form_before_preprocessing(tmp_path: Path) -> None:
             for name, values in (("matches", rows), ("R", [s["R_gt"] for s in part])):
                 (folder / f"{name}.pkl").write_bytes(pickle.dumps(values, 2))
             (folder / "t.pkl").write_bytes(pickle.dumps([s["t_gt"][:, None] for s in part], 2))
-    prepare_preprocessed(tmp_path, tmp_path / "store")
-    store = open_store(tmp_path / "store", PAIRS)
+    prepare_authors(tmp_path, tmp_path / "store")
+    store = open_store(tmp_path / "store", PROBLEMS)
     assert tuple(scene_rows(store)) == ("train/0001", "train/0002", "test/0001", "test/0002")
     check(store, samples)
 
@@ -82,8 +80,8 @@ BAD = {
 
 def test_bad_samples_are_counted(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(20)] + [sample(30) | change for change in BAD.values()]
-    prepared = prepare_preprocessed(write(tmp_path, samples), tmp_path / "store")
-    assert prepared.counts == {"train": 20, "test": 20}
+    prepared = prepare_authors(write(tmp_path, samples), tmp_path / "store")
+    assert [len(split_rows(prepared, split)) for split in ("train", "test")] == [20, 20]
     assert set(prepared.skipped) == {f"{split}/{20 + i:06d}" for split in ("train", "test") for i in range(len(BAD))}
     assert all(reason.startswith("expected") for reason in prepared.skipped.values())
 
@@ -93,9 +91,9 @@ def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(8)]
     count = int(samples[0]["num_points_2d"][0])
     samples[0]["W_gt"][1] = samples[0]["W_gt"][0]
-    prepare_preprocessed(write(tmp_path, samples), tmp_path / "store")
-    pair = stored_pair(open_store(tmp_path / "store", PAIRS), 0)
-    assert (pair.matched, len(pair.points2d), len(pair.points3d)) == (count - 1, count, count)
+    prepare_authors(write(tmp_path, samples), tmp_path / "store")
+    problem = stored_problem(open_store(tmp_path / "store", PROBLEMS), 0)
+    assert (problem.matched, len(problem.points2d), len(problem.points3d)) == (count - 1, count, count)
 
 
 class Exploit:
@@ -115,23 +113,23 @@ def test_bad_sources_are_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     ):
         (root / "modelnet40_test" / "preprocessed" / "p3d.pkl").write_bytes(content)
         with pytest.raises(PickleError, match=message):
-            prepare_preprocessed(root, output)
+            prepare_authors(root, output)
     (root / "modelnet40_test" / "preprocessed" / "p3d.pkl").unlink()
     with pytest.raises(ValueError, match="no .*p3d.pkl"):
-        prepare_preprocessed(root, output)
+        prepare_authors(root, output)
     write(tmp_path / "data", [sample(0)], "other")
     with pytest.raises(ValueError, match="--dataset modelnet40"):
-        prepare_preprocessed(root, output)
+        prepare_authors(root, output)
     with pytest.raises(ValueError, match="nowhere"):
-        prepare_preprocessed(tmp_path / "nowhere", output)
+        prepare_authors(tmp_path / "nowhere", output)
     with pytest.raises(ValueError, match="got none"):
-        prepare_preprocessed(root / "other_test", output)
+        prepare_authors(root / "other_test", output)
     shifted = [sample(i) | {"t_gt": np.array([5.0, 5.0, 8.0])} for i in range(4)]
     with pytest.raises(PickleError, match="project"):
-        prepare_preprocessed(write(tmp_path / "shifted", shifted), output)
+        prepare_authors(write(tmp_path / "shifted", shifted), output)
     unusable = [sample(i) | BAD["rotation"] for i in range(4)]
     with pytest.raises(StoreError, match="at least one usable sample"):
-        prepare_preprocessed(write(tmp_path / "unusable", unusable), output)
+        prepare_authors(write(tmp_path / "unusable", unusable), output)
     assert not output.exists()
     assert not Path("hacked").exists()
 
@@ -140,7 +138,7 @@ def test_data_module(tmp_path: Path) -> None:
     samples = [sample(i) for i in range(20)]
     options = {"val_fraction": 0.2, "batch_size": 4, "cache_dir": str(tmp_path / "cache"), "max_points": 6}
     options |= {"test_outliers": Outliers(ratio=1.0), "min_points": 5}
-    module = PreprocessedDataModule(str(write(tmp_path / "data", samples)), **options)
+    module = AuthorsDataModule(str(write(tmp_path / "data", samples)), **options)
     module.prepare_data()
     module.setup()
     names = [name for batch in module.train_dataloader() for name in batch.ids]
@@ -152,6 +150,6 @@ def test_data_module(tmp_path: Path) -> None:
         assert (batch.count2d == 2 * true).all()
         assert (batch.count3d == 2 * true).all()
     assert len(list((tmp_path / "cache").iterdir())) == 1
-    again = PreprocessedDataModule(str(next((tmp_path / "cache").iterdir())), **options)
+    again = AuthorsDataModule(str(next((tmp_path / "cache").iterdir())), **options)
     again.setup("test")
     assert len(again.datasets["test"]) == 20
