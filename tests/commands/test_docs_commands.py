@@ -63,7 +63,7 @@ def test_the_commands_run_as_written(
     for words in found:
         released = "released.ckpt" in words
         if words[0] == "prepare":
-            words += [] if words[1] == "preprocessed" else ["--processes", "1"]
+            words += [] if words[1] == "authors" else ["--processes", "1"]
         elif words[0] != "convert-weights":
             words += ["--config", "short.yaml", "--data.num_workers", "0", "--data.batch_size", "2"]
             words += [] if released else QUICK
