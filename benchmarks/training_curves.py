@@ -14,7 +14,7 @@ import matplotlib.pyplot as plt
 
 from bpnp.report.figures import save_figure
 from bpnp.report.palette import LIGHT
-from bpnp.report.training_log import TrainingLog, read_training_log
+from bpnp.report.runs import TrainingLog, read_training_log
 
 PARTS = {"train": "training batch", "val": "validation"}
 ROTATION = "val/rotation_q2_deg"

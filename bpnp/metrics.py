@@ -166,12 +166,28 @@ def pose_recalls(errors: PoseErrors, thresholds: RecallThresholds | None = None)
     thresholds = thresholds or RecallThresholds()
     values: dict[str, Tensor] = {}
     for name, unit, error in known_errors(errors):
-        for limit in getattr(thresholds, f"{name}_{unit}".rstrip("_")):
-            values[f"recall_{name}_{limit:g}{unit}"] = (error <= limit).double().mean()
+        limits = getattr(thresholds, f"{name}_{unit}".rstrip("_"))
+        keys = [f"recall_{name}_{limit:g}{unit}" for limit in limits]
+        values |= zip(keys, recall_curve(error, limits), strict=True)
     for degrees, length in thresholds.joint:
-        right = (errors.rotation_deg <= degrees) & (errors.translation <= length)
-        values[f"recall_joint_{degrees:g}deg_{length:g}"] = right.double().mean()
+        (values[f"recall_joint_{degrees:g}deg_{length:g}"],) = recall_curve(joint_error(errors, length), [degrees])
     return values
+
+
+def recall_curve(error: Float[Tensor, " b"], limits: Limits) -> Float[Tensor, " k"]:
+    """Share of errors up to each limit, float64.
+
+    >>> recall_curve(torch.tensor([1.0, 3.0, 3.0, 9.0]), [1, 3, 4]).tolist()
+    [0.25, 0.75, 0.75]
+    """
+    ordered = error.double().sort().values
+    most = torch.as_tensor(limits, dtype=torch.float64, device=error.device)
+    return torch.searchsorted(ordered, most, right=True).double() / max(len(ordered), 1)
+
+
+def joint_error(errors: PoseErrors, translation: float | int) -> Float[Tensor, " b"]:
+    """Rotation errors in degrees, infinite for a pose with more than this translation error."""
+    return errors.rotation_deg.where(errors.translation <= translation, math.inf)
 
 
 def known_errors(errors: PoseErrors) -> Iterator[tuple[str, str, Tensor]]:

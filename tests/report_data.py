@@ -1,4 +1,4 @@
-"""Results of planted pairs for the tests of the page and of the figures."""
+"""Results of planted problems for the tests of the page and of the figures."""
 
 import base64
 import gzip
@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.report import PairRow, Results, write_results
-from bpnp.report.samples import PairView, write_views
+from bpnp.report import ProblemRow, Results, write_results
+from bpnp.report.points import ProblemPoints, write_points
 from bpnp.types import Batch
 
 HOSTILE = "</script><script>document.title='owned'</script><b>&amp;%%data%%\udcff"
@@ -20,8 +20,8 @@ def inflated(text: str) -> str:
     return gzip.decompress(base64.b64decode(text)).decode()
 
 
-def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) -> list[PairRow]:
-    """Random rows of pairs whose sizes do not depend on the seed; the first pair has a hostile name, every seventh no
+def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) -> list[ProblemRow]:
+    """Random rows of problems whose sizes do not depend on the seed; the first has a hostile name, every seventh no
     pose, the second no reprojection error."""
     rng, sizes = np.random.default_rng(seed), np.random.default_rng(0)
     planted = []
@@ -38,13 +38,13 @@ def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) 
             converged = found and bool(rng.random() < 0.8)
             inliers, seconds = int(rng.integers(0, m)), float(rng.gamma(4, 0.01))
             planted.append(
-                PairRow(i, name, estimate, *errors, inliers, m, n, min(m, n), 12, 1e-8, converged, found, seconds)
+                ProblemRow(i, name, estimate, *errors, inliers, m, n, min(m, n), 12, 1e-8, converged, found, seconds)
             )
     return planted
 
 
 def planted(sizes: tuple[int, ...], clutter: int) -> Batch:
-    """Exact pairs; the last `clutter` points of each side have no match, and matches are shuffled."""
+    """Exact problems; the last `clutter` points of each side have no match, and matches are shuffled."""
     rng = np.random.default_rng(0)
     sets2d, sets3d, matches = [], [], []
     rotation = Rotation.random(len(sizes), rng=rng).as_matrix()
@@ -61,37 +61,39 @@ def planted(sizes: tuple[int, ...], clutter: int) -> Batch:
         matches.append(match)
     translation = np.tile([0.0, 0.0, 4.0], (len(sizes), 1))
     return Batch.from_arrays(
-        sets2d, sets3d, list(rotation), list(translation), matches, ids=[f"pair {i}" for i in range(len(sizes))]
+        sets2d, sets3d, list(rotation), list(translation), matches, ids=[f"problem {i}" for i in range(len(sizes))]
     )
 
 
-def row(index: int, estimate: str = "pnp", **changes: object) -> PairRow:
+def row(index: int, estimate: str = "pnp", **changes: object) -> ProblemRow:
     """A row of random errors, with changes."""
     values = np.random.default_rng(index).gamma(1.0, 5.0, 4).tolist()
-    first = PairRow(index, f"pair {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
+    first = ProblemRow(index, f"problem {index}", estimate, *values, 3, 10, 12, 9, 4, 1e-7, True, True, 0.25)
     return replace(first, **changes)  # type: ignore[arg-type]
 
 
-def view(index: int, name: str, points: int = 30) -> PairView:
+def drawn_problem(index: int, name: str, count: int = 30) -> ProblemPoints:
     """Points in front of a camera, exactly projected; `ransac` is the true pose, `pnp` has none."""
     rng = np.random.default_rng(index)
     rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 4.0])
-    points3d = rng.uniform(-1, 1, (points, 3)).astype(np.float32)
+    points3d = rng.uniform(-1, 1, (count, 3)).astype(np.float32)
     camera = points3d @ rotation.T + translation
-    match = np.arange(points, dtype=np.int32)
+    match = np.arange(count, dtype=np.int32)
     missing = (np.full((3, 3), np.nan), np.full(3, np.nan))
     estimates = {"ransac": (rotation, translation), "pnp": missing}
     points2d = (camera[:, :2] / camera[:, 2:]).astype(np.float32)
-    return PairView(index, name, points2d, points3d, match, match[::-1].copy(), (rotation, translation), estimates, 2.0)
+    return ProblemPoints(
+        index, name, points2d, points3d, match, match[::-1].copy(), (rotation, translation), estimates, 2.0
+    )
 
 
 def write_run(folder: Path, count: int, seed: int) -> Results:
-    """Results with the views of their worst and their first pair, and a log of a training whose pose loss joins."""
+    """Results with the points of their worst and their first pair, and a log of a training whose pose loss joins."""
     planted = rows(count, seed)
     results = write_results(folder / "test", planted, correspondence_loss=0.25, settings={"command": HOSTILE})
     first = [row for row in planted if row.estimate == "ransac"]
     worst = max(first, key=lambda row: (row.rotation_error_deg, -row.index))
-    write_views(folder / "test", [view(row.index, row.id) for row in (first[0], worst)])
+    write_points(folder / "test", [drawn_problem(row.index, row.id) for row in (first[0], worst)])
     log = folder / "logs" / "version_0" / "metrics.csv"
     log.parent.mkdir(parents=True)
     lines = ["step,train/loss,train/pose_loss,val/rotation_q2_deg"]

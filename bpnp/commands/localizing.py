@@ -16,6 +16,10 @@ if TYPE_CHECKING:
     from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
+CAPTION = (
+    "error: mean over the matches, pixels. log10 false: logarithm of the number of false alarms, how many poses are "
+    "expected to fit as well by chance; smaller is surer."
+)
 COLUMNS = ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec")
 LEGEND = (
     "error px: mean distance between the keypoints of the matches and their points; log10 false: how many poses would "
@@ -206,8 +210,7 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
 def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
     """A row for each photo."""
     from bpnp.report.palette import VERDICTS
-    from bpnp.report.tables.fitted_table import FittedTable
-    from bpnp.report.tables.rows import number
+    from bpnp.report.terminal import SplitTable, number
 
     rows = []
     for name, record in records.items():
@@ -222,4 +225,4 @@ def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
             number(record["seconds"]),
         )
         rows.append((Text(name), [Text(record["verdict"], VERDICTS[record["verdict"]]), *map(Text, cells)]))
-    return FittedTable("", COLUMNS, [rows])
+    return SplitTable("", COLUMNS, [rows], CAPTION)

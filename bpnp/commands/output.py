@@ -3,7 +3,7 @@
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from bpnp.report.tables.fitted_table import WIDTH
+from bpnp.report.terminal import WIDTH
 
 
 def console() -> Console:

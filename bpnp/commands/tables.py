@@ -1,16 +1,18 @@
-"""`bpnp table`: several methods on the same pairs, in the form of the paper's tables."""
+"""`bpnp table`: several methods on the same problems, in the form of the paper's tables."""
 
 from contextlib import ExitStack
+from itertools import product
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.output import console, progress, say
 from bpnp.commands.parser import at_least
-from bpnp.files import claimed, packaged_config
-from bpnp.report.tables.published import Paper
+from bpnp.files import claimed, packaged_config, write_text
+from bpnp.report.terminal import Paper
 
 if TYPE_CHECKING:
-    from bpnp.table.run import Block
+    from bpnp.report.tables import Row
+    from bpnp.training.comparison import MethodTest
 
 PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": "megadepth"}
 
@@ -28,55 +30,105 @@ def table(
     paper: Literal["auto", "modelnet40", "megadepth", "none"] = "auto",
     overrides: list[str] | None = None,
 ) -> None:
-    """Test several methods on the same pairs and print the paper's table.
+    """Test several methods on the same problems and print the paper's table.
 
-    Started again, it resumes; a longer --limit adds to what is there. `--data.NAME=VALUE` overrides the
-    recipe's data.
+    Each method has a folder of results, as of `bpnp test`. Started again, it skips the methods that are finished.
+    `--data.NAME=VALUE` overrides the recipe's data.
 
     Args:
         data: name or file of a configuration with `data`.
         methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, constellation, hungarian,
             bpnpnet, matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian
             need a CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
-        limit: pairs, a fixed random choice; all by default.
-        rho: outliers a true pair on both sides; a table and a plot over these.
-        seeds: of the data; the table of each, and their mean with its standard deviation.
-        time_limit: seconds a pair, for methods that have a limit.
-        processes: worker processes of one thread each.
+        limit: problems, a fixed random choice; all by default.
+        rho: outliers a match on both sides; a table and a plot over these.
+        seeds: of the data; the mean over these and its standard deviation.
+        time_limit: seconds a problem, for methods that have a limit.
+        processes: worker processes of one thread each; each takes a method at a time.
         output: folder of the results.
         paper: published rows beneath.
     """
-    from bpnp.report.tables.result_tables import CAPTION, fitted
-    from bpnp.report.tables.rows import paper_rows
-    from bpnp.report.tables.written_tables import COLUMNS, note
-    from bpnp.table.blocks import blocks_of, rows_of, write_tables
-    from bpnp.table.methods import parse_methods
-    from bpnp.table.pairs import read_data
-    from bpnp.table.run import run
+    from bpnp.report.figures import outlier_curves, save_figure
+    from bpnp.report.tables import (
+        CAPTION,
+        FILE_COLUMNS,
+        as_latex,
+        as_markdown,
+        note,
+        paper_rows,
+        table_frame,
+        table_of_rows,
+    )
+    from bpnp.solving.processes import in_processes
+    from bpnp.training.comparison import MethodTest, parse_methods, read_data, with_setting
 
     at_least(1, limit=limit, processes=processes)
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
-    described = read_data(Path(packaged_config(data)), overrides or [])
-    every: list[int | None] = [None] if seeds is None else [*dict.fromkeys(seeds)]
-    lists: list[tuple[float | None, list["Block"]]] = [
-        (share, [block for seed in every for block in blocks_of(output, chosen, described, limit, share, seed)])
-        for share in ([None] if rho is None else dict.fromkeys(rho))
-    ]
-    blocks = [block for _, own in lists for block in own]
+    recipe = read_data(Path(packaged_config(data)), overrides or [])
+    tests: dict[tuple[float | None, str], list[MethodTest]] = {}  # by share of outliers and method, a test a seed
+    shares: list[float | None] = [*dict.fromkeys(rho)] if rho else [None]
+    drawn: list[int | None] = [*dict.fromkeys(seeds)] if seeds else [None]
+    for share, seed in product(shares, drawn):
+        described, folder = recipe, output
+        if share is not None:
+            described, folder = with_setting(described, "test_outliers", {"ratio": share}), folder / f"rho-{share:g}"
+        if seed is not None:
+            described, folder = with_setting(described, "seed", seed), folder / f"seed-{seed}"
+        for method in chosen:
+            name = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in method.label)
+            tests.setdefault((share, method.label), []).append(MethodTest(method, described, folder / name, limit))
+    every = [test for several in tests.values() for test in several]
     out = console()
     with ExitStack() as held:
-        for block in blocks:
-            held.enter_context(claimed(block.folder))
-            block.claim()
-        missing = sum(len(block.missing()) for block in blocks)
+        for test in every:
+            held.enter_context(claimed(test.folder))
+        missing = [test for test in every if test.results() is None]
+        if len(missing) < len(every):
+            say(f"{len(every) - len(missing)} of {len(every)} tests are finished, in {output}", to=out)
         with progress() as shown:
-            task = shown.add_task("pairs", total=missing)
-            for tested in run(blocks, processes=processes):
-                shown.advance(task, tested)
-        rows = [row for ratio, own in lists for row in rows_of(own, ratio, len(every))]
-    published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else paper
+            task = shown.add_task("methods", total=len(missing))
+            if processes == 1:
+                for test in missing:
+                    test.run()
+                    shown.advance(task)
+            else:
+                for _ in in_processes(lambda i, _: missing[i].run(), range(len(missing)), processes, tell=_nothing):
+                    shown.advance(task)
+        rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
+    published = PAPERS.get(recipe["class_path"].rpartition(".")[2]) if paper == "auto" else paper
     rows += paper_rows(None if published == "none" else published)
-    out.print(fitted("Pose errors", COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
-    for path in write_tables(output, rows):
-        say(f"wrote {path}", to=out)
+    out.print(table_of_rows("Pose errors", FILE_COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
+    frame = table_frame(rows)
+    for name, text in (
+        ("table.csv", frame.to_csv(index=False)),
+        ("table.md", as_markdown(rows)),
+        ("table.tex", as_latex(rows)),
+    ):
+        say(f"wrote {write_text(output / name, text)}", to=out)
+    if rho is not None:
+        say(f"wrote {save_figure(outlier_curves(frame), output / 'outliers.png')}", to=out)
+
+
+def _rows(label: str, share: float | None, tests: "list[MethodTest]") -> "list[Row]":
+    """A row per estimate of a method; of several seeds their mean and standard deviation."""
+    from pandas import DataFrame
+
+    from bpnp.report.tables import Row
+
+    results = [result for test in tests if (result := test.results()) is not None]
+    count = {"problems": sum(result.problems for result in results)}
+    rows = []
+    for estimate in results[0].estimates:
+        name = f"{label} {estimate}" if len(results[0].estimates) > 1 else label
+        frame = DataFrame([result.estimates[estimate] for result in results])
+        mean: dict[str, Any] = frame.mean(skipna=False).to_dict()
+        rows.append(Row(name, mean | count, rho=share, problems=("rho", share)))
+        if len(results) > 1:
+            spread = frame.std(skipna=False).to_dict()
+            rows.append(Row(f"{name}, standard deviation of {len(results)} seeds", spread | count, rho=share))
+    return rows
+
+
+def _nothing(*_: Any) -> None:
+    """Workers say nothing while they test."""

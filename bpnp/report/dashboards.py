@@ -1,4 +1,4 @@
-"""Results as a run of Weights & Biases, and the workspace that shows such runs.
+"""Results as a run of Weights & Biases.
 
 Offline unless WANDB_MODE says otherwise. An offline run is a folder; `wandb sync FOLDER` sends it. `wandb` is imported
 here only, when it is used.
@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from bpnp.report.figures import plot_pair, recall_curve
-from bpnp.report.folder import read_results
+from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.page.charts import RECALLS, recall_chart
-from bpnp.report.results import Results, cause_shares
-from bpnp.report.samples import FEW, PairView, read_views
+from bpnp.report.points import FEW, ProblemPoints, read_points
+from bpnp.report.results import Results, cause_shares, read_results
+from bpnp.report.runs import named_runs
 
 MOST_PICTURES = 12
 
@@ -24,17 +24,17 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
     """Log a results folder to W&B and return the folder of the run, below `directory`.
 
     Scalars "test/<estimate>/rotation_q1_deg" and so on, the first estimate's also without its name; tables "quartiles",
-    "causes" and "pairs"; recall curves as plotly charts and as a picture; pictures of the worst kept pairs.
+    "causes" and "problems"; recall curves as plotly charts and as a picture; pictures of the worst problems.
     Raises ValueError if the folder cannot be read.
     """
     import wandb
 
-    results, views = read_results(folder), read_views(folder)
+    results, problems = read_results(folder), read_points(folder)
     directory = Path(directory)
     directory.mkdir(parents=True, exist_ok=True)
     run = wandb.init(
         project=project,
-        name=name or Path(folder).absolute().parent.name,
+        name=name or next(iter(named_runs([folder]))),
         dir=str(directory),
         job_type="test",
         config={"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written},
@@ -42,7 +42,7 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
     )
     try:
-        run.log(scalars(results) | _tables(results) | _curves(results) | _pictures(results, views))
+        run.log(scalars(results) | _tables(results) | _curves(results) | _pictures(results, problems))
         return Path(run.settings.sync_dir)
     finally:
         run.finish()
@@ -65,47 +65,6 @@ def scalars(results: Results) -> dict[str, float]:
     return values
 
 
-def workspace(entity: str, project: str) -> Any:
-    """The saved view of a project that shows what `log_results` and training log; `.save()` sends it.
-
-    Raises ValueError without the package wandb-workspaces.
-    """
-    try:
-        import wandb_workspaces.reports.v2 as panels
-        import wandb_workspaces.workspaces as spaces
-    except ImportError as error:
-        raise ValueError(
-            "expected the package wandb-workspaces, got none; try: pip install wandb-workspaces"
-        ) from error
-    errors: list[Any] = [f"test/{key}" for key in ("rotation_q2_deg", "translation_q2", "reprojection_q2_deg")]
-    recalls: list[Any] = ["test/recall_joint_15deg_0.5", "test/recall_joint_10deg_1", "test/found"]
-    training: dict[str, list[Any]] = {
-        "Loss": ["train/loss", "train/pose_loss"],
-        "Correspondence loss": ["train/correspondence_loss", "val/correspondence_loss"],
-        "Rotation error, degrees": [f"val/rotation_q{i}_deg" for i in (1, 2, 3)],
-        "Recall": ["val/recall_joint_15deg_0.5", "val/recall_joint_10deg_1"],
-        "Probability of the true matches": ["val/true_match_mass"],
-        "Iterations": ["train/sinkhorn_iterations", "val/pnp_iterations"],
-        "Without a pose, share": ["train/without_pose"],
-        "Gradient norm": ["train/gradient_norm"],
-        "Pairs per second": ["train/pairs_per_second"],
-    }
-    tests: list[Any] = [
-        panels.BarPlot(title=title, metrics=keys) for title, keys in (("Errors", errors), ("Recall", recalls))
-    ]
-    pictures = panels.MediaBrowser(media_keys=["test/recall", "test/worst_pairs", "val/pairs"])
-    curves: list[Any] = [panels.LinePlot(title=title, x="Step", y=keys) for title, keys in training.items()]
-    return spaces.Workspace(
-        entity=entity,
-        project=project,
-        name="Blind PnP",
-        sections=[
-            spaces.Section(name="Test", panels=[*tests, pictures], is_open=True),
-            spaces.Section(name="Training", panels=curves, is_open=True),
-        ],
-    )
-
-
 def _tables(results: Results) -> dict[str, Any]:
     import wandb
     from pandas import DataFrame
@@ -114,7 +73,7 @@ def _tables(results: Results) -> dict[str, Any]:
     frames = {
         "quartiles": DataFrame({"estimate": name, **values} for name, values in results.estimates.items()),
         "causes": DataFrame({"estimate": name, **shares} for name, shares in causes.items()),
-        "pairs": results.frame().map(_text),
+        "problems": results.frame().map(_text),
     }
     return {f"test/{name}": wandb.Table(dataframe=frame) for name, frame in frames.items()}
 
@@ -124,12 +83,14 @@ def _curves(results: Results) -> dict[str, Any]:
     return {key: chart for key, chart in charts.items() if chart is not None}
 
 
-def _pictures(results: Results, views: Sequence[PairView]) -> dict[str, Any]:
+def _pictures(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
     pictures: dict[str, Any] = {"test/recall": image(recall_curve({"test": results}))}
-    # Pairs with many points: the worst and some others, as a test keeps them.
-    worst = sorted(views, key=lambda view: (len(view.points2d) <= FEW, -view.error))[:MOST_PICTURES]
+    # Problems with many points: the worst and some others, as a test keeps them.
+    worst = sorted(problems, key=lambda problem: (len(problem.points2d) <= FEW, -problem.error))[:MOST_PICTURES]
     if worst:
-        pictures["test/worst_pairs"] = [image(plot_pair(view), caption=str(_text(view.id))) for view in worst]
+        pictures["test/worst_problems"] = [
+            image(plot_problem(problem), caption=str(_text(problem.id))) for problem in worst
+        ]
     return pictures
 
 

@@ -1,40 +1,44 @@
-"""Recall curves and pairs as matplotlib figures, for papers, notebooks and loggers.
+"""Recall curves and problems as matplotlib figures, for papers, notebooks and loggers.
 
 Figures are made without pyplot: they need no display, no backend, and no closing. `plot_scene`, `plot_image` and
-`plot_residuals` draw into given axes.
+`plot_residuals` draw into axes that they are given; an image and its residuals are in pixels of the problem's camera,
+in normalised coordinates where there is none.
 """
 
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from bpnp.cameras import Camera, in_front
 from bpnp.files import interruptions_later, written_whole
-from bpnp.report.page.charts import RECALLS, Error, sorted_errors, within
+from bpnp.report.page.charts import RECALLS, Error, recall_of
 from bpnp.report.palette import DASHES, LIGHT, QUIET
-from bpnp.report.photos import box_of
-from bpnp.report.pictures import Lines, estimate_of, plot_image
+from bpnp.report.photos import Box, box_of, picture_box, size_in_camera
+from bpnp.report.points import Array, ProblemPoints
 from bpnp.report.results import Results
-from bpnp.report.runs import read_runs, series_of
-from bpnp.report.samples import Array, PairView
+from bpnp.report.runs import lines_of, read_runs
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 SUFFIXES = (".png", ".svg", ".pdf")
 POINTS = 981  # of a curve
-LIMITS: dict[Error, float] = {
+LIMITS: dict[Error, float] = {  # of the recall curves
     "rotation_deg": 20.0,
     "translation": 1.0,
     "joint": 20.0,
     "reprojection_deg": 2.0,
-}  # of the recall curves
+}
+Lines = Literal["match3d", "assigned3d"]
 
 
 def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure":
-    """Share of pairs with an error up to a threshold, for rotation, translation, both, and reprojection (paper Fig. 3).
+    """Share of problems with an error up to a threshold: rotation, translation, both, reprojection (paper Fig. 3).
 
     runs: results folders, or results by name. Raises ValueError if a folder cannot be read.
     """
@@ -43,14 +47,36 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure"
     runs = runs if isinstance(runs, Mapping) else read_runs(runs)
     figure = Figure(figsize=(11, 3.2), layout="constrained")
     for axes, (key, limit) in zip(figure.subplots(1, 4, sharey=True), LIMITS.items(), strict=True):
-        for own in series_of(runs):
-            limits = np.linspace(0, limit, POINTS)
-            shares = within(sorted_errors(runs[own.run], own.estimate, key), limits)
-            axes.plot(limits, shares, **line_style(own.colour, own.dashes), label=_text(own.label))
+        limits = np.linspace(0, limit, POINTS)
+        for line in lines_of(runs):
+            shares = recall_of(runs[line.run], line.estimate, key, limits)
+            axes.plot(limits, shares, **line_style(line.colour, line.dashes), label=_text(line.label))
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
-    figure.axes[0].set_ylabel("pairs within")
+    figure.axes[0].set_ylabel("problems within")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
+    return figure
+
+
+def outlier_curves(frame: "DataFrame") -> "Figure":
+    """Median rotation error and recall against the share of outliers, a curve for each method.
+
+    frame: `bpnp.report.tables.table_frame`; rows without a share and standard deviations are not drawn.
+    """
+    from matplotlib.figure import Figure
+
+    recall = "recall_joint_15deg_0.5"
+    drawn = frame[frame.rho.notna() & ~frame.method.str.contains("standard deviation")].astype({"rho": float})
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    for axes, key, scale in zip(figure.subplots(1, 2), ("rotation_q2_deg", recall), (1, 100), strict=True):
+        for i, (method, rows) in enumerate(drawn.sort_values("rho").groupby("method", sort=False)):
+            style = line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": _text(str(method))}
+            axes.plot(rows.rho, scale * rows[key].astype(float), **style)
+        axes.set_xlabel("outliers a match, on both sides")
+        axes.grid(alpha=0.3)
+    figure.axes[0].set(yscale="log", ylabel="median rotation error, degrees", ylim=(None, 1.2 * 180))
+    figure.axes[1].set(ylabel="% of problems within 15 degrees and 0.5", ylim=(0, 101))
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4, frameon=False)
     return figure
 
@@ -61,45 +87,44 @@ def line_style(colour: int, dashes: int) -> dict[str, Any]:
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
 
 
-def plot_pair(
-    view: PairView, *, estimate: str | None = None, lines: Lines | None = "match3d", photo: Array | None = None
+def plot_problem(
+    problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d", photo: Array | None = None
 ) -> "Figure":
-    """A pair in space, points with true and estimated cameras, and in the image, seen and reprojected points.
+    """A problem in space, points with true and estimated cameras, and in the image, seen and reprojected points.
 
-    estimate, lines: see `plot_image`. photo: (h, w, 3)
-    uint8 under the image points, undistorted, that fills `bpnp.report.photos.box_of(view)`. Raises ValueError for an
-    unknown estimate.
+    estimate, lines: see `plot_image`. photo: (h, w, 3) uint8 under the image points, undistorted, that fills
+    `bpnp.report.photos.box_of(problem)`. Raises ValueError for an unknown estimate.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6), layout="constrained")
-    figure.suptitle(_text(view.id), fontsize=10)
-    plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), view)
-    box = None if photo is None else box_of(view)
-    axes = plot_image(figure.add_subplot(1, 2, 2), view, estimate=estimate, lines=lines, photo=photo, box=box)
-    name = estimate_of(view, estimate)
-    found = name is not None and np.isfinite(np.c_[view.estimates[name]]).all()
-    axes.set_title(_text(f"reprojected by {name}") if found else "no pose", fontsize=9)
+    figure.suptitle(_text(problem.id), fontsize=10)
+    plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), problem)
+    box = None if photo is None else box_of(problem)
+    axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines, photo=photo, box=box)
+    name = estimate_of(problem, estimate)
+    posed = name is not None and np.isfinite(np.c_[problem.estimates[name]]).all()
+    axes.set_title(_text(f"reprojected by {name}") if posed else "no pose", fontsize=9)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False, fontsize=8)
     return figure
 
 
-def plot_scene(axes: Any, view: PairView) -> Any:
+def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     """3D points, true and estimated cameras, in the axes of the true camera (right, forward, up). Returns the axes.
 
     axes: a matplotlib axes with projection="3d".
     """
-    colours = {name: LIGHT[i % len(LIGHT)] for i, name in enumerate(view.estimates)}
-    poses = {name: pose for name, pose in view.estimates.items() if np.isfinite(np.c_[pose]).all()}
-    frame = view.pose or next(iter(poses.values()), (np.eye(3), np.zeros(3)))
-    cameras = {"true pose": (view.pose, "black")} if view.pose is not None else {}
+    colours = {name: LIGHT[i % len(LIGHT)] for i, name in enumerate(problem.estimates)}
+    poses = {name: pose for name, pose in problem.estimates.items() if np.isfinite(np.c_[pose]).all()}
+    frame = problem.pose or next(iter(poses.values()), (np.eye(3), np.zeros(3)))
+    cameras = {"true pose": (problem.pose, "black")} if problem.pose is not None else {}
     cameras |= {name: (pose, colours[name]) for name, pose in poses.items()}
-    points = _upright(view.points3d, frame)
+    points = _upright(problem.points3d, frame)
     axes.scatter(*points.T, s=4, color=QUIET, depthshade=False)
     centre = np.median(points, axis=0)
     depth = max(0.5 * float(np.linalg.norm(centre)), 1e-9)
     for name, (pose, colour) in cameras.items():
-        corners = _upright(_frustum(pose, view.points2d, depth), frame)
+        corners = _upright(_frustum(pose, problem.points2d, depth), frame)
         if np.linalg.norm(corners[0] - centre) > 6 * depth + np.linalg.norm(np.ptp(points, axis=0)):
             axes.plot([], [], color=colour, label=_text(f"{name} (too far away)"))
             continue
@@ -114,6 +139,73 @@ def plot_scene(axes: Any, view: PairView) -> Any:
     return axes
 
 
+def plot_image(
+    axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d",
+    photo: Array | None = None, box: Box | None = None,
+) -> "Axes":  # fmt: skip
+    """Rings around the image points, crosses where a pose puts 3D points, and a line from each to its match.
+
+    estimate: whose pose, the first by default. lines: to the true matches or to those assigned by the solver, which a
+    problem without known matches always has; those that are not the true ones are dotted. photo: (h, w, 3) uint8, as it
+    was taken with the camera; or undistorted, filling a `box` of the normalised image plane, `picture_box` of the image
+    points for a problem without a camera. Under a photo, 3D points without a match are not drawn. Returns the axes.
+    """
+    from matplotlib.collections import LineCollection
+    from matplotlib.patheffects import withStroke
+
+    seen, projected, targets = _drawn(problem, estimate, lines)
+    if photo is not None and (box is not None or problem.camera is None):
+        frame = Box(
+            *_in_unit(np.reshape(box or picture_box(problem.points2d), (2, 2)), problem.camera).ravel().tolist()
+        )
+    else:
+        frame = picture_box(seen) if photo is None else Box(0, 0, *size_in_camera(photo, problem.camera))
+    if photo is not None:
+        axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
+    size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
+    rim = "black" if photo is None else "white"
+    rims = axes.plot(*seen.T, "o", mfc="none", mec=rim, mew=0.7, ms=size, label="image points", zorder=3)
+    if photo is not None:
+        rims[0].set_path_effects([withStroke(linewidth=1.7, foreground="black")])  # for bright photos and the legend
+    visible = np.isfinite(projected).all(-1)
+    matched, free = visible & ((targets >= 0) | (lines is None)), visible & (targets < 0) & (lines is not None)
+    if matched.any():
+        colour = _colour(problem, estimate)
+        axes.plot(*projected[matched].T, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
+        joined = matched & (targets >= 0)
+        wrong = joined & (problem.match3d != targets) & (problem.match3d >= 0)
+        for some, ink, style in ((joined & ~wrong, colour, "-"), (wrong, LIGHT[3], ":")):
+            if some.any():
+                ends = np.stack([seen[targets[some]], projected[some]], 1)
+                axes.add_collection(LineCollection(list(ends), colors=ink, linestyles=style, linewidths=0.8, zorder=2))
+    if free.any() and photo is None:
+        axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
+    unit = _unit(problem)
+    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal", xlabel=unit, ylabel=unit)
+    axes.tick_params(labelsize=8)
+    return axes
+
+
+def plot_residuals(
+    axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines = "match3d"
+) -> "Axes":  # fmt: skip
+    """A close-up: image point minus reprojected 3D point of each match; arguments as for `plot_image`."""
+    seen, projected, targets = _drawn(problem, estimate, lines)
+    matched = targets >= 0
+    residuals = seen[targets[matched]] - projected[matched]
+    if not np.isfinite(residuals).any():
+        axes.set_axis_off()
+        return axes
+    reach = 1.1 * float(np.nanmax(np.abs(residuals))) or 1.0
+    axes.plot(*residuals.T, ".", color=_colour(problem, estimate), ms=4)
+    axes.axhline(0, color=QUIET, lw=0.5)
+    axes.axvline(0, color=QUIET, lw=0.5)
+    axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
+    axes.set_title(f"residuals, {_unit(problem)}", fontsize=9)
+    axes.tick_params(labelsize=7)
+    return axes
+
+
 def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     """Write a figure whole or not at all. Raises ValueError if the name does not end in .png, .svg or .pdf."""
     path = Path(path)
@@ -125,6 +217,36 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     with written_whole(path) as temporary:
         temporary.write_bytes(content.getvalue())
     return path
+
+
+def estimate_of(problem: ProblemPoints, estimate: str | None) -> str | None:
+    """The estimate, the first by default; None if there is none. Raises ValueError for one that the problem lacks."""
+    if estimate is not None and estimate not in problem.estimates:
+        raise ValueError(f"expected an estimate among {list(problem.estimates)}, got {estimate!r}")
+    return estimate or next(iter(problem.estimates), None)
+
+
+def _drawn(problem: ProblemPoints, estimate: str | None, lines: Lines | None) -> tuple[Array, Array, Array]:
+    """Image points, projected 3D points (n, 2), NaN without a pose, and the image point that each is joined to."""
+    pose = problem.estimates.get(estimate_of(problem, estimate) or "", (np.full((3, 3), np.nan), np.full(3, np.nan)))
+    projected = in_front(np.asarray(problem.points3d, float) @ pose[0].T + pose[1])[:, :2]
+    if lines == "match3d" and (problem.match3d < 0).all():
+        lines = "assigned3d"
+    targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
+    return _in_unit(problem.points2d, problem.camera), _in_unit(projected, problem.camera), targets
+
+
+def _in_unit(points: Array, camera: Camera | None) -> Array:
+    """Normalised coordinates (k, 2) as the axes have them."""
+    return points if camera is None else camera.project(np.column_stack([points, np.ones(len(points))]))
+
+
+def _unit(problem: ProblemPoints) -> str:
+    return "normalised coordinates" if problem.camera is None else "pixels"
+
+
+def _colour(problem: ProblemPoints, estimate: str | None) -> str:
+    return LIGHT[list(problem.estimates).index(estimate_of(problem, estimate) or "") % len(LIGHT)]
 
 
 def _text(name: str) -> str:

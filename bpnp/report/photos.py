@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bpnp.cameras import Camera, Lens
-from bpnp.report.samples import Array, PairView
+from bpnp.report.points import Array, ProblemPoints
 
 MARGIN = 0.15  # of the extent of the image points, around them
 MOST_BYTES = 3_000_000  # of all photos of a page
@@ -52,7 +52,9 @@ class Box(NamedTuple):
     bottom: float
 
 
-PhotoFinder = Callable[[str, Box], Array | None]  # (id of a pair, box) to (h, w, 3) uint8 that fills the box, or None
+PhotoFinder = Callable[
+    [str, Box], Array | None
+]  # (id of a problem, box) to (h, w, 3) uint8 that fills the box, or None
 
 
 def picture_box(points2d: Array) -> Box:
@@ -65,9 +67,9 @@ def picture_box(points2d: Array) -> Box:
     return Box(*(low - margin).tolist(), *(high + margin).tolist())
 
 
-def box_of(view: PairView) -> Box:
-    """The `picture_box` of a pair."""
-    return picture_box(view.points2d)
+def box_of(problem: ProblemPoints) -> Box:
+    """The `picture_box` of a problem."""
+    return picture_box(problem.points2d)
 
 
 def jpeg(photo: Array, *, quality: int = 70) -> bytes:
@@ -79,24 +81,26 @@ def jpeg(photo: Array, *, quality: int = 70) -> bytes:
     return content.getvalue()
 
 
-def page_photos(runs: Mapping[str, Sequence[PairView]], photo: PhotoFinder | None) -> dict[str, dict[str, object]]:
-    """By pair, a plotly layout image that fills its box, the worst pairs first while there is room."""
+def page_photos(runs: Mapping[str, Sequence[ProblemPoints]], photo: PhotoFinder | None) -> dict[str, dict[str, object]]:
+    """By problem, a plotly layout image that fills its box, the worst problems first while there is room."""
     if photo is None:
         return {}
-    views = sorted((view for views in runs.values() for view in views), key=lambda view: -view.error)
-    found: dict[str, dict[str, object]] = {}
+    worst_first = sorted(
+        (problem for problems in runs.values() for problem in problems), key=lambda problem: -problem.error
+    )
+    images: dict[str, dict[str, object]] = {}
     left = MOST_BYTES
-    for view in {view.id: view for view in views}.values():
-        box = box_of(view)
-        pixels = photo(view.id, box)
+    for problem in {problem.id: problem for problem in worst_first}.values():
+        box = box_of(problem)
+        pixels = photo(problem.id, box)
         if pixels is None:
             continue
         content = base64.b64encode(jpeg(pixels)).decode()
         left -= len(content)
         if left < 0:
             break
-        found[view.id] = {
+        images[problem.id] = {
             "source": f"data:image/jpeg;base64,{content}", "xref": "x", "yref": "y", "sizing": "stretch",
             "layer": "below", "x": box.left, "y": box.top, "sizex": box.right - box.left, "sizey": box.bottom - box.top,
         }  # fmt: skip
-    return found
+    return images

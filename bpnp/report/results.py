@@ -1,16 +1,24 @@
-"""What a test found: one row per pair and estimate, why estimates are wrong, and the aggregates of the rows.
+"""What a test found, in memory and in its folder: a row per problem and estimate, and the aggregates of the rows.
 
-Angles in degrees, lengths in scene units, as in `bpnp.metrics`. `bpnp.report.folder` keeps results on disk.
+`problems.csv` has the rows, `summary.json` the aggregates. Angles in degrees, lengths in scene units, as in
+`bpnp.metrics`. Infinite and undefined numbers are "inf" and "nan" in both files (strings in the JSON, which has no such
+numbers).
 """
 
+import json
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, astuple, dataclass, fields
+from datetime import UTC, datetime
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import torch
 from scipy.spatial import cKDTree
 
+from bpnp import __version__
+from bpnp.files import written_whole
 from bpnp.geometry import project, transform
 from bpnp.metrics import PoseErrors, RecallThresholds, pose_errors, pose_quartiles, pose_recalls
 from bpnp.types import Batch, Pose, Prediction
@@ -18,19 +26,21 @@ from bpnp.types import Batch, Pose, Prediction
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+FORMAT = 2  # 1 had pairs.csv
+ROWS, SUMMARY = "problems.csv", "summary.json"
 PIPELINE = ("ransac", "pnp", "refined")  # estimates are listed in this order, others after them
-SOLVED_DEG = 5.0  # largest rotation error of a solved pair
+SOLVED_DEG = 5.0  # largest rotation error of a solved problem
 PLAUSIBLE_INLIERS = 0.5  # share of the 2D points from which a wrong pose counts as fitting the image
 CAUSES = ("solved", "no pose", "wrong, not converged", "wrong, but fits the image", "wrong")
 
 
 @dataclass(frozen=True)
-class PairRow:
-    """One estimate of one pair.
+class ProblemRow:
+    """One estimate of one problem.
 
-    index, id: the pair in its data set. Errors: see `bpnp.metrics`. inliers: see `count_inliers`. m, n: 2D and 3D
-    points. true_pairs: 3D points with a known match. iterations, residual, converged: the solver's `SolveStats`.
-    found: whether there is a pose. seconds: share of the time that the pair's batch took.
+    index, id: the problem in its data set. Errors: see `bpnp.metrics`. inliers: see `count_inliers`. m, n: 2D and 3D
+    points. matches: 3D points with a known match. iterations, residual, converged: the solver's `SolveStats`. found:
+    whether there is a pose. seconds: share of the time that the problem's batch took.
     """
 
     index: int
@@ -43,7 +53,7 @@ class PairRow:
     inliers: int
     m: int
     n: int
-    true_pairs: int
+    matches: int
     iterations: int
     residual: float
     converged: bool
@@ -70,18 +80,22 @@ class PairRow:
         return "wrong, but fits the image" if self.inliers >= PLAUSIBLE_INLIERS * self.m else "wrong"
 
 
+TYPES: dict[str, Any] = {field.name: field.type for field in fields(ProblemRow)}
+PARSE: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
+
+
 @dataclass(frozen=True)
 class Results:
     """The rows of a test and, by estimate, what `summarise` makes of them; `settings` is what the caller recorded."""
 
-    rows: tuple[PairRow, ...]
+    rows: tuple[ProblemRow, ...]
     estimates: dict[str, dict[str, float]]
     correspondence_loss: float | None
     settings: dict[str, Any]
     bpnp_version: str
     written: str
 
-    def of(self, estimate: str) -> list[PairRow]:
+    def of(self, estimate: str) -> list[ProblemRow]:
         """The rows of one estimate, in the order of the data set."""
         return [row for row in self.rows if row.estimate == estimate]
 
@@ -90,12 +104,12 @@ class Results:
         return _errors(self.of(estimate))
 
     @property
-    def pairs(self) -> int:
-        """Number of pairs."""
+    def problems(self) -> int:
+        """Number of problems."""
         return len({row.index for row in self.rows})
 
     def frame(self) -> "DataFrame":
-        """The rows as a DataFrame for notebooks: the columns of `PairRow`, and "cause".
+        """The rows as a DataFrame for notebooks: the columns of `ProblemRow`, and "cause".
 
         `read_results("runs/quickstart/test").frame().groupby("estimate").rotation_error_deg.median()`
         """
@@ -104,34 +118,37 @@ class Results:
         return DataFrame([asdict(row) | {"cause": row.cause} for row in self.rows])
 
 
-def rows_from(prediction: Prediction, batch: Batch, seconds: float, *, inlier_threshold: float = 0.01) -> list[PairRow]:
-    """One row per pair and estimate. `seconds` is the time of the whole batch; each pair is given an equal share.
+def rows_from(
+    prediction: Prediction, batch: Batch, seconds: float, *, inlier_threshold: float = 0.01
+) -> list[ProblemRow]:
+    """One row per problem and estimate. `seconds` is the time of the whole batch; each problem has an equal share.
 
     `inlier_threshold` in normalised image units, see `count_inliers`. Raises ValueError if the batch has no true pose.
     """
-    true_pairs = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
-    sizes = torch.stack([batch.count2d, batch.count3d, true_pairs], -1).tolist()
-    indices = batch.index.tolist()
+    matches = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
+    sizes = torch.stack([batch.count2d, batch.count3d, matches], -1).tolist()
+    indices, share = batch.index.tolist(), seconds / len(batch)
     rows = []
     for estimate, pose in prediction.poses.items():
-        errors = pose_errors(pose, batch)
+        errors, stats = pose_errors(pose, batch), pose.stats
         columns = (errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg)
-        numbers = torch.stack([*columns, pose.stats.residual.double()], -1).tolist()
-        iterations, converged, found = (v.tolist() for v in (pose.stats.iterations, pose.stats.converged, pose.found))
+        numbers = torch.stack([*columns, stats.residual.double()], -1).tolist()
+        states = zip(stats.iterations.tolist(), stats.converged.tolist(), pose.found.tolist(), strict=True)
         inliers = count_inliers(pose, batch, threshold=inlier_threshold)
-        for i, (m, n, pairs) in enumerate(sizes):
+        for i, (iterations, converged, found) in enumerate(states):
             rotation, translation, centre, reprojection, residual = numbers[i]
+            m, n, known = sizes[i]
             rows.append(
-                PairRow(
+                ProblemRow(
                     indices[i], batch.ids[i], estimate, rotation, translation, centre, reprojection, inliers[i], m, n,
-                    pairs, iterations[i], residual, converged[i], found[i], seconds / len(batch),
+                    known, iterations, residual, converged, found, share,
                 )
             )  # fmt: skip
     return rows
 
 
 def count_inliers(pose: Pose, batch: Batch, *, threshold: float = 0.01) -> list[int]:
-    """2D points of each pair with a projected 3D point nearer than `threshold` (normalised image units).
+    """2D points of each problem with a projected 3D point nearer than `threshold` (normalised image units).
 
     Needs no true match: it is what a user of the pose can check. Points behind the camera do not count; without a pose
     there is no inlier.
@@ -148,26 +165,25 @@ def count_inliers(pose: Pose, batch: Batch, *, threshold: float = 0.01) -> list[
     return counts
 
 
-def cause_shares(rows: Iterable[PairRow]) -> dict[str, float]:
+def cause_shares(rows: Iterable[ProblemRow]) -> dict[str, float]:
     """Share of the rows with each cause, in the order of `CAUSES`; they sum to one.
 
     Raises ValueError if there is no row.
     """
-    found = [row.cause for row in rows]
-    if not found:
+    causes = [row.cause for row in rows]
+    if not causes:
         raise ValueError("expected at least one row, got none")
-    return {cause: found.count(cause) / len(found) for cause in CAUSES}
+    return {cause: causes.count(cause) / len(causes) for cause in CAUSES}
 
 
-def summarise(rows: Sequence[PairRow], *, thresholds: RecallThresholds | None = None) -> dict[str, dict[str, float]]:
-    """By estimate: `quartiles` and `recalls` of its rows, the share that converged and the mean seconds per pair."""
+def summarise(rows: Sequence[ProblemRow], *, thresholds: RecallThresholds | None = None) -> dict[str, dict[str, float]]:
+    """By estimate: quartiles and recalls of its rows, the share that converged and the mean seconds per problem."""
     summary = {}
     for estimate in sorted({row.estimate for row in rows}, key=pipeline_order):
         chosen = [row for row in rows if row.estimate == estimate]
         errors = _errors(chosen)
-        values = {
-            key: float(value) for key, value in (pose_quartiles(errors) | pose_recalls(errors, thresholds)).items()
-        }
+        figures = pose_quartiles(errors) | pose_recalls(errors, thresholds)
+        values = {key: float(value) for key, value in figures.items()}
         values["converged"] = sum(row.converged for row in chosen) / len(chosen)
         values["seconds_mean"] = math.fsum(row.seconds for row in chosen) / len(chosen)
         summary[estimate] = values
@@ -179,7 +195,137 @@ def pipeline_order(estimate: str) -> tuple[int, str]:
     return PIPELINE.index(estimate) if estimate in PIPELINE else len(PIPELINE), estimate
 
 
-def _errors(rows: Iterable[PairRow]) -> PoseErrors:
+def write_results(
+    folder: Path | str,
+    rows: Iterable[ProblemRow],
+    *,
+    correspondence_loss: float | None = None,
+    settings: Mapping[str, Any] | None = None,
+    thresholds: RecallThresholds | None = None,
+) -> Results:
+    """Write `problems.csv` and `summary.json`, each whole or not at all, and return what was written.
+
+    A problem that several processes tested is written once, its first row; rows are sorted by index, so that the files
+    do not depend on the order of batches or processes. `settings` (the command, the configuration) are kept as they
+    are; what JSON cannot hold becomes text. Raises ValueError if there is no row, if an estimate is missing for some
+    problem, or if one index has two ids, as when two data sets are mixed.
+    """
+    from pandas import DataFrame
+
+    ordered = _ordered(rows)
+    results = Results(
+        rows=ordered,
+        estimates=summarise(ordered, thresholds=thresholds),
+        correspondence_loss=correspondence_loss,
+        settings=plain(dict(settings or {})),
+        bpnp_version=__version__,
+        written=datetime.now(UTC).isoformat(timespec="seconds"),
+    )
+    summary = {"format": FORMAT, "problems": results.problems} | vars(results)
+    del summary["rows"]
+    frame = DataFrame(map(astuple, ordered), columns=list(TYPES), dtype=object)
+    # File names that are not UTF-8 reach us, and leave, as surrogates.
+    table = frame.to_csv(index=False, na_rep="nan", lineterminator="\r\n").encode(errors="surrogateescape")
+    folder = Path(folder)
+    # Old aggregates must not stand beside new rows, should the process end between the two files.
+    (folder / SUMMARY).unlink(missing_ok=True)
+    for name, content in (
+        (ROWS, table),
+        (SUMMARY, json.dumps(plain(summary), indent=2, allow_nan=False).encode() + b"\n"),
+    ):
+        with written_whole(folder / name) as temporary:
+            temporary.write_bytes(content)
+    return results
+
+
+def read_results(folder: Path | str) -> Results:
+    """Read what `write_results` wrote. Raises ValueError that names the file: missing, of another format, incomplete,
+    or with a value that is no number."""
+    path = Path(folder) / SUMMARY
+    try:
+        summary = json.loads(_existing(path).read_bytes())
+    except ValueError as error:
+        raise ValueError(f"expected JSON in {path}, got {error}" if path.is_file() else str(error)) from error
+    version = summary.get("format") if isinstance(summary, dict) else None
+    if version != FORMAT:
+        raise ValueError(
+            f"expected results of format {FORMAT} in {path}, got {version!r}; try `bpnp test` again, or the bpnp that "
+            "wrote them"
+        )
+    rows = _read_rows(Path(folder) / ROWS)
+    try:
+        loss, problems = summary["correspondence_loss"], summary["problems"]
+        results = Results(
+            rows=rows,
+            estimates={name: {k: float(v) for k, v in values.items()} for name, values in summary["estimates"].items()},
+            correspondence_loss=None if loss is None else float(loss),
+            settings=summary["settings"],
+            bpnp_version=summary["bpnp_version"],
+            written=summary["written"],
+        )
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"expected what `bpnp test` writes in {path}, got {type(error).__name__}: {error}") from error
+    if len(rows) != problems * len(results.estimates):
+        raise ValueError(
+            f"expected {problems} x {len(results.estimates)} rows in {ROWS}, as {path} says, got {len(rows)}"
+        )
+    return results
+
+
+def plain(value: Any) -> Any:
+    """The same in the types of strict JSON."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if value is None or isinstance(value, (bool, int, str)) or (isinstance(value, float) and math.isfinite(value)):
+        return value
+    return str(value)
+
+
+def _existing(path: Path) -> Path:
+    if not path.is_file():
+        raise ValueError(f"expected a results folder with {path.name}, got no {path}; try `bpnp test` first")
+    return path
+
+
+def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
+    from pandas import read_csv
+
+    _existing(path)
+    try:
+        frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
+        missing = [name for name in TYPES if name not in frame]
+        if missing:
+            raise ValueError(f"no column {missing[0]!r} among {', '.join(frame)}")
+        if frame.isna().any(axis=None):
+            raise ValueError(f"too few columns in row {int(frame.isna().any(axis=1).argmax()) + 1}")
+        columns = [[PARSE[kind](text) for text in frame[name]] for name, kind in TYPES.items()]
+    except (ValueError, KeyError) as error:
+        raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
+    if frame.empty:
+        raise ValueError(f"expected at least one row in {path}, got none")
+    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
+
+
+def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
+    ids: dict[int, str] = {}
+    first: dict[tuple[int, str], ProblemRow] = {}
+    for row in rows:
+        if ids.setdefault(row.index, row.id) != row.id:
+            raise ValueError(
+                f"expected one id for index {row.index}, got {ids[row.index]!r}, {row.id!r}; try a folder per data set"
+            )
+        first.setdefault((row.index, row.estimate), row)
+    counts = Counter(row.estimate for row in first.values())
+    if not counts:
+        raise ValueError("expected at least one row, got none; try a test set with a problem in it")
+    if len(first) != len(ids) * len(counts):
+        raise ValueError(f"expected each estimate for all {len(ids)} problems, got {dict(counts)}")
+    return tuple(sorted(first.values(), key=lambda row: (row.index, pipeline_order(row.estimate))))
+
+
+def _errors(rows: Iterable[ProblemRow]) -> PoseErrors:
     columns = [
         (row.rotation_error_deg, row.translation_error, row.centre_error, row.reprojection_error_deg) for row in rows
     ]

@@ -1,25 +1,32 @@
-"""Several runs: names, figures as a DataFrame, and mean and spread of those that differ by their seeds only."""
+"""Several runs: their names, their figures as a DataFrame, how each is drawn, and their training curves."""
 
 import math
 import os
-import re
-import statistics
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from bpnp.report.folder import read_results
+import numpy as np
+
 from bpnp.report.palette import styles
-from bpnp.report.results import Results
+from bpnp.report.results import SUMMARY, Results, read_results
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from pandas import DataFrame, Series
 
-SEEDS = frozenset({"seed", "training_seed"})
-PLACES = frozenset({"checkpoint", "complete"})  # settings that need not be equal
-SPREAD = "  standard deviation"  # of a sample, n - 1; what a table calls its row
-
-Values = Mapping[str, float]
+LOGS = ("logs", "lightning_logs")  # folders of Lightning's CSVLogger
+LOSS = "train/loss"
+CURVES = (
+    LOSS,
+    "train/correspondence_loss",
+    "train/pose_loss",
+    "val/correspondence_loss",
+    "val/rotation_q2_deg",
+    "val/recall_joint_15deg_0.5",
+)
+SWITCH_MARKS = ("train/pose_loss", "train/without_pose")  # logged from the first step with a pose loss on
+MOST_POINTS = 500  # of a curve
 
 
 def read_runs(paths: Sequence[Path | str]) -> dict[str, Results]:
@@ -42,7 +49,7 @@ def table(runs: Sequence[Path | str] | Mapping[str, Results]) -> "DataFrame":
     )
 
 
-class Series(NamedTuple):
+class Line(NamedTuple):
     """An estimate of a run as tables and figures show it. colour, dashes: indices of the palette."""
 
     run: str
@@ -52,15 +59,10 @@ class Series(NamedTuple):
     dashes: int
 
 
-def series_of(runs: Mapping[str, Results]) -> list[Series]:
+def lines_of(runs: Mapping[str, Results]) -> list[Line]:
     """Every estimate of every run, with the run's name only where there are several."""
     shapes = styles({run: list(results.estimates) for run, results in runs.items()})
-    return [Series(*key, key[1] if len(runs) == 1 else ": ".join(key), *shape) for key, shape in shapes.items()]
-
-
-def trained_only(paths: Sequence[Path | str]) -> bool:
-    """Whether these are folders of trainings of which none has results yet."""
-    return bool(paths) and not any(path.is_file() for place in paths for path in Path(place).rglob("summary.json"))
+    return [Line(*key, key[1] if len(runs) == 1 else ": ".join(key), *shape) for key, shape in shapes.items()]
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
@@ -71,87 +73,101 @@ def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
     """
     if not paths:
         raise ValueError("expected at least one results folder, got none; try the folder that `bpnp test` wrote")
-    folders = [Path(path).absolute() for path in paths]
-    folders = [place for path in folders for place in _results_in(path)]
+    folders = [place for path in paths for place in _results_in(Path(path).absolute())]
     if len(folders) == 1:
         (folder,) = folders
         return {(folder.parent if folder.name == "test" else folder).name: folder}
     shared = os.path.commonpath([path.parent for path in folders])
     parts = [Path(os.path.relpath(path, shared)).parts for path in folders]
-    while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({own[-1] for own in parts}) == 1:
-        parts = [own[:-1] for own in parts]
-    return {os.path.join(*own): path for own, path in zip(parts, folders, strict=True)}
+    while len(set(parts)) > 1 and min(map(len, parts)) > 1 and len({path[-1] for path in parts}) == 1:
+        parts = [path[:-1] for path in parts]
+    return {os.path.join(*path): folder for path, folder in zip(parts, folders, strict=True)}
 
 
 def _results_in(folder: Path) -> list[Path]:
     for place in (folder, folder / "test"):
-        if (place / "summary.json").is_file():
+        if (place / SUMMARY).is_file():
             return [place]
-    return sorted(path.parent for path in folder.rglob("summary.json")) or [folder]
+    return sorted(path.parent for path in folder.rglob(SUMMARY)) or [folder]
 
 
-def seed_groups(runs: Mapping[str, Results]) -> dict[str, tuple[str, ...]]:
-    """The runs of each group of two or more by the group's name, such as "psb, mean of 3 seeds".
+@dataclass(frozen=True)
+class TrainingLog:
+    """Curves by name, each as (steps, values) of at most `MOST_POINTS` points.
 
-    Runs of a group have the same estimates and the same settings but for their seeds: all settings named "seed", of the
-    data say, and "training_seed", that of the checkpoint's training. Runs of which two have the same seeds, or one has
-    seeds that are not known, are no group: they differ by something else.
+    switch_step: the first logged step with the pose loss, None if it never joined. files: where the curves come from.
     """
-    alike: dict[str, dict[str, tuple[Any, ...]]] = {}
-    for name, results in runs.items():
-        seeds: list[Any] = []
-        settings = _without_seeds(results.settings, seeds)
-        known = [seed is not None for seed in seeds]
-        if any(known):
-            trained = results.settings.get("checkpoint") is not None
-            alike.setdefault(repr((settings, known, trained, sorted(results.estimates))), {})[name] = tuple(seeds)
-    groups = [tuple(own) for own in alike.values() if len(own) > 1 and len(set(own.values())) == len(own)]
-    return {f"{shared_name(group)}, mean of {len(group)} seeds": group for group in groups}
+
+    curves: dict[str, tuple[list[float], list[float]]]
+    switch_step: int | None
+    files: tuple[Path, ...]
 
 
-def with_spread(
-    rows: Mapping[tuple[str, str], Values], groups: Mapping[str, Sequence[str]]
-) -> list[tuple[str, Values]]:
-    """For each estimate of each group two rows (label, values) of a table: the mean, and the standard deviation.
+def trained_only(paths: Sequence[Path | str]) -> dict[str, TrainingLog]:
+    """The logs of trainings by the names of `named_runs`, if none of the folders has results yet; else none."""
+    folders = named_runs(paths)
+    if any((folder / SUMMARY).is_file() for folder in folders.values()):
+        return {}
+    logs = {name: read_training_log(folder) for name, folder in folders.items()}
+    return {name: log for name, log in logs.items() if log is not None}
 
-    rows: the values of each run and estimate.
+
+def read_training_log(results: Path | str) -> TrainingLog | None:
+    """The log of the run that a results folder belongs to: in `logs` or `lightning_logs` of it or of its parent.
+
+    Of several versions the newest that trained counts, with those before it that it continues (a resumed run); of a
+    training too short to log its loss, what was validated. None if nothing was trained. Raises ValueError that names
+    the file if a value is no number.
     """
-    found: list[tuple[str, Values]] = []
-    for name, runs in groups.items():
-        for estimate in (estimate for run, estimate in rows if run == runs[0]):
-            mean, spread = mean_and_spread([rows[run, estimate] for run in runs])
-            found += [(f"{name}: {estimate}", mean), (SPREAD, spread)]
-    return found
+    folder = Path(results).absolute()
+    for place in (folder, folder.parent):
+        files = [file for name in LOGS for file in (place / name).glob("version_*/metrics.csv")]
+        logs = [(file, _read_log(file)) for file in sorted(files, key=_version)]
+        trained = [log for log in logs if LOSS in log[1]] or [log for log in logs if _steps(log[1])]
+        if trained:
+            return _joined(trained)
+    return None
 
 
-def mean_and_spread(runs: Sequence[Values]) -> tuple[Values, Values]:
-    """Mean and standard deviation over runs of each value that the first has; NaN where one is not finite, or alone.
+def _read_log(file: Path) -> "DataFrame":
+    """The curves, a row per step."""
+    from pandas import read_csv
 
-    >>> mean_and_spread([{"found": 0.5}, {"found": 1.0}])
-    ({'found': 0.75}, {'found': 0.3535533905932738})
-    """
-    columns = {key: [run.get(key, math.nan) for run in runs] for key in runs[0]}
-    mean = {key: sum(values) / len(values) for key, values in columns.items()}
-    spread = {
-        key: statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else math.nan
-        for key, values in columns.items()
-    }
-    return mean, spread
+    try:
+        log = read_csv(file, index_col="step", usecols=lambda name: name in {"step", *CURVES, *SWITCH_MARKS})
+        return log.astype(float).groupby(log.index.astype(int)).last().dropna(axis=1, how="all")
+    except ValueError as error:
+        raise ValueError(f"expected numbers in {file}, and a column 'step', got {error}") from error
 
 
-def shared_name(names: Sequence[str]) -> str:
-    """What the names of runs begin with, without the word seed at its end; "runs" if they begin with nothing.
-
-    >>> shared_name(["psb-seed0", "psb-seed12"])
-    'psb'
-    """
-    return re.sub(r"[^A-Za-z0-9]*(seed)?[^A-Za-z0-9]*$", "", os.path.commonprefix(list(names))) or "runs"
+def _steps(log: "DataFrame") -> list[int]:
+    """The steps that were trained, as far as they were logged; untrained weights are at step 0."""
+    logged = log[LOSS].dropna().index if LOSS in log else log.index[log.index > 0]
+    return [int(step) for step in logged]
 
 
-def _without_seeds(settings: Any, seeds: list[Any]) -> Any:
-    """The settings without seeds and places; the seeds are added to the list."""
-    if not isinstance(settings, Mapping):
-        return settings
-    seeds += [settings[key] for key in sorted(SEEDS & settings.keys())]
-    kept = sorted(settings.keys() - SEEDS - PLACES)
-    return [(key, _without_seeds(settings[key], seeds)) for key in kept]
+def _joined(logs: "list[tuple[Path, DataFrame]]") -> TrainingLog:
+    """The newest log, and of older ones that started before it the steps up to its start."""
+    file, log = logs[-1]
+    files = [file]
+    for file, older in reversed(logs[:-1]):
+        start = _steps(log)[0]
+        if _steps(older)[0] < start:
+            files.insert(0, file)
+            log = log.combine_first(older[older.index < start])
+    marks = [log[name].dropna().index[0] for name in SWITCH_MARKS if name in log]
+    curves = {name: _thinned(log[name].dropna()) for name in CURVES if name in log}
+    return TrainingLog(curves, min(map(int, marks), default=None), tuple(files))
+
+
+def _thinned(curve: "Series[float]") -> tuple[list[float], list[float]]:
+    """Steps and values in order; of long curves the means of equal parts."""
+    points = np.column_stack([curve.index, curve])
+    size = math.ceil(len(points) / MOST_POINTS)
+    steps, values = np.transpose([part.mean(0) for part in np.split(points, range(size, len(points), size))]).tolist()
+    return steps, values
+
+
+def _version(path: Path) -> tuple[float, str]:
+    number = path.parent.name.removeprefix("version_")
+    return float(number if number.isdigit() else "inf"), str(path)

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, Lens, camera_from
 from bpnp.files import written_whole
+from bpnp.report.figures import plot_image, plot_residuals
 from bpnp.report.palette import VERDICTS
 from bpnp.report.photos import Box
-from bpnp.report.pictures import plot_image, plot_residuals
-from bpnp.report.samples import PairView
+from bpnp.report.points import ProblemPoints
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -26,7 +26,7 @@ WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches
 NOMINAL_FOCAL = 1000.0  # pixels, of a solution without a camera
 
 
-def solution_view(solution: "Solution", *, title: str | None = None) -> PairView:
+def solution_points(solution: "Solution", *, title: str | None = None) -> ProblemPoints:
     """The points of a solution, ready to draw; its id is the title, the verdict with its figures, and the reason.
 
     Raises ValueError if a match has no point.
@@ -44,7 +44,7 @@ def solution_view(solution: "Solution", *, title: str | None = None) -> PairView
             raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
         assigned[matches[:, 1]] = matches[:, 0]
     lines = [*([] if title is None else [title]), f"{solution.verdict}: {shown}", textwrap.fill(solution.reason, LINE)]
-    return PairView(
+    return ProblemPoints(
         0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
         estimates={"solution": (solution.rotation, solution.translation)}, camera=solution.camera,
     )  # fmt: skip
@@ -56,15 +56,15 @@ def solution_picture(
     """The image of a solution and a close-up of its residuals; photo, box: see `bpnp.report.plot_image`."""
     from matplotlib.figure import Figure
 
-    view = solution_view(solution, title=title)
+    drawn = solution_points(solution, title=title)
     figure = Figure(layout="constrained")
     axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
-    plot_image(axes, view, photo=photo, box=box)
-    plot_residuals(close, view)
+    plot_image(axes, drawn, photo=photo, box=box)
+    plot_residuals(close, drawn)
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     height = float(np.clip(WIDTH * (bottom - top) / (right - left), 3, 10))
     figure.set_size_inches(WIDTH + CLOSE_UP, height + CAPTIONS)
-    figure.suptitle(view.id.replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
+    figure.suptitle(drawn.id.replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
 

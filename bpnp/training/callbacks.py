@@ -22,8 +22,8 @@ from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import read_checkpoint
 from bpnp.report.dashboards import image
-from bpnp.report.figures import plot_pair, save_figure
-from bpnp.report.samples import PairView, views_from
+from bpnp.report.figures import plot_problem, save_figure
+from bpnp.report.points import ProblemPoints, points_from
 from bpnp.types import Batch, Prediction
 
 
@@ -179,7 +179,7 @@ class TrainingMonitor(Callback):
                 "model.learning_rate, a warm-up, or `centre` of the solver's features"
             )
         if self.every and trainer.current_epoch % self.every == 0 and trainer.is_global_zero:
-            _draw(trainer, views_from(prediction, batch))
+            _draw(trainer, points_from(prediction, batch))
 
 
 def first_problems(batch: Batch, count: int) -> Batch:
@@ -212,14 +212,15 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
     return values
 
 
-def _draw(trainer: Trainer, views: list[PairView]) -> None:
+def _draw(trainer: Trainer, problems: list[ProblemPoints]) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
-            logger.log_image("val/pairs", [image(plot_pair(view), caption=view.id) for view in views])
+            pictures = [image(plot_problem(problem), caption=problem.id) for problem in problems]
+            logger.log_image("val/problems", pictures)
         elif isinstance(logger, TensorBoardLogger):
-            for number, view in enumerate(views):
-                logger.experiment.add_figure(f"val/pair{number}", plot_pair(view), trainer.global_step)
+            for number, problem in enumerate(problems):
+                logger.experiment.add_figure(f"val/problem{number}", plot_problem(problem), trainer.global_step)
     if trainer.loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in trainer.loggers):
         folder = os.path.join(trainer.default_root_dir, "pictures", f"epoch_{trainer.current_epoch:04d}")
-        for number, view in enumerate(views):
-            save_figure(plot_pair(view), os.path.join(folder, f"pair{number}.png"))
+        for number, problem in enumerate(problems):
+            save_figure(plot_problem(problem), os.path.join(folder, f"problem{number}.png"))

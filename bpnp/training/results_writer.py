@@ -1,7 +1,7 @@
 """The files that a test leaves."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +11,9 @@ from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
-from bpnp.report import report
-from bpnp.report.folder import write_results
-from bpnp.report.results import PairRow, rows_from
-from bpnp.report.samples import PairView, select_views, thin, views_from, write_views
+from bpnp.report.points import ProblemPoints, points_from, select_points, thin, write_points
+from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
+from bpnp.report.tables import report
 from bpnp.types import Batch
 
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
@@ -22,23 +21,25 @@ NUMBER = "try Batch.from_arrays(..., index=...) with the position of each proble
 
 
 class ResultsWriter(Callback):
-    """Writes `pairs.csv`, `summary.json`, the points of some problems and a few points of every problem after a test.
+    """Writes `problems.csv`, `summary.json`, the points of some problems and a few points of every one after a test.
 
     Args:
         folder: where; null for `test` in the trainer's default_root_dir.
     """
 
-    rows: list[PairRow]
+    rows: list[ProblemRow]
     losses: dict[int, float]
-    chosen: Sequence[PairView]
-    views: list[PairView]
+    chosen: Sequence[ProblemPoints]
+    points: list[ProblemPoints]
     numbers: set[int]  # of the problems so far
+
+    settings: Mapping[str, Any] | None = None  # what is recorded in place of the command line's; no table is printed
 
     def __init__(self, folder: str | None = None) -> None:
         self.folder = folder
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.rows, self.losses, self.chosen, self.views, self.numbers = [], {}, (), [], set()
+        self.rows, self.losses, self.chosen, self.points, self.numbers = [], {}, (), [], set()
         self._check_replaced(trainer)
 
     def on_test_batch_end(
@@ -48,14 +49,14 @@ class ResultsWriter(Callback):
             return  # of a task of the user's own
         self._note_numbers(batch)
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
-        views = views_from(outputs["prediction"], batch)
-        self.chosen = select_views([*self.chosen, *views])
-        self.views += map(thin, views)
+        points = points_from(outputs["prediction"], batch)
+        self.chosen = select_points([*self.chosen, *points])
+        self.points += map(thin, points)
         if outputs["losses"] is not None:
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather((self.rows, self.losses, self.chosen, self.views))
+        gathered = _gather((self.rows, self.losses, self.chosen, self.points))
         if any(rows for rows, *_ in gathered):
             self._write_test(trainer, gathered, complete=True)
             return
@@ -65,7 +66,7 @@ class ResultsWriter(Callback):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Of an interrupted test the problems that are finished; of several processes those of the first."""
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
-            self._write_test(trainer, [(self.rows, self.losses, self.chosen, self.views)], complete=False)
+            self._write_test(trainer, [(self.rows, self.losses, self.chosen, self.points)], complete=False)
 
     def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
         if trainer.is_global_zero:
@@ -74,19 +75,19 @@ class ResultsWriter(Callback):
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer)
-            write_results(folder, rows, correspondence_loss=mean, settings=_settings(trainer) | {"complete": complete})
-            chosen = select_views([view for _, _, part, _ in gathered for view in part])
-            write_views(folder, [*chosen, *(view for *_, part in gathered for view in part)])
-            report([folder])
-            rank_zero_info(
-                f"{'' if complete else 'interrupted: '}results of {len({row.index for row in rows})} problems "
-                f"in {folder}"
-            )
+            settings = _settings(trainer) if self.settings is None else self.settings
+            write_results(folder, rows, correspondence_loss=mean, settings={**settings, "complete": complete})
+            chosen = select_points([problem for _, _, part, _ in gathered for problem in part])
+            write_points(folder, [*chosen, *(problem for *_, part in gathered for problem in part)])
+            if self.settings is None:
+                report([folder])
+            count = len({row.index for row in rows})
+            rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {folder}")
 
     def _check_replaced(self, trainer: Trainer) -> None:
         """Raises ValueError if results of a checkpoint would be replaced by those of a test without one."""
-        summary = self._folder(trainer) / "summary.json"
-        if trainer.ckpt_path is None and summary.is_file():
+        summary = self._folder(trainer) / SUMMARY
+        if self.settings is None and trainer.ckpt_path is None and summary.is_file():
             checkpoint = json.loads(summary.read_bytes()).get("settings", {}).get("checkpoint")
             if checkpoint is not None:
                 raise ValueError(
@@ -105,9 +106,9 @@ class ResultsWriter(Callback):
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"
 
 
-def _check_repeated(rows: Sequence[PairRow]) -> None:
+def _check_repeated(rows: Sequence[ProblemRow]) -> None:
     """Among several processes the first problems are repeated to fill the last batch: raises ValueError for others."""
-    first: dict[tuple[int, str], PairRow] = {}
+    first: dict[tuple[int, str], ProblemRow] = {}
     for row in rows:
         other = first.setdefault((row.index, row.estimate), row)
         if (other.id, other.m, other.n) != (row.id, row.m, row.n):

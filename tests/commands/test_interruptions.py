@@ -14,7 +14,7 @@ import bpnp
 from bpnp.cli import main
 from bpnp.models.weights import read_checkpoint
 from bpnp.report import read_results
-from bpnp.report.samples import read_views
+from bpnp.report.points import read_points
 from bpnp.training.callbacks import SafeCheckpointIO
 
 MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
@@ -55,9 +55,9 @@ def test_an_interrupted_training_keeps_its_checkpoint(tmp_path: Path) -> None:
 def test_an_interrupted_test_keeps_its_finished_pairs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     interrupted([*arguments("test", tmp_path), "--data.eval_batch_size=2"])
     results = read_results(tmp_path / "run" / "test")
-    assert results.pairs == 2  # of the first batch; the second ended in the interruption
+    assert results.problems == 2  # of the first batch; the second ended in the interruption
     assert results.settings["complete"] is False
-    assert len(read_views(tmp_path / "run" / "test")) == 2
+    assert len(read_points(tmp_path / "run" / "test")) == 2
     assert "weights of the solver are untrained" in capsys.readouterr().err
 
 

@@ -1,16 +1,15 @@
 """`bpnp report`, `view` and `wandb` on planted results."""
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from matplotlib.image import imread
-from report_data import rows, view, write_run
+from report_data import drawn_problem, rows, write_run
 
 from bpnp.cli import main
-from bpnp.report.samples import thin, write_views
+from bpnp.report.points import thin, write_points
 
 
 def test_commands_write_what_they_say(
@@ -21,7 +20,7 @@ def test_commands_write_what_they_say(
     main(["report", str(tmp_path / "run"), "--html", str(page), "--recall", str(recall)])
     shown = capsys.readouterr().out
     assert [line for line in shown.splitlines() if "wrote" in line] == [f"wrote {page}", f"wrote {recall}"]
-    assert "Pose errors, 12 pairs" in shown
+    assert "Pose errors, 12 problems" in shown
     assert imread(recall).std() > 0.05
     main(["view", str(tmp_path / "run"), "script", "--lines", "assigned"])
     written = Path(capsys.readouterr().out.removeprefix("wrote ").rstrip("\n"))
@@ -48,38 +47,12 @@ def test_a_run_that_was_only_trained_shows_its_curves(
     assert "expected a results folder" in fails("report", str(tmp_path))
 
 
-def test_every_pair_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:
+def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:
     write_run(tmp_path, 9, 0)
     names = {row.index: row.id for row in rows(9, 0)}
-    write_views(tmp_path / "test", [thin(view(i, names[i])) for i in range(9)])
+    write_points(tmp_path / "test", [thin(drawn_problem(i, names[i])) for i in range(9)])
     main(["view", str(tmp_path), "scene/0004", "0007"])
     assert {path.name for path in (tmp_path / "test" / "views").iterdir()} == {"scene_0004.png", "scene_0007.png"}
     assert "got 'scene'; try one of scene/000" in fails("view", str(tmp_path), "scene")
     several = ["view", str(tmp_path), "scene/0004", "0007", "--output", "x.png"]
-    assert "expected one pair with --output, got 2" in fails(*several)
-
-
-def test_the_workspace_of_the_project_is_saved(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """What would be sent: the panels, to an API that is only pretended."""
-    spaces = pytest.importorskip("wandb_workspaces.workspaces", reason="needs wandb-workspaces")
-    monkeypatch.delenv("WANDB_MODE", raising=False)
-    write_run(tmp_path / "run", 9, 0)
-    sent: list[dict[str, object]] = []
-
-    def upsert(workspace: object, *args: object, **kwargs: object) -> object:
-        sent.append(workspace._to_model().model_dump(by_alias=True))  # type: ignore[attr-defined]
-        return workspace
-
-    monkeypatch.setattr(spaces.Workspace, "save", upsert)
-    monkeypatch.setattr(spaces.Workspace, "url", "https://example.org/team/bpnp", raising=False)
-    options = ["--directory", str(tmp_path / "w"), "--project", "paper", "--workspace", "team"]
-    main(["wandb", str(tmp_path / "run"), *options])
-    (saved,) = sent
-    assert (saved["entity"], saved["project"]) == ("team", "paper")
-    shown = json.dumps(saved)
-    for name in ("rotation_q2_deg", "true_match_mass", "gradient_norm", "pairs_per_second", "worst_pairs"):
-        assert name in shown
-    assert "saved https://example.org/team/bpnp" in capsys.readouterr().out
-    assert len(list((tmp_path / "w" / "wandb").glob("offline-run-*"))) == 1
+    assert "expected one problem with --output, got 2" in fails(*several)

@@ -217,7 +217,7 @@ def test_hungarian_pairs_lead_to_the_planted_pose() -> None:
     "path", sorted((Path(__file__).parents[2] / "bpnp" / "configs" / "baselines").glob("*.yaml")), ids=lambda p: p.stem
 )
 def test_every_recipe_names_a_solver_and_its_settings(path: Path) -> None:
-    from bpnp.table.methods import parse_methods
+    from bpnp.training.comparison import parse_methods
 
     (method,) = parse_methods([str(path)])
     if "checkpoint" in method.init_args:

@@ -3,9 +3,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from report_data import HOSTILE, view, write_run
+from report_data import HOSTILE, drawn_problem, write_run
 
-from bpnp.report.figures import plot_pair, recall_curve, save_figure
+from bpnp.report.figures import plot_problem, recall_curve, save_figure
 
 
 def points_of(axes: object, marker: str) -> np.ndarray:
@@ -32,36 +32,36 @@ def test_recall_curves_are_the_shares_of_pairs_within(tmp_path: Path) -> None:
 
 
 def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
-    planted = view(3, "<b>$x_1$</b>")
-    figure = plot_pair(planted)
+    planted = drawn_problem(3, "<b>$x_1$</b>")
+    figure = plot_problem(planted)
     seen, projected = (points_of(figure.axes[1], marker) for marker in ("o", "x"))
     np.testing.assert_allclose(seen, planted.points2d)
     np.testing.assert_allclose(projected, planted.points2d, atol=1e-5)
     top, bottom = figure.axes[1].get_ylim()
     assert top > bottom
     with pytest.raises(ValueError, match=r"expected an estimate among \['ransac', 'pnp'\], got 'best'"):
-        plot_pair(planted, estimate="best")
+        plot_problem(planted, estimate="best")
     assert figure.axes[1].get_title() == "reprojected by ransac"
-    assert plot_pair(planted, estimate="pnp").axes[1].get_title() == "no pose"
+    assert plot_problem(planted, estimate="pnp").axes[1].get_title() == "no pose"
 
 
 def test_wrong_matches_are_dotted_and_unknown_ones_are_not() -> None:
-    planted = view(3, "pair", points=10)
-    (wrong,) = plot_pair(planted, lines="assigned3d").axes[1].collections
+    planted = drawn_problem(3, "problem", 10)
+    (wrong,) = plot_problem(planted, lines="assigned3d").axes[1].collections
     assert len(wrong.get_segments()) == 10
     assert wrong.get_linestyles()[0][1] is not None
     assigned = np.where(np.arange(10) < 4, np.arange(10), -1)
     solved = replace(planted, match3d=np.full(10, -1), assigned3d=assigned)
-    (unknown,) = plot_pair(solved).axes[1].collections
+    (unknown,) = plot_problem(solved).axes[1].collections
     assert len(unknown.get_segments()) == 4
     assert unknown.get_linestyles()[0][1] is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])
 def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
-    path = save_figure(plot_pair(view(0, HOSTILE)), tmp_path / "new" / f"pair{suffix}")
+    path = save_figure(plot_problem(drawn_problem(0, HOSTILE)), tmp_path / "new" / f"pair{suffix}")
     assert [p.name for p in path.parent.iterdir()] == [path.name]
     heads = {".png": b"\x89PNG", ".svg": b"<?xml", ".pdf": b"%PDF"}
     assert path.read_bytes().startswith(heads[suffix])
     with pytest.raises(ValueError, match=r"expected a file name that ends in .png, .svg, .pdf, got 'pair.jpg'"):
-        save_figure(plot_pair(view(0, "")), tmp_path / "pair.jpg")
+        save_figure(plot_problem(drawn_problem(0, "")), tmp_path / "pair.jpg")

@@ -14,7 +14,7 @@ from bpnp.report.page.charts import chart_text, error_chart, page_charts, recall
 from bpnp.report.page.text import headline_html
 from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
 from bpnp.report.results import CAUSES
-from bpnp.report.tables.rows import number
+from bpnp.report.terminal import number
 
 
 class Elements(HTMLParser):
@@ -71,18 +71,18 @@ def test_the_headline_says_what_was_tested(tmp_path: Path) -> None:
     write_results(tmp_path, planted, settings={"data": data, "checkpoint": "best.ckpt"})
     text = headline_html({"run": read_results(tmp_path)})
     low, high = min(row.m for row in planted), max(row.m for row in planted)
-    assert f"20 pairs with {low} to {high} 2D points" in text
+    assert f"20 problems with {low} to {high} 2D points" in text
     assert "data MeshDataModule (root psb, rotation so3), checkpoint best.ckpt" in text
 
 
 def test_charts_without_data_are_left_out(tmp_path: Path) -> None:
     """Pairs of one size, without times and without a training, have nothing to draw in those charts."""
-    planted = [replace(row, m=10, n=12, true_pairs=9, seconds=0.0) for row in rows(30, 0)]
+    planted = [replace(row, m=10, n=12, matches=9, seconds=0.0) for row in rows(30, 0)]
     runs = {"run": write_results(tmp_path, planted)}
     assert list(page_charts(runs, {})) == ["recall"]
     shown = Elements(page_html([tmp_path]))
     assert {a["id"] for tag, a in shown.tags if tag == "section"} == {
-        "quartiles", "versus-section", "recall", "failures", "pairs"}  # fmt: skip
+        "quartiles", "versus-section", "recall", "failures", "problems"}  # fmt: skip
 
 
 def test_charts_are_the_shares_and_medians_of_the_rows(tmp_path: Path) -> None:
@@ -139,6 +139,6 @@ def test_what_cannot_be_read_is_named_and_no_page_is_left(tmp_path: Path) -> Non
         write_page([tmp_path / "run"], output)
     (tmp_path / "run" / "test" / "points.npz").unlink()
     (tmp_path / "run" / "logs" / "version_0" / "metrics.csv").write_text("step,train/loss\n1,much\n")
-    with pytest.raises(ValueError, match=r"expected numbers in .*metrics.csv, line 2"):
+    with pytest.raises(ValueError, match=r"expected numbers in .*metrics.csv, .*could not convert .* 'much'"):
         write_page([tmp_path / "run"], output)
     assert not output.exists()

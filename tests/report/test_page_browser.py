@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from report_data import HOSTILE, rows, view, write_run
+from report_data import HOSTILE, drawn_problem, rows, write_run
 
 from bpnp.report import Results, write_page, write_results
 from bpnp.report.palette import DARK, LIGHT
 from bpnp.report.photos import box_of
-from bpnp.report.samples import thin, write_views
-from bpnp.report.tables.rows import number
+from bpnp.report.points import thin, write_points
+from bpnp.report.terminal import number
 
 pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
 FLAGS = (
@@ -139,26 +139,26 @@ def test_the_worst_pairs_come_first_and_filters_narrow_them(
 ) -> None:
     results = written[1]["first"]
     rotation = column(results, "ransac", "rotation_error_deg")
-    first = floats(texts(page, "#pair-table tbody td:nth-child(2)"))
+    first = floats(texts(page, "#problem-table tbody td:nth-child(2)"))
     assert first == pytest.approx(np.sort(rotation)[::-1][: len(first)].tolist(), rel=0.005)
-    press(page, "#pair-table [data-key='reprojection_error_deg']")
-    press(page, "#pair-table [data-key='reprojection_error_deg']")
+    press(page, "#problem-table [data-key='reprojection_error_deg']")
+    press(page, "#problem-table [data-key='reprojection_error_deg']")
     for _ in range(3):
         press(page, "#more")
     ordered = np.sort(column(results, "ransac", "reprojection_error_deg"))
-    every = floats(texts(page, "#pair-table tbody td:nth-child(5)"))
+    every = floats(texts(page, "#problem-table tbody td:nth-child(5)"))
     assert every == pytest.approx(ordered.tolist(), rel=0.005, nan_ok=True)
     choose(page, "cause", "1")
-    assert set(texts(page, "#pair-table tbody td.words")) == {" no pose"}
+    assert set(texts(page, "#problem-table tbody td.words")) == {" no pose"}
     without = sum(not row.found for row in results.of("ransac"))
-    assert f"{without} of {COUNT} pairs" in texts(page, "#place")[0]
+    assert f"{without} of {COUNT} problems" in texts(page, "#place")[0]
     choose(page, "cause", "")
     choose(page, "least", "12.5")
     choose(page, "status", "1")
     chosen = [r for r in results.of("ransac") if r.rotation_error_deg >= 12.5 and r.found and not r.converged]
-    assert f"{len(chosen)} of {COUNT} pairs" in texts(page, "#place")[0]
+    assert f"{len(chosen)} of {COUNT} problems" in texts(page, "#place")[0]
     opened(browser, page("return location.href"))
-    assert f"{len(chosen)} of {COUNT} pairs" in texts(page, "#place")[0]
+    assert f"{len(chosen)} of {COUNT} problems" in texts(page, "#place")[0]
     assert page("return document.getElementById('least').value") == "12.5"
 
 
@@ -175,21 +175,21 @@ def test_run_against_run_counts_the_better_pairs_and_opens_one(
     points = page("const t = document.getElementById('versus').data[0]; return [t.customdata, t.x, t.y]")
     np.testing.assert_allclose(np.array(points).T[np.argsort(points[0])], np.c_[np.arange(COUNT), a, b], rtol=6e-5)
     page("document.getElementById('versus').emit('plotly_click', {points: [{customdata: 5}]})")
-    assert texts(page, "#pair-title") == ["scene/0005"]
+    assert texts(page, "#problem-title") == ["scene/0005"]
 
 
 def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., Any], written: Any) -> None:
     choose(page, "name", "SCRIPT")
-    press(page, "#pair-table button.link")
-    assert page("return document.getElementById('pair').open")
-    assert texts(page, "#pair-title") == [HOSTILE.replace("\udcff", "?")]
+    press(page, "#problem-table button.link")
+    assert page("return document.getElementById('problem').open")
+    assert texts(page, "#problem-title") == [HOSTILE.replace("\udcff", "?")]
     assert page("return document.title").startswith("bpnp: ")
     assert texts(page, "b") == []
     rows = [row for results in written[1].values() for row in results.rows if row.index == 0]
-    cells = floats(texts(page, "#pair-numbers tbody td:nth-child(2)"))
+    cells = floats(texts(page, "#problem-numbers tbody td:nth-child(2)"))
     assert cells == pytest.approx([row.rotation_error_deg for row in rows], rel=0.005)
     # The points in space and in the image are the planted ones, and both runs' cameras are there.
-    planted = view(0, HOSTILE)
+    planted = drawn_problem(0, HOSTILE)
     names, image = page(
         "return [document.getElementById('scene').data.map((t) => t.name),"
         "[document.getElementById('image').data[2].x, document.getElementById('image').data[2].y]]"
@@ -200,8 +200,8 @@ def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., An
 
 def test_a_click_on_a_point_picks_it_in_both_views(page: Callable[..., Any]) -> None:
     choose(page, "name", "SCRIPT")
-    press(page, "#pair-table button.link")
-    planted = view(0, HOSTILE)
+    press(page, "#problem-table button.link")
+    planted = drawn_problem(0, HOSTILE)
     click = "document.getElementById(arguments[0]).emit('plotly_click', {points: [{curveNumber: arguments[1],"
     click += "pointNumber: 7}]})"
     marked = "return [document.getElementById('image').data[4].x, document.getElementById('scene').data[1].x.length]"
@@ -221,18 +221,20 @@ def test_all_pairs_open_and_photos_lie_under_the_points(browser: Any, tmp_path: 
     planted = rows(30, 0, ("ransac", "pnp", "refined"))
     write_results(tmp_path / "test", planted)
     names = {row.index: row.id for row in planted}
-    views = [
-        replace(view(i, names[i]), estimates=dict.fromkeys(("ransac", "pnp", "refined"), view(i, "").pose))
+    problems = [
+        replace(
+            drawn_problem(i, names[i]), estimates=dict.fromkeys(("ransac", "pnp", "refined"), drawn_problem(i, "").pose)
+        )
         for i in range(30)
     ]
-    write_views(tmp_path / "test", [views[3], *map(thin, views)])
+    write_points(tmp_path / "test", [problems[3], *map(thin, problems)])
     red = np.broadcast_to(np.array([255, 0, 0], np.uint8), (30, 40, 3))
     page = write_page([tmp_path], tmp_path / "r.html", photo=lambda id, box: red if id == names[3] else None)
     for index, points, few in ((3, "30 image points", False), (11, "24 image points", True)):
         opened(browser, f"{page.as_uri()}#open={names[index].replace('/', '%2F')}")
         assert points in browser.find_element("id", "image-text").text
         assert browser.find_element("css selector", "#lines [value=assigned]").get_property("disabled") == few
-        assert len(browser.find_elements("css selector", "#pair-numbers tbody tr .swatch")) == 3
+        assert len(browser.find_elements("css selector", "#problem-numbers tbody tr .swatch")) == 3
         options = [option.text for option in browser.find_elements("css selector", "#pose option")]
         assert options == ["true pose", "ransac", "pnp", "refined"]
         assert "× 0 of" not in browser.find_element("id", "image-text").text
@@ -240,29 +242,29 @@ def test_all_pairs_open_and_photos_lie_under_the_points(browser: Any, tmp_path: 
         assert len(images) == (not few)
         assert browser.find_element("id", "photo").is_displayed() != few
         if images:
-            box = box_of(views[3])
+            box = box_of(problems[3])
             assert [images[0][key] for key in ("x", "y")] == pytest.approx([box.left, box.top])
     choose(browser.execute_script, "drawn", "true")
-    assert "30 of 30 pairs" in texts(browser.execute_script, "#place")[0]
+    assert "30 of 30 problems" in texts(browser.execute_script, "#place")[0]
     assert severe(browser) == []
 
 
 def test_a_pair_opens_from_the_keyboard_and_arrows_go_through_the_list(browser: Any, page: Callable[..., Any]) -> None:
     from selenium.webdriver.common.keys import Keys
 
-    button = browser.find_element("css selector", "#pair-table tbody tr:nth-child(3) button")
+    button = browser.find_element("css selector", "#problem-table tbody tr:nth-child(3) button")
     name = button.text.removeprefix("◉ ")
-    names = [text.removeprefix("◉ ") for text in texts(page, "#pair-table tbody th")]
+    names = [text.removeprefix("◉ ") for text in texts(page, "#problem-table tbody th")]
     button.send_keys(Keys.ENTER)
-    assert texts(page, "#pair-title") == [name]
+    assert texts(page, "#problem-title") == [name]
     for key, place in ((Keys.ARROW_RIGHT, 3), (Keys.ARROW_LEFT, 2), (Keys.ARROW_LEFT, 1)):
         browser.switch_to.active_element.send_keys(key)
-        assert texts(page, "#pair-title") == [names[place]]
+        assert texts(page, "#problem-title") == [names[place]]
     browser.switch_to.active_element.send_keys(Keys.ESCAPE)
     browser.execute_async_script("setTimeout(arguments[0], 100)")
-    assert not page("return document.getElementById('pair').open || location.hash.includes('open=')")
+    assert not page("return document.getElementById('problem').open || location.hash.includes('open=')")
     opened(browser, page("return location.href.split('#')[0]") + "#open=scene%2F0042")
-    assert texts(page, "#pair-title") == ["scene/0042"]
+    assert texts(page, "#problem-title") == ["scene/0042"]
 
 
 def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_path: Path) -> None:
@@ -273,7 +275,7 @@ def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_p
     browser.execute_script("dispatchEvent(new Event('beforeprint'))")
     browser.execute_async_script("setTimeout(arguments[0], 500)")
     assert len(browser.find_elements("css selector", "#training .js-plotly-plot")) == 2
-    assert not browser.find_element("id", "pairs").is_displayed()
+    assert not browser.find_element("id", "problems").is_displayed()
     assert severe(browser) == []
 
 
@@ -295,7 +297,7 @@ def test_nothing_sticks_out_sideways(browser: Any, page: Callable[..., Any], wid
     try:
         opened(browser, page("return location.href.split('#')[0]"))
         page("dispatchEvent(new Event('beforeprint'))")
-        press(page, "#pair-table button.link")
+        press(page, "#problem-table button.link")
         browser.execute_async_script("setTimeout(arguments[0], 500)")
         assert page("return document.documentElement.scrollWidth") == width
         wide = "return [...document.querySelectorAll('.js-plotly-plot .main-svg')].map((e) => [e.clientWidth, "

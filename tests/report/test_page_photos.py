@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from PIL import Image
 from planted_model import HEIGHT, WIDTH, plant_model
-from report_data import inflated, view, write_run
+from report_data import drawn_problem, inflated, write_run
 
 from bpnp.cli import main
 from bpnp.datamodules.colmap.scenes import photo_finder
-from bpnp.report import plot_pair, write_page
+from bpnp.report import plot_problem, write_page
 from bpnp.report.photos import Box, box_of
-from bpnp.report.samples import write_views
+from bpnp.report.points import write_points
 
 
 def photographed(folder: Path, shrink: int = 1) -> Any:
@@ -60,8 +60,8 @@ def test_the_photo_lies_under_the_normalised_points(tmp_path: Path, shrink: int)
 def test_the_page_and_the_figure_carry_the_photo(tmp_path: Path) -> None:
     photographed(tmp_path / "scenes")
     write_run(tmp_path / "run", 9, 0)
-    own = view(0, "castle/photo 0.jpg")
-    write_views(tmp_path / "run" / "test", [own, view(1, "castle/none.jpg")])
+    own = drawn_problem(0, "castle/photo 0.jpg")
+    write_points(tmp_path / "run" / "test", [own, drawn_problem(1, "castle/none.jpg")])
     plain = write_page([tmp_path / "run"], tmp_path / "plain.html").stat().st_size
     scenes = str(tmp_path / "scenes")
     main(["report", str(tmp_path / "run"), "--html", str(tmp_path / "r.html"), "--photos", scenes])
@@ -69,7 +69,7 @@ def test_the_page_and_the_figure_carry_the_photo(tmp_path: Path) -> None:
     data = json.loads(inflated(text.split('id="data">')[1].split("<")[0]))
     assert list(data["photos"]) == [own.id]
     assert len(text) > plain + 3000
-    figure = plot_pair(own, photo=np.zeros((4, 4, 3), np.uint8))
+    figure = plot_problem(own, photo=np.zeros((4, 4, 3), np.uint8))
     (shown,) = figure.axes[1].images
     box = box_of(own)
     assert shown.get_extent() == [box.left, box.right, box.bottom, box.top]

@@ -14,14 +14,13 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import PoseErrors, RecallThresholds
 from bpnp.report import (
-    PairRow,
+    ProblemRow,
     count_inliers,
     read_results,
     rows_from,
     summarise,
     write_results,
 )
-from bpnp.report.folder import append_rows, finished_rows
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 HOSTILE = [
@@ -50,8 +49,12 @@ def test_rows_of_a_planted_batch() -> None:
     refined.rotation[1] = math.nan
     rows = rows_from(Prediction(poses={"pnp": pose_of(batch), "refined": refined}), batch, 3.0)
     assert [(r.index, r.id, r.estimate) for r in rows] == [
-        (0, "pair 0", "pnp"), (1, "pair 1", "pnp"), (0, "pair 0", "refined"), (1, "pair 1", "refined")]  # fmt: skip
-    assert [(r.m, r.n, r.true_pairs, r.inliers, r.seconds) for r in rows[:2]] == [(6, 6, 5, 5, 1.5), (4, 4, 3, 3, 1.5)]
+        (0, "problem 0", "pnp"),
+        (1, "problem 1", "pnp"),
+        (0, "problem 0", "refined"),
+        (1, "problem 1", "refined"),
+    ]
+    assert [(r.m, r.n, r.matches, r.inliers, r.seconds) for r in rows[:2]] == [(6, 6, 5, 5, 1.5), (4, 4, 3, 3, 1.5)]
     assert [(r.iterations, r.residual, r.converged) for r in rows[:2]] == [
         (5, pytest.approx(1e-9), True),
         (9, 0.5, False),
@@ -95,13 +98,13 @@ def test_what_is_written_is_what_is_read(tmp_path: Path) -> None:
     assert again.correspondence_loss == -0.25
     assert again.settings == settings | {"limit": "inf", "path": "a/b"}
     assert again.estimates["pnp"]["found"] == pytest.approx(8 / 9)
-    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["pairs.csv", "summary.json"]
+    assert sorted(path.name for path in (tmp_path / "new" / "run").iterdir()) == ["problems.csv", "summary.json"]
 
 
 def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
     rows = [row(0, id=HOSTILE[0]), row(1, translation_error=math.inf, reprojection_error_deg=math.nan)]
     write_results(tmp_path, rows)
-    with (tmp_path / "pairs.csv").open(newline="", encoding="utf-8") as file:
+    with (tmp_path / "problems.csv").open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))
     assert table[0]["id"] == HOSTILE[0]
     assert float(table[0]["rotation_error_deg"]) == rows[0].rotation_error_deg
@@ -111,19 +114,19 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
         raise AssertionError(constant)
 
     summary = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
-    assert (summary["format"], summary["pairs"], summary["correspondence_loss"]) == (1, 2, None)
+    assert (summary["format"], summary["problems"], summary["correspondence_loss"]) == (2, 2, None)
     assert summary["estimates"]["pnp"]["translation_q3"] == "inf"
     assert summary["estimates"]["pnp"]["without_true_pairs"] == 1
     assert read_results(tmp_path).estimates["pnp"]["translation_q3"] == math.inf
 
 
-def test_the_files_do_not_depend_on_the_order_of_rows_and_count_a_repeated_pair_once(tmp_path: Path) -> None:
+def test_the_files_do_not_depend_on_the_order_of_rows_and_count_a_repeated_problem_once(tmp_path: Path) -> None:
     rows = [row(i, estimate) for i in range(20) for estimate in ("refined", "own", "ransac", "pnp")]
     write_results(tmp_path / "a", rows)
     shuffled = rows + rows[:12]
     random.Random(0).shuffle(shuffled)
     write_results(tmp_path / "b", shuffled)
-    assert (tmp_path / "a" / "pairs.csv").read_bytes() == (tmp_path / "b" / "pairs.csv").read_bytes()
+    assert (tmp_path / "a" / "problems.csv").read_bytes() == (tmp_path / "b" / "problems.csv").read_bytes()
     summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
     assert [summary.pop("written") != "" for summary in summaries] == [True, True]
     assert summaries[0] == summaries[1]
@@ -153,41 +156,20 @@ def test_a_failed_write_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr("bpnp.files.os.replace", fail)
     with pytest.raises(OSError, match="disk full"):
         write_results(tmp_path, [row(0), row(1)])
-    assert [path.name for path in tmp_path.iterdir()] == ["pairs.csv"]
+    assert [path.name for path in tmp_path.iterdir()] == ["problems.csv"]
     with pytest.raises(ValueError, match=r"expected a results folder with summary\.json, got no .*summary\.json"):
         read_results(tmp_path)
-
-
-def test_finished_pairs_are_on_the_disk_before_the_test_ends(tmp_path: Path) -> None:
-    rows = [row(i, estimate, id=HOSTILE[i]) for i in range(3) for estimate in ("ransac", "pnp")]
-    append_rows(tmp_path / "run", rows[:2])
-    append_rows(tmp_path / "run", rows[2:])
-    assert finished_rows(tmp_path / "run") == rows
-    path = tmp_path / "run" / "unfinished.csv"
-    path.write_bytes(path.read_bytes()[:-9])  # killed while it wrote
-    assert finished_rows(tmp_path / "run") == rows[:-1]
-    append_rows(tmp_path / "run", rows[-1:])
-    assert finished_rows(tmp_path / "run") == rows
-    write_results(tmp_path / "run", finished_rows(tmp_path / "run"))
-    assert sorted(path.name for path in (tmp_path / "run").iterdir()) == ["pairs.csv", "summary.json"]
-    assert finished_rows(tmp_path / "run") == list(read_results(tmp_path / "run").rows)
-
-
-def test_a_full_disk_names_the_file_of_the_finished_pairs(tmp_path: Path) -> None:
-    (tmp_path / "unfinished.csv").symlink_to("/dev/full")
-    with pytest.raises(OSError, match=r"No space left on device: '.*unfinished\.csv'"):
-        append_rows(tmp_path, [row(0)])
 
 
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
         ([], "expected at least one row, got none"),
-        ([row(0), row(0, "ransac", id="other")], "expected one id for index 0, got 'pair 0', 'other'"),
-        ([row(0), row(1), row(1, "ransac")], "expected each estimate for all 2 pairs, got"),
+        ([row(0), row(0, "ransac", id="other")], "expected one id for index 0, got 'problem 0', 'other'"),
+        ([row(0), row(1), row(1, "ransac")], "expected each estimate for all 2 problems, got"),
     ],
 )
-def test_rows_that_cannot_be_a_test_are_refused(tmp_path: Path, rows: list[PairRow], message: str) -> None:
+def test_rows_that_cannot_be_a_test_are_refused(tmp_path: Path, rows: list[ProblemRow], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         write_results(tmp_path, rows)
     assert list(tmp_path.iterdir()) == []
@@ -205,20 +187,22 @@ def _edit(name: str, old: str, new: str) -> Callable[[Path], object]:
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
-        (lambda folder: (folder / "pairs.csv").unlink(), r"expected a results folder with pairs\.csv, got no"),
-        (_edit("summary.json", '"format": 1', '"format": 2'), "expected results of format 1 in .*, got 2"),
-        (_edit("summary.json", '"pairs": 3', '"pairs": 4'), "expected 4 x 1 rows in pairs.csv"),
+        (lambda folder: (folder / "problems.csv").unlink(), r"expected a results folder with problems\.csv, got no"),
+        (_edit("summary.json", '"format": 2', '"format": 1'), "expected results of format 2 in .*, got 1"),
+        (_edit("summary.json", '"problems": 3', '"problems": 4'), "expected 4 x 1 rows in problems.csv"),
         (_edit("summary.json", '"settings"', '"things"'), "expected what `bpnp test` writes in .*KeyError: 'settings'"),
-        (lambda folder: (folder / "summary.json").write_text('{"format": 1, '), r"expected JSON in .*summary\.json"),
-        (lambda folder: (folder / "summary.json").write_text("[]"), "expected results of format 1 in .*, got None"),
-        (_edit("pairs.csv", "inliers", "inlyers"), r"expected column 'inliers' in .*pairs\.csv"),
-        (_edit("pairs.csv", "True", "maybe"), r"expected numbers in .*pairs\.csv, line 2, got 'maybe'"),
-        (_edit("pairs.csv", ",10,12,", ",10,x,"), r"expected numbers in .*pairs\.csv, line 2, got .*'x'"),
-        (_edit("pairs.csv", ",10,12,", ",10,"), r"expected 16 columns in .*pairs\.csv, line 2, got 15"),
-        (lambda folder: (folder / "pairs.csv").write_text(""), r"expected column 'index' in .*pairs\.csv"),
+        (lambda folder: (folder / "summary.json").write_text('{"format": 2, '), r"expected JSON in .*summary\.json"),
+        (lambda folder: (folder / "summary.json").write_text("[]"), "expected results of format 2 in .*, got None"),
+        (_edit("problems.csv", "inliers", "inlyers"), r"problems\.csv, got no column 'inliers' among index"),
+        (_edit("problems.csv", "True", "maybe"), r"expected the rows of a test in .*problems\.csv, got 'maybe'"),
+        (_edit("problems.csv", ",10,12,", ",10,x,"), r"expected the rows of a test in .*problems\.csv, got .*'x'"),
+        (_edit("problems.csv", ",10,12,", ",10,"), r"problems\.csv, got invalid literal"),
+        (lambda folder: (folder / "problems.csv").write_text(""), r"problems\.csv, got No columns"),
         (
-            lambda folder: (folder / "pairs.csv").write_bytes((folder / "pairs.csv").read_bytes().split(b"\r\n")[0]),
-            r"expected at least one row in .*pairs\.csv, got none",
+            lambda folder: (folder / "problems.csv").write_bytes(
+                (folder / "problems.csv").read_bytes().split(b"\r\n")[0]
+            ),
+            r"expected at least one row in .*problems\.csv, got none",
         ),
     ],
 )

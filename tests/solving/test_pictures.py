@@ -8,16 +8,15 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
-from report_data import view
+from report_data import drawn_problem
 
 import bpnp
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.report import plot_pair
-from bpnp.report.figures import plot_scene
-from bpnp.report.pictures import plot_image, plot_residuals
-from bpnp.solving.pictures import solution_view
+from bpnp.report import plot_problem
+from bpnp.report.figures import plot_image, plot_residuals, plot_scene
+from bpnp.solving.pictures import solution_points
 from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution, SolutionStats
 from bpnp.solving.sources import without_pose
@@ -70,7 +69,7 @@ def test_a_name_that_text_files_do_not_hold_is_refused(tmp_path: Path) -> None:
 
 def solved(camera: Any = None) -> Solution:
     """Exact; of 12 points two are matched."""
-    planted = view(3, "x", 12)
+    planted = drawn_problem(3, "x", 12)
     assert planted.pose is not None
     return Solution(
         rotation=planted.pose[0], translation=planted.pose[1], matches=np.array([[3, 3], [5, 5]]), inlier_count=2,
@@ -83,7 +82,7 @@ def test_a_solution_is_drawn_with_its_matches_in_pixels_of_its_camera() -> None:
     camera = camera_from(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
     for own, unit in ((None, "normalised coordinates"), (camera, "pixels")):
         solution = solved(own)
-        figure = plot_pair(solution_view(solution))
+        figure = plot_problem(solution_points(solution))
         assert figure.get_suptitle() == "ambiguous: 2 matches (50 %), mean error 0 px\nfew"
         axes = figure.axes[1]
         assert axes.get_xlabel() == axes.get_ylabel() == unit
@@ -96,7 +95,7 @@ def test_a_solution_is_drawn_with_its_matches_in_pixels_of_its_camera() -> None:
 def test_the_parts_of_a_picture_are_drawn_into_given_axes() -> None:
     from matplotlib.figure import Figure
 
-    own = solution_view(solved())
+    own = solution_points(solved())
     image, close_up = Figure().subplots(1, 2)
     space = Figure().add_subplot(projection="3d")
     assert (plot_image(image, own), plot_residuals(close_up, own), plot_scene(space, own)) == (image, close_up, space)

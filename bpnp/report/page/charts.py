@@ -1,34 +1,50 @@
-"""The charts of the page as plotly figures, for notebooks too: recall, errors against the size, time, training.
+"""The charts of the page as plotly figures, for notebooks too: recall, errors against the size, time, training; and the
+figures that the page fills with a problem or with two runs.
 
-Each function takes results by name and returns a `plotly.graph_objects.Figure`, or None where there is nothing to
-draw: `recall_chart(results, "rotation_deg").show()`.
+Each chart takes results by name and returns a `plotly.graph_objects.Figure`, or None where there is nothing to draw:
+`recall_chart(results, "rotation_deg").show()`. Colours are those of the light scheme, which the page replaces where the
+dark one is asked for.
 """
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import numpy.typing as npt
+import torch
 
-from bpnp.report.palette import DASHES, LIGHT, QUIET
+from bpnp.metrics import joint_error, recall_curve
+from bpnp.report.palette import DASHES, INKS, LIGHT, QUIET
 from bpnp.report.results import Results
-from bpnp.report.runs import series_of
-from bpnp.report.samples import Array
-from bpnp.report.training_log import TrainingLog
+from bpnp.report.runs import TrainingLog, lines_of
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
 
 Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
+Array = npt.NDArray[Any]
 POINTS = 200  # of a curve
-GROUPS = 16  # of pairs of similar size
+GROUPS = 16  # of problems of similar size
 RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
     "translation": ("Translation", "translation error, scene units", 10.0),
-    "joint": ("Rotation and translation", "rotation error, degrees, of pairs within 0.5 scene units", 90.0),
+    "joint": ("Rotation and translation", "rotation error, degrees, of problems within 0.5 scene units", 90.0),
     "reprojection_deg": ("Reprojection", "reprojection error, degrees", 20.0),
 }
 JOINT_TRANSLATION = 0.5
-SIZES = {"m": "2D points", "n": "3D points", "true_pairs": "true pairs"}
+INK = {name: light for name, (light, _) in INKS.items()}
+CLEAR = "rgba(0,0,0,0)"
+GRID = {"gridcolor": INK["line"], "zerolinecolor": INK["line"]}
+PICKED = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}}
+CONFIG = {  # of every figure
+    "responsive": True,
+    "displaylogo": False,
+    "toImageButtonOptions": {"scale": 2, "filename": "bpnp"},
+    "modeBarButtonsToRemove": [
+        "sendChartToCloud", "select2d", "lasso2d", "autoScale2d", "tableRotation", "resetCameraLastSave3d",
+    ],
+}  # fmt: skip
+SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
 TRAINING = {
     "Training loss": (("train/loss", "train/correspondence_loss", "train/pose_loss"), False),
     "Validation: correspondence loss": (("val/correspondence_loss",), False),
@@ -36,42 +52,42 @@ TRAINING = {
 }
 
 
-def sorted_errors(results: Results, estimate: str, key: str) -> Array:
-    """Errors of the pairs that have one, ascending; in the joint curve a pair that is too far away never counts."""
+def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
+    """Errors of the problems that have one; in the joint curve one that is too far away is infinite."""
     errors = results.errors(estimate)
-    if key == "joint":
-        return np.sort(errors.rotation_deg.where(errors.translation <= JOINT_TRANSLATION, np.inf).numpy())
-    values = getattr(errors, key).numpy()
-    return np.sort(values[~np.isnan(values)])
+    if error == "joint":
+        return joint_error(errors, JOINT_TRANSLATION)
+    values: torch.Tensor = getattr(errors, error)
+    return values[~values.isnan()]
 
 
-def within(errors: Array, limits: Array) -> Array:
-    """Share of ascending errors up to each limit."""
-    return np.searchsorted(errors, limits, side="right") / max(len(errors), 1)
+def recall_of(results: Results, estimate: str, error: Error, limits: Array) -> Array:
+    """Share of these problems with an error up to each limit."""
+    return recall_curve(errors_of(results, estimate, error), limits.tolist()).numpy()
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
-    """Share of pairs with an error up to a threshold, on a logarithmic axis (paper Fig. 3)."""
+    """Share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3)."""
     title, unit, most = RECALLS[error]
-    known = [sorted_errors(runs[own.run], own.estimate, error) for own in series_of(runs)]
-    finite = np.concatenate([values[np.isfinite(values) & (values > 0)] for values in known])
+    finite = np.concatenate([errors_of(runs[line.run], line.estimate, error).numpy() for line in lines_of(runs)])
+    finite = finite[np.isfinite(finite) & (finite > 0)]
     if not len(finite):
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = _figure(title, unit, "pairs up to this error")
+    figure = _figure(title, unit, "problems up to this error")
     figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
-    for place, errors in enumerate(known):
-        _line(figure, runs, place, limits, within(errors, limits), "%{y:.1%}")
+    for place, line in enumerate(lines_of(runs)):
+        _line(figure, runs, place, limits, recall_of(runs[line.run], line.estimate, error, limits), "%{y:.1%}")
     return _logarithmic(figure)
 
 
 def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
-    """Median rotation error of groups of pairs of similar `size` ("m", "n" or "true_pairs")."""
+    """Median rotation error of groups of problems of similar `size` ("m", "n" or "matches")."""
     figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees")
     figure.update_yaxes(type="log")
-    for place, own in enumerate(series_of(runs)):
-        rows = sorted(runs[own.run].of(own.estimate), key=lambda row: getattr(row, size))
+    for place, line in enumerate(lines_of(runs)):
+        rows = sorted(runs[line.run].of(line.estimate), key=lambda row: getattr(row, size))
         x = np.array([getattr(row, size) for row in rows])
         if len(np.unique(x)) < 3:
             continue
@@ -84,21 +100,29 @@ def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
 
 
 def time_charts(runs: Mapping[str, Results]) -> "list[Figure]":
-    """Share of pairs done within a time, and cumulative seconds in the order of the data set.
+    """Share of problems done within a time, and cumulative seconds in the order of the data set.
 
     The estimates of a run are made together and share their time.
     """
-    first = {own.run: place for place, own in reversed(list(enumerate(series_of(runs))))}
+    first = {line.run: place for place, line in reversed(list(enumerate(lines_of(runs))))}
     times = {run: np.array([row.seconds for row in runs[run].of(next(iter(runs[run].estimates)))]) for run in first}
     positive = np.concatenate([values[values > 0] for values in times.values()])
     if not len(positive):
         return []
     limits = np.geomspace(positive.min() * 0.9, positive.max() * 1.1, POINTS)
-    shares = _figure("Pairs done within a time", "seconds per pair", "pairs within")
+    shares = _figure("Problems done within a time", "seconds per problem", "problems within")
     shares.update_yaxes(range=[0, 1.01], tickformat=".0%")
-    total = _figure("Cumulative run time", "pairs, in the order of the data set", "seconds")
+    total = _figure("Cumulative run time", "problems, in the order of the data set", "seconds")
     for run, values in reversed(times.items()):
-        _line(shares, runs, first[run], limits, within(np.sort(values), limits), "%{y:.1%}", name=run)
+        _line(
+            shares,
+            runs,
+            first[run],
+            limits,
+            recall_curve(torch.from_numpy(values), limits.tolist()).numpy(),
+            "%{y:.1%}",
+            name=run,
+        )
         shown = np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))
         _line(total, runs, first[run], shown + 1, np.cumsum(values)[shown], "%{y:.3g} s", name=run)
     return [_logarithmic(shares), total]
@@ -110,20 +134,21 @@ def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
     for title, (keys, log) in TRAINING.items():
         figure = _figure(title, "step", "")
         figure.update_yaxes(type="log" if log else "linear")
-        for place, (run, own) in enumerate(logs.items()):
-            known = [key for key in keys if key in own.curves and (key == keys[0] or own.switch_step is not None)]
+        for place, (run, training) in enumerate(logs.items()):
+            posed = training.switch_step is not None
+            known = [key for key in keys if key in training.curves and (key == keys[0] or posed)]
             for key in known:
                 short = key.split("/")[1].replace("_", " ")
-                steps, values = own.curves[key]
+                steps, values = training.curves[key]
                 colour = LIGHT[(place if len(logs) > 1 else keys.index(key)) % len(LIGHT)]
                 figure.add_scatter(
                     x=steps, y=values, name=short if len(logs) == 1 else f"{run} {short}", mode="lines",
                     line={"color": colour, "dash": _dash(keys.index(key)), "width": 2},
                 )  # fmt: skip
-            if own.switch_step is not None and known and known[0].startswith("train"):
+            if posed and known and known[0].startswith("train"):
                 text = "pose loss joins" if len(logs) == 1 else f"{run}: pose loss"
                 figure.add_vline(
-                    x=own.switch_step, line={"dash": "dash", "width": 1, "color": QUIET}, annotation={"text": text}
+                    x=training.switch_step, line={"dash": "dash", "width": 1, "color": QUIET}, annotation={"text": text}
                 )
         if figure.data:
             charts.append(figure)
@@ -174,13 +199,83 @@ def _logarithmic(figure: "Figure") -> "Figure":
 def _line(
     figure: "Figure", runs: Mapping[str, Results], place: int, x: Any, y: Any, hover: str, name: str = ""
 ) -> None:
-    """Add a line in the style of the series at `place`, by which the page finds it."""
-    own = series_of(runs)[place]
+    """Add a line in the style of the estimate at `place`, by which the page finds it."""
+    line = lines_of(runs)[place]
     figure.add_scatter(
-        x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=name or own.label, mode="lines", meta=place,
-        line={"color": LIGHT[own.colour], "dash": _dash(own.dashes), "width": 2}, hovertemplate=hover,
+        x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=name or line.label, mode="lines", meta=place,
+        line={"color": LIGHT[line.colour], "dash": _dash(line.dashes), "width": 2}, hovertemplate=hover,
     )  # fmt: skip
 
 
 def _dash(number: int) -> str:
     return ",".join(f"{length:g}px" for length in DASHES[number % len(DASHES)]) or "solid"
+
+
+def look() -> dict[str, Any]:
+    """The plotly template of every figure."""
+    axis = GRID | {"linecolor": INK["quiet"], "automargin": True}
+    axis3d = GRID | {"color": INK["quiet"], "backgroundcolor": CLEAR, "showspikes": False}
+    layout = {
+        "margin": {"l": 50, "r": 12, "t": 44, "b": 40}, "showlegend": False, "paper_bgcolor": CLEAR,
+        "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11},
+        "hoverlabel": {"namelength": 60, "bgcolor": INK["panel"], "font": {"color": INK["text"]}},
+        "modebar": {"bgcolor": CLEAR, "color": INK["quiet"], "activecolor": INK["focus"]},
+        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": axis, "yaxis": axis,
+        "scene": {"xaxis": axis3d, "yaxis": axis3d, "zaxis": axis3d},
+    }  # fmt: skip
+    return {"layout": layout}
+
+
+def figures() -> dict[str, dict[str, Any]]:
+    """By the id of their element: run against run, a problem in space, a problem in the image."""
+    degrees = {"type": "log", "tickformat": "~g", "dtick": "D2"}
+    diagonal = {
+        "type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper",
+        "line": {"color": INK["quiet"], "width": 1, "dash": "dash"},
+    }  # fmt: skip
+    hover = "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>"
+    versus = {
+        "data": [_marks("scatter", size=5, color=INK["text"], opacity=0.5) | {"hovertemplate": hover}],
+        "layout": {
+            "title": {"text": "Rotation error of each problem"}, "hovermode": "closest", "xaxis": degrees,
+            "yaxis": degrees | {"matches": "x"},  # so that the diagonal of the picture is x = y
+            "shapes": [diagonal],
+        },
+    }  # fmt: skip
+    directions = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
+    axes = {axis: {"title": {"text": direction}} for axis, direction in directions.items()}
+    scene = {
+        "data": [
+            _marks("scatter3d", size=3.5, line={"width": 0}),
+            {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 18}},
+        ],
+        "layout": {
+            "margin": dict.fromkeys("lrtb", 0), "hovermode": "closest",
+            "scene": axes | {
+                "aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}
+            },
+        },
+    }  # fmt: skip
+    axis = {"constrain": "domain", "zeroline": False}
+    image = {
+        "data": [
+            _lines(color=INK["quiet"]),
+            _lines(color=INK["wrong"], dash="dot"),
+            _marks("scatter", symbol="circle-open"),
+            _marks("scatter", symbol="x-thin"),
+            {"mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 16}},
+        ],
+        "layout": {
+            "margin": {"l": 40, "r": 10, "t": 10, "b": 30}, "hovermode": "closest", "dragmode": "pan",
+            "xaxis": axis, "yaxis": axis | {"scaleanchor": "x"},
+        },
+    }  # fmt: skip
+    return {"versus": versus, "scene": scene, "image": image}
+
+
+def _marks(kind: str, **marker: Any) -> dict[str, Any]:
+    return {"type": kind, "mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
+
+
+def _lines(**line: Any) -> dict[str, Any]:
+    return {"mode": "lines", "hoverinfo": "skip", "opacity": 0.7, "line": {"width": 1, **line}}

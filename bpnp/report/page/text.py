@@ -7,15 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from bpnp.report.page.charts import SIZES
 from bpnp.report.palette import DASHES
-from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, PairRow, Results, cause_shares
-from bpnp.report.runs import Series, series_of
-from bpnp.report.tables.published import Paper
-from bpnp.report.tables.result_tables import CAPTION
-from bpnp.report.tables.rows import RESULT_COLUMNS, best_texts, cell, run_rows
-
-# Options of the data that change no result.
-LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
+from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, ProblemRow, Results, cause_shares
+from bpnp.report.runs import Line, lines_of
+from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
+from bpnp.report.terminal import Paper
 
 
 def visible(text: object) -> str:
@@ -41,7 +38,7 @@ def headline_html(runs: Mapping[str, Results]) -> str:
             f"{best[0]}: median rotation error {cell(RESULT_COLUMNS[1], best[1])} deg, "
             f"{100 * cause_shares(results.of(best[0]))['solved']:.1f} % within {SOLVED_DEG:g} deg"
         )
-        facts = [f"{len(rows)} pairs with {sizes}", _described(results.settings), outcome]
+        facts = [f"{len(rows)} problems with {sizes}", _described(results.settings), outcome]
         lines.append(
             f"<li><strong>{visible(name)}</strong>: {'. '.join(visible(fact) for fact in facts if fact)}.</li>"
         )
@@ -52,10 +49,7 @@ def headline_html(runs: Mapping[str, Results]) -> str:
     return f"<ul>{''.join(lines)}</ul><details><summary>Settings of the runs</summary>{details}</details>"
 
 
-SIZES = {"m": "2D points", "n": "3D points", "true_pairs": "true pairs"}
-
-
-def _span(rows: list[PairRow], key: str) -> str:
+def _span(rows: list[ProblemRow], key: str) -> str:
     low, high = np.quantile([getattr(row, key) for row in rows], [0, 1]).astype(int)
     return str(low) if low == high else f"{low} to {high}"
 
@@ -69,15 +63,11 @@ def _described(settings: Mapping[str, Any]) -> str:
     """Solver, data and checkpoint of a test, as far as they were recorded."""
     said = []
     for name in ("solver", "data"):
-        own = settings.get(name)
-        if isinstance(own, Mapping) and "class_path" in own:
-            given = {
-                key: value
-                for key, value in (own.get("init_args") or {}).items()
-                if _plain(value) and key not in LOADING
-            }
-            options = ", ".join(f"{key} {value}" for key, value in given.items())
-            kind = str(own["class_path"]).rpartition(".")[2]
+        part = settings.get(name)
+        if isinstance(part, Mapping) and "class_path" in part:
+            plain = {key: value for key, value in (part.get("init_args") or {}).items() if _plain(value)}
+            options = ", ".join(f"{key} {value}" for key, value in plain.items() if key not in LOADING)
+            kind = str(part["class_path"]).rpartition(".")[2]
             said.append(f"{name} {kind}" + (f" ({options})" if options and name == "data" else ""))
     if settings.get("complete") is False:
         said.append("interrupted before the last pair")
@@ -93,8 +83,8 @@ def _plain(value: Any) -> bool:
 def series_boxes(runs: Mapping[str, Results]) -> str:
     """A checkbox for each estimate of each run that shows and hides it."""
     return "".join(
-        f'<label><input type="checkbox" id="series{i}" data-state checked>{_named(own)}</label>'
-        for i, own in enumerate(series_of(runs))
+        f'<label><input type="checkbox" id="series{i}" data-state checked>{_named(line)}</label>'
+        for i, line in enumerate(lines_of(runs))
     )
 
 
@@ -105,43 +95,43 @@ def quartiles_html(runs: Mapping[str, Results], paper: Paper | None) -> str:
     head = "".join(
         f'<th scope="col"><button type="button">{visible(column.header)}</button></th>' for column in RESULT_COLUMNS
     )
-    shown = series_of(runs)
+    lines = lines_of(runs)
     body = ""
     for i, row in enumerate(rows):
-        own = i < len(shown)
-        body += f'<tr data-series="{i}">' if own else f'<tr class="{"seeds" if row.seeds else "paper"}">'
-        body += f'<th scope="row">{_named(shown[i]) if own else visible(row.name)}</th>'
+        ours = i < len(lines)
+        body += f'<tr data-series="{i}">' if ours else '<tr class="paper">'
+        body += f'<th scope="row">{_named(lines[i]) if ours else visible(row.name)}</th>'
         for column in RESULT_COLUMNS:
             text, value = cell(column, row.values), row.values.get(column.key)
-            mark = " class=best" if own and text == best[column.key] else ""
-            if own and value is not None:
+            mark = " class=best" if ours and text == best.get((row.problems, column.key)) else ""
+            if ours and value is not None:
                 mark += f' data-value="{str(value).replace("inf", "Infinity")}" title="{value}"'
             body += f"<td{mark}>{text}</td>"
         body += "</tr>"
     return (
         f'<div class="wide"><table id="quartile-table"><thead><tr><th scope="col">estimate</th>{head}</tr></thead>'
-        f'<tbody>{body}</tbody></table></div><p class="note">{CAPTION} Best values are bold.</p>'
+        f'<tbody>{body}</tbody></table></div><p class="note">{CAPTION} Best values are bold, among runs of the same '
+        "problems.</p>"
     )
 
 
 def causes_html(runs: Mapping[str, Results]) -> str:
-    """The share of pairs with each cause, as a bar and in numbers; the share that the solver reports as converged."""
+    """The share of problems with each cause as a bar and in numbers, and the share that the solver calls converged."""
     head = "".join(
         f'<th scope="col"><span class="fill cause{i}"></span> {cause}</th>' for i, cause in enumerate(CAUSES)
     )
     body = ""
-    for i, own in enumerate(series_of(runs)):
-        results = runs[own.run]
-        shares = cause_shares(results.of(own.estimate))
-        bar = "".join(
-            f'<span class="cause{place}" style="width: {100 * share:.2f}%"></span>'
-            for place, share in enumerate(shares.values()) if share
-        )  # fmt: skip
-        cells = "".join(f"<td>{100 * share:.1f}%</td>" for share in shares.values())
+    for i, line in enumerate(lines_of(runs)):
+        results = runs[line.run]
+        shares = list(cause_shares(results.of(line.estimate)).values())
+        parts = [(k, f"{100 * share:.2f}") for k, share in enumerate(shares) if share]
+        bar = "".join(f'<span class="cause{k}" style="width: {width}%"></span>' for k, width in parts)
+        converged = results.estimates[line.estimate].get("converged", float("nan"))
         body += (
-            f'<tr data-series="{i}"><th scope="row">{_named(own)}</th>'
-            f'<td><div class="bar" aria-hidden="true">{bar}</div></td>{cells}'
-            f"<td>{100 * results.estimates[own.estimate].get('converged', float('nan')):.1f}%</td></tr>"
+            f'<tr data-series="{i}"><th scope="row">{_named(line)}</th>'
+            f'<td><div class="bar" aria-hidden="true">{bar}</div></td>'
+            + "".join(f"<td>{100 * share:.1f}%</td>" for share in [*shares, converged])
+            + "</tr>"
         )
     return (
         f'<div class="wide"><table id="cause-table"><thead><tr><th scope="col">estimate</th><th></th>{head}'
@@ -151,9 +141,10 @@ def causes_html(runs: Mapping[str, Results]) -> str:
     )
 
 
-def _named(own: Series) -> str:
-    """A line in the colour and the dashes of a series, and its label."""
+def _named(line: Line) -> str:
+    """A line in the colour and the dashes of an estimate, and its label."""
     return (
         f'<svg class="swatch" aria-hidden="true" viewBox="0 0 28 10"><path d="M0,5H28" style="stroke: '
-        f'var(--c{own.colour})" stroke-dasharray="{" ".join(map(str, DASHES[own.dashes]))}"/></svg>{visible(own.label)}'
+        f'var(--c{line.colour})" stroke-dasharray="{" ".join(map(str, DASHES[line.dashes]))}"/></svg>'
+        f"{visible(line.label)}"
     )

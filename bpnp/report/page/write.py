@@ -1,7 +1,7 @@
 """Results as one HTML file that needs nothing else: no network, no server.
 
 plotly's script is inside, compressed: 2.0 MB of text. The numbers and points travel as compressed JSON: eight runs of
-ten thousand pairs stay under 20 MB. What is drawn from them is in `assets`.
+ten thousand problems stay under 20 MB. What is drawn from them is in `assets`.
 """
 
 import html
@@ -13,32 +13,29 @@ from pathlib import Path
 from typing import Any
 
 from bpnp.files import written_whole
-from bpnp.report.folder import read_results
-from bpnp.report.page import templates
-from bpnp.report.page.charts import chart_text, page_charts
-from bpnp.report.page.pairs import compressed, page_numbers, page_points, shown_id
+from bpnp.report.page.charts import CONFIG, chart_text, figures, look, page_charts
+from bpnp.report.page.problems import compressed, page_numbers, page_points, shown_id
 from bpnp.report.page.text import causes_html, headline_html, options, quartiles_html, series_boxes, visible
 from bpnp.report.palette import INKS
 from bpnp.report.photos import PhotoFinder, page_photos
-from bpnp.report.results import CAUSES
-from bpnp.report.runs import named_runs, series_of, trained_only
-from bpnp.report.samples import read_views
-from bpnp.report.tables.published import Paper
-from bpnp.report.training_log import TrainingLog, read_training_log
+from bpnp.report.points import read_points
+from bpnp.report.results import CAUSES, read_results
+from bpnp.report.runs import TrainingLog, lines_of, named_runs, read_training_log, trained_only
+from bpnp.report.terminal import Paper
 
-SCRIPTS = ("page.js", "pair.js")
+SCRIPTS = ("page.js", "problem.js")
 MOST_BYTES = 19_850_000
-COLUMNS = {  # of the table of pairs: head and hover text
+COLUMNS = {  # of the table of problems: head and hover text
     "rotation_error_deg": ("rot deg", "rotation error, degrees"),
     "translation_error": ("trans", "translation error, scene units"),
     "centre_error": ("centre", "distance of the camera centres, scene units"),
     "reprojection_error_deg": ("repr deg", "mean reprojection error of the true matches, degrees"),
     "inliers": ("inliers", "2D points with a reprojected 3D point beside them"),
-    "m": ("2D points", "2D points of the pair"),
-    "n": ("3D points", "3D points of the pair"),
-    "true_pairs": ("true pairs", "3D points with a true match"),
+    "m": ("2D points", "2D points of the problem"),
+    "n": ("3D points", "3D points of the problem"),
+    "matches": ("true matches", "3D points with a true match"),
     "iterations": ("iterations", "iterations of the solver"),
-    "seconds": ("sec", "seconds, the pair's share of its batch"),
+    "seconds": ("sec", "seconds, the problem's share of its batch"),
 }
 STATUSES = ("converged", "not converged", "no pose")
 HEADINGS = {"recall": "Recall", "errors": "Errors against size", "time": "Time", "training": "Training"}
@@ -46,7 +43,7 @@ VERSUS = (
     '<div class="controls"><label>A <select id="a" data-state>{0}</select></label>'
     '<label>B <select id="b" data-state>{1}</select></label></div><p id="versus-text" role="status"></p>'
     '<div class="chart" id="versus" role="img"></div>'
-    '<p class="note">A point above the diagonal is a pair that A solves better. Click a point to open its pair.</p>'
+    '<p class="note">A point above the diagonal is a problem that A solves better. Click a point to open it.</p>'
 )
 
 
@@ -55,7 +52,7 @@ def write_page(
 ) -> Path:
     """Write the page of one or several results folders, whole or not at all, and return where it is.
 
-    photo: what finds the photo of a pair, to lie under its 2D view; see `bpnp.report.photos`.
+    photo: what finds the photo of a problem, to lie under its image points; see `bpnp.report.photos`.
     Raises ValueError if a folder, its points or its training log cannot be read.
     """
     output = Path(output)
@@ -71,12 +68,11 @@ def page_html(
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
     logs = _logs(folders)
-    only_trained = bool(logs) and trained_only(paths)
-    runs = {} if only_trained else {name: read_results(path) for name, path in folders.items()}
-    views = {name: read_views(path) for name, path in folders.items()}
+    runs = {} if trained_only(paths) else {name: read_results(path) for name, path in folders.items()}
+    points = {name: read_points(path) for name, path in folders.items()}
     charts = page_charts(runs, logs)
-    figures = [chart for section in charts.values() for chart in section]
-    names = [own.label for own in series_of(runs)]
+    drawn = [chart for section in charts.values() for chart in section]
+    names = [line.label for line in lines_of(runs)]
     sections = {
         **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
         **(
@@ -84,34 +80,34 @@ def page_html(
             if names[1:]
             else {}
         ),
-        **{name: (HEADINGS[name], _charts_html(own, figures)) for name, own in charts.items()},
+        **{name: (HEADINGS[name], _charts_html(section, drawn)) for name, section in charts.items()},
         **({"failures": ("Failures", causes_html(runs))} if runs else {}),
     }
     plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
     data = compressed(json.dumps(page_numbers(runs) | {
         "keys": list(COLUMNS), "causes": CAUSES, "inks": INKS,
-        "photos": {shown_id(id): own for id, own in page_photos(views, photo).items()},
-        "charts": [chart.to_json() for chart in figures], "config": templates.CONFIG,
-        "figures": {name: json.dumps(figure) for name, figure in templates.figures().items()},
-        "look": json.dumps(templates.look()),
+        "photos": {shown_id(id): image for id, image in page_photos(points, photo).items()},
+        "charts": [chart.to_json() for chart in drawn], "config": CONFIG,
+        "figures": {name: json.dumps(figure) for name, figure in figures().items()},
+        "look": json.dumps(look()),
     }))  # fmt: skip
-    links = {name: heading for name, (heading, _) in sections.items()} | ({"pairs": "Pairs"} if runs else {})
+    links = {name: heading for name, (heading, _) in sections.items()} | ({"problems": "Problems"} if runs else {})
     colours = " ".join(f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in INKS.items())
     parts = {
         "style": f":root {{ color-scheme: light dark; {colours} }}\n"
         + (assets / "page.css").read_text(encoding="utf-8"),
         "script": "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS),
         "data": data,
-        "points": page_points(runs, views, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
+        "points": page_points(runs, points, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
         "plotly": plotly,
         "title": html.escape("bpnp: " + ", ".join(folders)),
         "headline": headline_html(runs),
         "list": options(names),
         "causes": options(CAUSES),
         "statuses": options(STATUSES),
-        "no-pairs": "" if runs else " hidden",
-        "pair-head": pair_head("pair", sort=True),
-        "number-head": pair_head("estimate"),
+        "no-problems": "" if runs else " hidden",
+        "problem-head": problem_head("problem", sort=True),
+        "number-head": problem_head("estimate"),
         "series": series_boxes(runs),
         "navigation": " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in links.items()),
         "sections": "\n".join(
@@ -124,8 +120,8 @@ def page_html(
     return "".join(parts[piece] if i % 2 else piece for i, piece in enumerate(pieces))
 
 
-def pair_head(first: str, *, sort: bool = False) -> str:
-    """The head of a table of pairs or of estimates of a pair, with buttons that sort."""
+def problem_head(first: str, *, sort: bool = False) -> str:
+    """The head of a table of problems or of the estimates of one, with buttons that sort."""
     heads = ""
     for key, (text, title) in {"id": (first, ""), **COLUMNS}.items():
         shown = f'<button type="button" data-key="{key}">{text}</button>' if sort else text

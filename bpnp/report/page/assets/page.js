@@ -1,5 +1,5 @@
 "use strict";
-// What the address keeps, the tables, the charts and the list of pairs. Data and plotly are gzip in base64.
+// What the address keeps, the tables, the charts and the list of problems. Data and plotly are gzip in base64.
 
 const [PICTURES, MOST] = [12, 1250];
 const byId = (id) => document.getElementById(id);
@@ -88,33 +88,33 @@ function sortTable(button) {
   body.prepend(...(down ? sorted.reverse() : sorted));
 }
 
-// Run against run: the rotation errors of two series pair by pair; of many, those that differ most and others between.
+// Run against run: the rotation errors of two series, of many problems those that differ most and others between.
 function drawComparison() {
   const [a, b] = ["a", "b"].map((id) => SERIES[byId(id).value]);
   const place = new Map(b.ids.map((id, i) => [id, i]));
   const [x, y] = [a, b].map((series) => column(series, "rotation_error_deg"));
   const common = [...a.ids.keys()].filter((i) => place.has(a.ids[i]));
-  const pairs = common.map((i) => ({ i, id: a.ids[i], x: x[i], y: y[place.get(a.ids[i])] }));
-  const share = (part) => `${((100 * part.length) / Math.max(pairs.length, 1)).toFixed(1)} %`;
+  const problems = common.map((i) => ({ i, id: a.ids[i], x: x[i], y: y[place.get(a.ids[i])] }));
+  const share = (part) => `${((100 * part.length) / Math.max(problems.length, 1)).toFixed(1)} %`;
   byId("versus-text").textContent = byId("versus").ariaLabel =
-    `${a.name} has the smaller rotation error in ${share(pairs.filter((pair) => pair.x < pair.y))} of ${pairs.length} ` +
-    `common pairs, ${b.name} in ${share(pairs.filter((pair) => pair.y < pair.x))}.`;
+    `${a.name} has the smaller rotation error in ${share(problems.filter(({ x, y }) => x < y))} of ${problems.length} ` +
+    `common problems, ${b.name} in ${share(problems.filter(({ x, y }) => y < x))}.`;
   const gap = ({ x: own, y: other }) => Math.abs(Math.log((own + 1e-9) / (other + 1e-9)));
-  const between = Math.ceil(pairs.length / MOST);
-  const drawn = pairs.sort((p, q) => gap(q) - gap(p)).filter((_, k) => k < MOST || k % between === 0);
+  const between = Math.ceil(problems.length / MOST);
+  const drawn = problems.sort((p, q) => gap(q) - gap(p)).filter((_, k) => k < MOST || k % between === 0);
   const figure = themed(DATA.figures.versus);
-  const all = (key, least) => drawn.map((pair) => (least ? Math.max(pair[key], least) : pair[key]));
+  const all = (key, least) => drawn.map((problem) => (least ? Math.max(problem[key], least) : problem[key]));
   Object.assign(figure.data[0], { x: all("x", 1e-4), y: all("y", 1e-4), text: all("id"), customdata: all("i") });
   [figure.layout.xaxis.title, figure.layout.yaxis.title] = [a, b].map(({ name }) => ({ text: `${name}, degrees` }));
   draw(byId("versus"), figure, {}, ({ customdata }) => {
     setState({ list: byId("a").value });
-    drawPairs();
-    openPair(customdata);
+    drawProblems();
+    openProblem(customdata);
   });
 }
 
-// Positions of the pairs that pass the filters, sorted; undefined errors last.
-function selectPairs() {
+// Positions of the problems that pass the filters, sorted; undefined errors last.
+function selectProblems() {
   const series = listed();
   const [cause, status, error] = ["cause", "status", "rotation_error_deg"].map((key) => column(series, key));
   const passes = (id, value) => byId(id).value === "" || Number(byId(id).value) === value;
@@ -127,25 +127,25 @@ function selectPairs() {
   return found.sort((a, b) => Number.isNaN(values[a]) - Number.isNaN(values[b]) || order(a, b) || a - b);
 }
 
-function pairRow(series, i, ...head) {
+function problemRow(series, i, ...head) {
   const cause = column(series, "cause")[i];
   return element("tr", {}, element("th", { scope: "row" }, ...head),
     ...DATA.keys.map((key) => element("td", {}, number(column(series, key)[i]))),
     element("td", { className: "words" }, element("span", { className: `fill cause${cause}` }), ` ${DATA.causes[cause]}`));
 }
 
-function drawPairs() {
+function drawProblems() {
   const series = listed();
-  chosen = selectPairs();
+  chosen = selectProblems();
   const rows = chosen.slice(0, Number(byId("rows").value));
-  each("#pair-table [data-key]", ({ dataset, parentNode }) => {
+  each("#problem-table [data-key]", ({ dataset, parentNode }) => {
     parentNode.ariaSort = dataset.key !== byId("sort").value ? "none" : byId("up").checked ? "ascending" : "descending";
   });
-  const link = (i) => element("button", { className: "link", onclick: () => openPair(i) },
+  const link = (i) => element("button", { className: "link", onclick: () => openProblem(i) },
     `${series.lines[i] >= 0 ? "◉ " : ""}${series.ids[i]}`);
-  byId("pair-table").tBodies[0].replaceChildren(...rows.map((i) => pairRow(series, i, link(i))));
+  byId("problem-table").tBodies[0].replaceChildren(...rows.map((i) => problemRow(series, i, link(i))));
   byId("more").hidden = rows.length === chosen.length;
-  byId("place").textContent = `${rows.length} shown · ${chosen.length} of ${series.ids.length} pairs`;
+  byId("place").textContent = `${rows.length} shown · ${chosen.length} of ${series.ids.length} problems`;
   const pictured = chosen.filter((i) => series.lines[i] >= 0).slice(0, PICTURES);
   byId("gallery").replaceChildren(...pictured.map((i) => thumbnail(series, i)));
 }
@@ -158,22 +158,22 @@ async function start() {
   SERIES = DATA.series.map((own) => ({ ...own, ids: DATA.columns[own.ids], lines: JSON.parse(lines)[own.run] }));
   setState(Object.fromEntries(new URLSearchParams(location.hash.slice(1))));
   document.addEventListener("input", ({ target }) => {
-    if (target.matches("#pair *")) return drawPair();
+    if (target.matches("#problem *")) return drawProblem();
     setState({});
-    return target.matches("#series *") ? drawSeries() : target.matches("#versus-section *") ? drawComparison() : drawPairs();
+    return target.matches("#series *") ? drawSeries() : target.matches("#versus-section *") ? drawComparison() : drawProblems();
   });
   each("nav a", (link) => { link.onclick = () => document.querySelector(link.hash).scrollIntoView() ?? false; });
   each("#quartile-table button", (button) => { button.onclick = () => sortTable(button); });
-  each("#pair-table [data-key]", (button) => { button.onclick = () => {
+  each("#problem-table [data-key]", (button) => { button.onclick = () => {
     const again = byId("sort").value === button.dataset.key;
     setState({ up: String(again && !byId("up").checked), sort: button.dataset.key });
-    drawPairs();
+    drawProblems();
   }; });
-  byId("more").onclick = () => { setState({ rows: Number(byId("rows").value) + 25 }); drawPairs(); };
+  byId("more").onclick = () => { setState({ rows: Number(byId("rows").value) + 25 }); drawProblems(); };
   byId("previous").onclick = () => step(-1);
   byId("next").onclick = () => step(1);
-  byId("pair").onclose = () => setState({ open: "" });
-  byId("pair").onkeydown = ({ key, target }) => {
+  byId("problem").onclose = () => setState({ open: "" });
+  byId("problem").onkeydown = ({ key, target }) => {
     if (!target.matches("select, input")) step({ ArrowLeft: -1, ArrowRight: 1 }[key]);
   };
   each("[data-chart]", (node) => watch(node, () => drawChart(node)));
@@ -181,8 +181,8 @@ async function start() {
   addEventListener("beforeprint", () => each(".chart", (node) => node.show()));
   dark.onchange = () => { each(".js-plotly-plot", (node) => node.show()); };
   drawSeries();
-  if (SERIES.length) drawPairs();
+  if (SERIES.length) drawProblems();
   const i = SERIES.length ? listed().ids.indexOf(byId("open").value) : -1;
-  if (i >= 0) openPair(i);
+  if (i >= 0) openProblem(i);
   document.documentElement.dataset.ready = "1";
 }

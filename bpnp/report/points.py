@@ -1,7 +1,7 @@
-"""The points of the pairs of a test, `points.npz`: enough to draw what the cameras see.
+"""The points of the problems of a test, `points.npz`: enough to draw what the cameras see.
 
-Of every pair up to `FEW` points a side are kept; of the worst pairs and of some others, up to `MANY`. Which ones does
-not depend on the order of batches or on processes.
+Of every problem up to `FEW` points a side are kept; of the worst and of some others, up to `MANY`. Which ones does not
+depend on the order of batches or on processes.
 """
 
 import io
@@ -24,7 +24,7 @@ FORMAT = 2
 FILE = "points.npz"
 FEW, MANY = 24, 1000
 IDS = ("ids2d", "ids3d")
-POINTS: dict[str, tuple[Any, ...]] = {  # columns of all pairs one after the other: type and width
+POINTS: dict[str, tuple[Any, ...]] = {  # columns of all problems one after the other: type and width
     "points2d": (np.float32, 2),
     "points3d": (np.float32, 3),
     **dict.fromkeys(("match3d", "assigned3d", *IDS), (np.int32,)),
@@ -34,15 +34,15 @@ Array = npt.NDArray[Any]
 
 
 @dataclass(frozen=True)
-class PairView:
-    """One pair, ready to draw. Conventions as in `bpnp.types`: camera = R p + t, normalised image coordinates.
+class ProblemPoints:
+    """One problem, ready to draw. Conventions as in `bpnp.types`: camera = R p + t, normalised image coordinates.
 
     points2d: (m, 2). points3d: (n, 3). match3d: (n,) the 2D point that each 3D point truly is, -1 for none.
     assigned3d: (n,) the 2D point to which the solver's assignment gives most of each 3D point, -1 if it has none.
     pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
     error: rotation error of the first estimate in degrees, by which the worst are chosen. ids2d, ids3d: the places of
-    the points in the pair as it was solved, if only some of them are here; None for all. camera: in whose pixels the
-    pair is drawn, None for normalised coordinates; it is not kept on disk.
+    the points in the problem as it was solved, if only some of them are here; None for all. camera: in whose pixels the
+    problem is drawn, None for normalised coordinates; it is not kept on disk.
     """
 
     index: int
@@ -64,8 +64,8 @@ class PairView:
         return count2d if self.ids2d is None else self.ids2d, count3d if self.ids3d is None else self.ids3d
 
 
-def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY) -> list[PairView]:
-    """The views of a batch. Of larger sets `most_points` are kept on each side, evenly spaced, matched ones first."""
+def points_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY) -> list[ProblemPoints]:
+    """The points of a batch. Of larger sets `most_points` are kept on each side, evenly spaced, matched ones first."""
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
     match3d = unknown if batch.match3d is None else _host(batch.match3d)
@@ -76,9 +76,9 @@ def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY)
     if batch.rotation is not None and batch.translation is not None:
         truth = (_host(batch.rotation), _host(batch.translation))
     errors = _first_errors(prediction, batch)
-    views = []
+    problems = []
     for i in range(len(batch)):
-        view = PairView(
+        problem = ProblemPoints(
             index=int(batch.index[i]),
             id=batch.ids[i],
             points2d=points2d[i][mask2d[i]].astype(np.float32),
@@ -89,22 +89,23 @@ def views_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY)
             estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
             error=errors[i],
         )
-        views.append(thin(view, most_points))
-    return views
+        problems.append(thin(problem, most_points))
+    return problems
 
 
-def select_views(views: Iterable[PairView], *, worst: int = 12, others: int = 12) -> tuple[PairView, ...]:
-    """The `worst` pairs and `others` spread over the data set, by index.
+def select_points(problems: Iterable[ProblemPoints], *, worst: int = 12, others: int = 12) -> tuple[ProblemPoints, ...]:
+    """The `worst` problems and `others` spread over the data set, by index.
 
-    Choosing from what was chosen of the parts gives the same as choosing from the whole, so that views can be selected
-    batch by batch and process by process: `kept = select_views([*kept, *views_from(prediction, batch)])`.
+    Choosing from what was chosen of the parts gives the same as choosing from the whole, so that problems can be
+    selected batch by batch and process by process:
+    `chosen = select_points([*chosen, *points_from(prediction, batch)])`.
     """
     if worst < 0 or others < 0:
         raise ValueError(f"expected `worst` and `others` >= 0, got {worst} and {others}")
-    once = {view.index: view for view in views}
-    by_error = sorted(once.values(), key=lambda view: (-view.error, view.index))
-    spread = sorted(once.values(), key=lambda view: spread_key(view.index))
-    chosen = {view.index: view for view in [*by_error[:worst], *spread[:others]]}
+    once = {problem.index: problem for problem in problems}
+    by_error = sorted(once.values(), key=lambda problem: (-problem.error, problem.index))
+    spread = sorted(once.values(), key=lambda problem: spread_key(problem.index))
+    chosen = {problem.index: problem for problem in [*by_error[:worst], *spread[:others]]}
     return tuple(chosen[index] for index in sorted(chosen))
 
 
@@ -113,75 +114,77 @@ def spread_key(index: int) -> int:
     return index * 2654435769 % 2**32
 
 
-def thin(view: PairView, most: int = FEW) -> PairView:
-    """The view with at most `most` points on each side, evenly spaced, matched ones first."""
-    keep2d, keep3d = _kept(len(view.points2d), view.match3d, most)
-    ids2d, ids3d = view.numbers()
+def thin(problem: ProblemPoints, most: int = FEW) -> ProblemPoints:
+    """The problem with at most `most` points on each side, evenly spaced, matched ones first."""
+    count2d = len(problem.points2d)
+    keep3d = _first_then_rest(problem.match3d >= 0, most)
+    keep2d = _first_then_rest(np.isin(np.arange(count2d), problem.match3d[keep3d]), most)
+    ids2d, ids3d = problem.numbers()
     return replace(
-        view,
-        points2d=view.points2d[keep2d],
-        points3d=view.points3d[keep3d],
-        match3d=_renumbered(view.match3d[keep3d], keep2d),
-        assigned3d=_renumbered(view.assigned3d[keep3d], keep2d),
+        problem,
+        points2d=problem.points2d[keep2d],
+        points3d=problem.points3d[keep3d],
+        match3d=_renumbered(problem.match3d[keep3d], keep2d, count2d),
+        assigned3d=_renumbered(problem.assigned3d[keep3d], keep2d, count2d),
         ids2d=ids2d[keep2d].astype(np.int32),
         ids3d=ids3d[keep3d].astype(np.int32),
     )
 
 
-def write_views(folder: Path | str, views: Iterable[PairView]) -> None:
-    """Write `points.npz` whole or not at all: columns with the points of all pairs one after the other, no pickles.
+def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
+    """Write `points.npz` whole or not at all: columns with the points of all problems one after the other.
 
-    Of several views of one index the first is kept. Raises ValueError if the views have different estimates.
+    Of several with one index the first is kept. Raises ValueError if they have different estimates.
     """
-    first: dict[int, PairView] = {}
-    for view in views:
-        first.setdefault(view.index, view)
-    kept = [first[index] for index in sorted(first)]
-    names = list(kept[0].estimates) if kept else []
-    if any(list(view.estimates) != names for view in kept):
-        raise ValueError(f"expected views with the estimates {names}, got others; try a folder for each solver")
+    first: dict[int, ProblemPoints] = {}
+    for problem in problems:
+        first.setdefault(problem.index, problem)
+    ordered = [first[index] for index in sorted(first)]
+    names = list(ordered[0].estimates) if ordered else []
+    if any(list(problem.estimates) != names for problem in ordered):
+        raise ValueError(f"expected problems with the estimates {names}, got others; try a folder for each solver")
     arrays = {
         "format": np.array(FORMAT),
-        "ids": np.frombuffer(json.dumps([view.id for view in kept]).encode(), np.uint8),
-        "index": np.array([view.index for view in kept], np.int64),
-        "error": np.array([view.error for view in kept], np.float64),
-        "count2d": np.array([len(view.points2d) for view in kept], np.int64),
-        "count3d": np.array([len(view.points3d) for view in kept], np.int64),
-        "pose": _stacked([view.pose for view in kept]),
+        "ids": np.frombuffer(json.dumps([problem.id for problem in ordered]).encode(), np.uint8),
+        "index": np.array([problem.index for problem in ordered], np.int64),
+        "error": np.array([problem.error for problem in ordered], np.float64),
+        "count2d": np.array([len(problem.points2d) for problem in ordered], np.int64),
+        "count3d": np.array([len(problem.points3d) for problem in ordered], np.int64),
+        "pose": _stacked([problem.pose for problem in ordered]),
     }
     for name, (kind, *width) in POINTS.items():
-        parts = [view.numbers()[name == "ids3d"] if name in IDS else getattr(view, name) for view in kept]
+        parts = [problem.numbers()[name == "ids3d"] if name in IDS else getattr(problem, name) for problem in ordered]
         arrays[name] = np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
-    arrays |= {f"estimate.{name}": _stacked([view.estimates[name] for view in kept]) for name in names}
+    arrays |= {f"estimate.{name}": _stacked([problem.estimates[name] for problem in ordered]) for name in names}
     content = io.BytesIO()
     np.savez(content, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
     with written_whole(Path(folder) / FILE) as temporary:
         temporary.write_bytes(content.getvalue())
 
 
-def read_views(folder: Path | str) -> tuple[PairView, ...]:
-    """Read what `write_views` wrote; empty if the folder has none. Raises ValueError that names an unreadable file."""
+def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
+    """Read what `write_points` wrote; empty if the folder has none. Raises ValueError that names an unreadable file."""
     path = Path(folder) / FILE
     if not path.is_file():
         return ()
     try:
         with np.load(path, allow_pickle=False) as archive:
             arrays = dict(archive)
-        found = int(arrays["format"])
-        if found == FORMAT:
-            return tuple(_views(arrays))
+        version = int(arrays["format"])
+        if version == FORMAT:
+            return tuple(_unpacked(arrays))
     except Exception as error:  # noqa: BLE001 - zipfile, numpy and json each have errors of their own
         raise ValueError(f"expected points of a test in {path}, got {error}; try `bpnp test` again") from error
-    raise ValueError(f"expected points of format {FORMAT} in {path}, got {found}; try the bpnp that wrote them")
+    raise ValueError(f"expected points of format {FORMAT} in {path}, got {version}; try the bpnp that wrote them")
 
 
-def _views(arrays: dict[str, Array]) -> Iterable[PairView]:
+def _unpacked(arrays: dict[str, Array]) -> Iterable[ProblemPoints]:
     ends = {side: arrays[f"count{side}"].cumsum()[:-1] for side in ("2d", "3d")}
     points: dict[str, Any] = {name: np.split(arrays[name], ends[name[-2:]]) for name in POINTS}
     prefix = "estimate."
     for i, name in enumerate(json.loads(arrays["ids"].tobytes())):
         truth = arrays["pose"][i]
-        yield PairView(
+        yield ProblemPoints(
             index=int(arrays["index"][i]),
             id=name,
             pose=_split(truth) if np.isfinite(truth).all() else None,
@@ -192,7 +195,7 @@ def _views(arrays: dict[str, Array]) -> Iterable[PairView]:
 
 
 def _stacked(poses: Sequence[tuple[Array, Array] | None]) -> Array:
-    """[R | t] of each pair, (k, 3, 4), NaN for none."""
+    """[R | t] of each problem, (k, 3, 4), NaN for none."""
     missing = np.full((3, 4), np.nan)
     return np.array([missing if pose is None else np.c_[pose] for pose in poses], np.float64).reshape(-1, 3, 4)
 
@@ -213,12 +216,6 @@ def _first_errors(prediction: Prediction, batch: Batch) -> list[float]:
     return [float(value) for value in error.where(pose.found, 180.0).tolist()]
 
 
-def _kept(m: int, match: Array, most: int) -> tuple[Array, Array]:
-    """Indices of the 2D and 3D points that are kept, ascending."""
-    keep3d = _first_then_rest(match >= 0, most)
-    return _first_then_rest(np.isin(np.arange(m), match[keep3d]), most), keep3d
-
-
 def _first_then_rest(first: Array, most: int) -> Array:
     """Indices where `first` holds and then of the rest, each thinned evenly where there is no room; ascending."""
     head = _thinned(np.flatnonzero(first), most)
@@ -231,9 +228,8 @@ def _thinned(values: Array, most: int) -> Array:
     return values[np.linspace(0, len(values) - 1, most).astype(np.int64)] if most else values[:0]
 
 
-def _renumbered(targets: Array, kept: Array) -> Array:
-    """Positions of `targets` in the sorted indices `kept`; -1 for those that are not kept."""
-    if len(kept) == 0:
-        return np.full(len(targets), -1, np.int32)
-    position = np.searchsorted(kept, targets).clip(max=len(kept) - 1)
-    return np.where(kept[position] == targets, position, -1).astype(np.int32)
+def _renumbered(targets: Array, chosen: Array, count: int) -> Array:
+    """Positions of `targets` in `chosen`, both indices of `count` points; -1 for those that are not among them."""
+    place = np.full(count + 1, -1, np.int32)  # the last for targets of -1
+    place[chosen] = np.arange(len(chosen))
+    return place[targets]

@@ -12,13 +12,9 @@ from bpnp.cli import main
 from bpnp.files import claimed
 from bpnp.models import Matcher
 from bpnp.models.baselines import RandomRansac
-from bpnp.report import read_results, read_views
-from bpnp.report.folder import append_rows, finished_rows
-from bpnp.report.tables.published import PUBLISHED
-from bpnp.report.tables.rows import Row, paper_rows
-from bpnp.report.tables.written_tables import as_latex, as_markdown
-from bpnp.table.methods import parse_methods
-from bpnp.table.pairs import TestPairs, read_data
+from bpnp.report import read_points, read_results
+from bpnp.report.tables import Row, as_latex, as_markdown, paper_rows
+from bpnp.training.comparison import MethodTest, parse_methods, problem_order, read_data
 from bpnp.training.task import BlindPnPTask
 from bpnp.types import Batch, Prediction
 
@@ -68,33 +64,39 @@ def test_a_table_of_two_methods_and_what_it_leaves(
     assert float(ours["blind"]["rotation_q2_deg"]) == pytest.approx(median)
     paper = {row["method"]: row for row in rows if row["source"] == "paper, ModelNet40"}
     assert float(paper["Lc Lp"]["recall_joint_15deg_0.5"]) == 0.72
-    assert (tmp_path / "out" / "table.tex").read_text().count(r"\\") == 2 + 2 + 1 + len(PUBLISHED["modelnet40"])
-    assert {view.index for view in read_views(tmp_path / "out" / "blind")} == {row.index for row in results.rows}
-    main(["report", str(tmp_path / "out" / "blind")])
+    tex = (tmp_path / "out" / "table.tex").read_text()
+    assert tex.count(r"\\") == 2 + 2 + len(paper_rows("modelnet40"))
+    assert r"\multicolumn{3}{c}{Rotation Error}" in tex
+    assert {problem.index for problem in read_points(tmp_path / "out" / "blind")} == {row.index for row in results.rows}
+    main(["report", str(tmp_path / "out")])
+    assert "softposit" in capsys.readouterr().out
 
 
-def test_it_goes_on_where_it_was_and_solves_no_pair_twice(recipes: list[str], tmp_path: Path) -> None:
+def test_finished_methods_are_skipped_and_longer_tables_run_again(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     main([*recipes, "--limit=2"])
     first = {name: read_results(tmp_path / "out" / name).rows for name in ("blind", "softposit")}
-    # As if the second of four pairs had been killed while its row was written.
-    folder = tmp_path / "out" / "blind"
-    append_rows(folder, first["blind"])
-    unfinished = (folder / "unfinished.csv").read_bytes()
-    (folder / "pairs.csv").unlink()
-    (folder / "unfinished.csv").write_bytes(unfinished[:-5])
+    (tmp_path / "out" / "softposit" / "summary.json").unlink()  # as if killed
+    main([*recipes, "--limit=2"])
+    assert "1 of 2 tests are finished" in capsys.readouterr().out
+    again = {name: read_results(tmp_path / "out" / name).rows for name in first}
+    assert again["blind"] == first["blind"]
+    assert again["softposit"] != first["softposit"]  # a problem that is solved again takes another time
     main([*recipes, "--limit=4"])
-    for name, rows in first.items():
-        now = read_results(tmp_path / "out" / name).rows
-        assert len(now) == 4
-        errors = {row.index: row.rotation_error_deg for row in now}
-        assert all(errors[row.index] == row.rotation_error_deg for row in rows)
-        kept = {row.index: row.seconds for row in now}
-        times = [kept[row.index] == row.seconds for row in rows]  # a pair that is solved again takes another time
-        assert sum(times) == (2 if name == "softposit" else 1)
+    longer = read_results(tmp_path / "out" / "blind").rows
+    assert len(longer) == 4
+    assert {row.index for row in first["blind"]} < {row.index for row in longer}
+    errors = {row.index: row.rotation_error_deg for row in longer}
+    assert all(errors[row.index] == row.rotation_error_deg for row in first["blind"])
+    main([*recipes, "--limit=1"])
+    assert read_results(tmp_path / "out" / "blind").rows == longer
+    rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
+    assert {row["problems"] for row in rows if row["source"] == "here"} == {"1"}
 
 
 class Failing(RandomRansac):
-    """Ctrl-C while the third pair is solved."""
+    """Ctrl-C while the third problem is solved."""
 
     solved = 0
 
@@ -105,27 +107,17 @@ class Failing(RandomRansac):
         return super().forward(batch)
 
 
-def test_ctrl_c_keeps_every_finished_pair(recipes: list[str], tmp_path: Path) -> None:
+def test_a_method_that_was_interrupted_starts_again(recipes: list[str], tmp_path: Path) -> None:
     Failing.solved = 0
-    words = ["table", recipes[1], "--methods", "it=test_baseline_table.Failing", recipes[-1], "--limit=5"]
+    words = ["table", recipes[1], "--methods", "it=test_table_command.Failing", recipes[-1], "--limit=5"]
     with pytest.raises(SystemExit) as stop:
         main(words)
     assert stop.value.code == 130
-    assert len(finished_rows(tmp_path / "out" / "it")) == 2
+    partial = read_results(tmp_path / "out" / "it")
+    assert (len(partial.rows), partial.settings["complete"]) == (2, False)
     main(words)
-    assert Failing.solved == 3 + 3
+    assert Failing.solved == 3 + 5
     assert len(read_results(tmp_path / "out" / "it").rows) == 5
-
-
-def test_a_shorter_table_shows_its_pairs_and_keeps_the_others(
-    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    main([*recipes, "--limit=3"])
-    main([*recipes, "--limit=1"])
-    assert len(read_results(tmp_path / "out" / "blind").rows) == 3
-    rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
-    assert {row["pairs"] for row in rows if row["source"] == "here"} == {"1"}
-    capsys.readouterr()
 
 
 def test_two_tables_do_not_write_to_one_folder(
@@ -149,8 +141,8 @@ def test_an_outlier_sweep_adds_points_and_draws_its_curves(recipes: list[str], t
     main([*recipes, "--limit=2", "--rho", "0", "0.5"])
     clean = read_results(tmp_path / "out" / "rho-0" / "blind").rows[0]
     cluttered = read_results(tmp_path / "out" / "rho-0.5" / "blind").rows[0]
-    assert (clean.m, clean.n, clean.true_pairs) == (12, 12, 12)
-    assert (cluttered.m, cluttered.n, cluttered.true_pairs) == (18, 18, 12)
+    assert (clean.m, clean.n, clean.matches) == (12, 12, 12)
+    assert (cluttered.m, cluttered.n, cluttered.matches) == (18, 18, 12)
     assert (tmp_path / "out" / "outliers.png").stat().st_size > 1000
     rows = list(csv.DictReader((tmp_path / "out" / "table.csv").open()))
     assert [row["rho"] for row in rows if row["source"] == "here"] == ["0.0", "0.0", "0.5", "0.5"]
@@ -165,19 +157,20 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
     assert len(set(medians)) == 3
     ours = [row for row in csv.DictReader((tmp_path / "out" / "table.csv").open()) if row["source"] == "here"]
     blind, spread, *_ = ours
-    assert (blind["method"], blind["pairs"], len(ours)) == ("blind", "6", 4)
+    assert (blind["method"], blind["problems"], len(ours)) == ("blind", "6", 4)
     assert float(blind["translation_q2"]) == pytest.approx(np.mean(medians))
     assert float(spread["translation_q2"]) == pytest.approx(np.std(medians, ddof=1))
 
 
 def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> None:
+    assert sorted(problem_order(30)) == list(range(30))
+    assert problem_order(30) == problem_order(30) != list(range(30))
     (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
     data = read_data(tmp_path / "data.yaml", ["--data.test_shapes=30", "--data.seed=3"])
     assert data["init_args"]["test_shapes"] == 30
-    pairs = TestPairs(data)
-    assert sorted(pairs.order) == list(range(30))
-    assert pairs.order != list(range(30))
-    assert TestPairs(data).order == pairs.order
+    (method,) = parse_methods(["ransac"], time_limit=0.2)
+    MethodTest(method, data, tmp_path / "out", limit=2).run()
+    assert {row.index for row in read_results(tmp_path / "out").rows} == set(problem_order(30)[:2])
 
 
 @pytest.mark.parametrize(
@@ -231,7 +224,7 @@ def test_a_checkpoint_becomes_rows_per_estimate(tmp_path: Path) -> None:
 
 
 def test_names_in_latex_and_markdown_are_text(tmp_path: Path) -> None:
-    rows = [Row("L_c & 50% | R", {"pairs": 3})]
+    rows = [Row("L_c & 50% | R", {"problems": 3})]
     assert r"L\_c \& 50\% | R" in as_latex(rows)
     rows += paper_rows("megadepth")
     assert r"L_c & 50% \| R | 3 |" in as_markdown(rows)

@@ -10,19 +10,17 @@ from rich.table import Table
 
 from bpnp.report import Results, learning_table, recall_table, report, results_table, write_results
 from bpnp.report.page.text import quartiles_html
-from bpnp.report.runs import seed_groups
-from bpnp.report.tables.fitted_table import FittedTable
-from bpnp.report.tables.rows import number
+from bpnp.report.terminal import SplitTable, number
 
 
-def rendered(table: Table | FittedTable, width: int = 80) -> list[str]:
+def rendered(table: Table | SplitTable, width: int = 80) -> list[str]:
     console = Console(width=width, file=io.StringIO(), color_system=None)
     with console.capture() as capture:
         console.print(table)
     return capture.get().splitlines()
 
 
-def bold(table: FittedTable) -> list[list[str]]:
+def bold(table: SplitTable) -> list[list[str]]:
     """The bold numbers of each row."""
     rows = [cells for group in table.groups for _, cells in group]
     return [[cell.plain for cell in cells if cell.style == "bold"] for cells in rows]
@@ -83,7 +81,7 @@ def test_the_learning_table_sets_untrained_beside_trained(tmp_path: Path) -> Non
     assert ["correspondence", "loss", "0.500", "-0.750"] in words
     assert ["median", "rotation", "error,", "deg:", "pnp", "40.0", "2.50"] in words
     other = write_results(tmp_path, [row(0), row(1)])
-    with pytest.raises(ValueError, match="expected the same pairs untrained and trained, got 1 and 2"):
+    with pytest.raises(ValueError, match="expected the same problems untrained and trained, got 1 and 2"):
         learning_table(before, other)
 
 
@@ -122,33 +120,19 @@ def test_a_report_without_a_wide_terminal_is_wide_enough(
     assert number(results.estimates["pnp"]["seconds_mean"]) in text
 
 
-def seeded(folder: Path, error: float, **settings: object) -> Results:
-    known = {"data": {"class_path": "Meshes", "init_args": {"seed": 0, "points": 9}}, "checkpoint": str(folder)}
-    return write_results(folder, [row(0, rotation_error_deg=error)], settings=known | settings)
+def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Path) -> None:
+    def run(name: str, error: float, **settings: object) -> Results:
+        return write_results(tmp_path / name, [row(0, rotation_error_deg=error)], settings=settings)
 
+    def data(**options: object) -> dict[str, object]:
+        return {"class_path": "Meshes", "init_args": {"seed": 0, **options}}
 
-def test_runs_of_several_seeds_have_rows_of_their_mean_and_spread(tmp_path: Path) -> None:
-    """Errors of 1, 2 and 6 degrees: mean 3, standard deviation sqrt((4 + 1 + 9) / 2)."""
-    runs = {f"psb-seed{i}": seeded(tmp_path / str(i), e, training_seed=str(i)) for i, e in enumerate((1.0, 2.0, 6.0))}
-    shown = results_table(runs)
-    (mean, mean_cells), (spread, spread_cells) = shown.groups[1]
-    assert (mean.plain, mean_cells[1].plain) == ("psb, mean of 3 seeds: pnp", "3.00")
-    assert (spread.plain.strip(), spread_cells[1].plain) == ("standard deviation", "2.65")
-    assert max(map(len, rendered(shown))) <= 80
-    assert "mean of 3 seeds" in quartiles_html(runs, None)
-    assert "mean of 3 seeds" in "".join(rendered(recall_table(runs)))
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        {"training_seed": "0"},  # the same seeds: another checkpoint of the same training
-        {"training_seed": None},  # not known
-        {"training_seed": "1", "data": {"class_path": "Meshes", "init_args": {"seed": 0, "points": 10}}},
-        {"training_seed": "1", "checkpoint": None},  # untrained
-    ],
-)
-def test_runs_that_differ_otherwise_have_no_mean(tmp_path: Path, other: dict[str, object]) -> None:
-    runs = {"a": seeded(tmp_path / "a", 1.0, training_seed="0"), "b": seeded(tmp_path / "b", 2.0, **other)}
-    assert seed_groups(runs) == {}
-    assert results_table(runs).groups[1] == []
+    same = {"a": run("a", 1.0, data=data(batch_size=2)), "b": run("b", 2.0, data=data(batch_size=4))}
+    assert bold(results_table(same))[0][:3] == ["1.00"] * 3
+    other = same | {"c": run("c", 0.1, data=data(seed=1)), "d": run("d", 0.2, data=data(num_points=3))}
+    shown = bold(results_table(other))
+    assert [texts[:3] for texts in shown[:2]] == [["1.00"] * 3, shown[1][:3]]
+    assert "0.100" not in shown[2]
+    assert shown[2] == shown[3] == []
+    assert 'class=best data-value="0.1"' not in quartiles_html(other, None)
+    assert 'class=best data-value="1.0"' in quartiles_html(other, None)

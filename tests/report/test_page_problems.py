@@ -6,16 +6,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from report_data import inflated, row, view
+from report_data import drawn_problem, inflated, row
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.page.pairs import VIEW_POINTS, page_points
+from bpnp.report.page.problems import PAGE_POINTS, page_points
+from bpnp.report.points import ProblemPoints, thin
 from bpnp.report.results import Results
-from bpnp.report.samples import PairView, thin
 
 
-def results(views: list[PairView]) -> Results:
-    rows = tuple(row(own.index, id=own.id, m=len(own.points2d), n=len(own.points3d)) for own in views)
+def results(problems: list[ProblemPoints]) -> Results:
+    rows = tuple(row(own.index, id=own.id, m=len(own.points2d), n=len(own.points3d)) for own in problems)
     return Results(rows, {"pnp": {}}, None, {}, "", "")
 
 
@@ -25,18 +25,18 @@ def read(text: str) -> tuple[dict[str, list[int]], list[dict[str, Any]]]:
     return places, lines
 
 
-def planted(count: int) -> list[PairView]:
+def planted(count: int) -> list[ProblemPoints]:
     """Pairs of 10 to 59 points, exactly projected by `ransac`; `pnp` has no pose."""
-    return [view(i, f"scene/{i:04d}", 10 + i % 50) for i in range(count)]
+    return [drawn_problem(i, f"scene/{i:04d}", 10 + i % 50) for i in range(count)]
 
 
 def test_the_page_has_the_points_and_poses_of_every_pair_while_there_is_room() -> None:
-    views = planted(40)
-    runs = {"a": results(views), "b": results(views)}
-    places, lines = read(page_points(runs, {"a": [thin(own) for own in views], "b": views}, room=10**6))
+    problems = planted(40)
+    runs = {"a": results(problems), "b": results(problems)}
+    places, lines = read(page_points(runs, {"a": [thin(own) for own in problems], "b": problems}, room=10**6))
     assert places["a"] == places["b"]
     assert sorted(places["a"]) == list(range(40))
-    for place, original in zip(places["a"], views, strict=True):
+    for place, original in zip(places["a"], problems, strict=True):
         line = lines[place]
         assert len(line["points2d"]) == len(original.points2d)
         points2d, points3d = np.array(line["points2d"]), np.array(line["points3d"])
@@ -51,11 +51,11 @@ def test_the_page_has_the_points_and_poses_of_every_pair_while_there_is_room() -
 
 
 def test_assignments_are_those_of_the_solver_and_large_pairs_are_thinned() -> None:
-    original = view(0, "a", 500)
+    original = drawn_problem(0, "a", 500)
     match = np.where(np.arange(500) % 4 == 0, original.match3d, -1).astype(np.int32)
     own = replace(original, match3d=match)
     _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}, room=10**6))
-    assert len(line["points2d"]) == len(line["points3d"]) == VIEW_POINTS
+    assert len(line["points2d"]) == len(line["points3d"]) == PAGE_POINTS
     for j, (i, assigned) in enumerate(zip(line["match3d"], line["assigned"]["run"], strict=True)):
         true = match[line["ids3d"][j]]
         assert (line["ids2d"][i] if i >= 0 else -1) == true
@@ -64,7 +64,7 @@ def test_assignments_are_those_of_the_solver_and_large_pairs_are_thinned() -> No
 
 
 def test_runs_on_other_points_have_lines_of_their_own() -> None:
-    one, other = view(0, "a", 20), replace(view(3, "a", 20), index=0)
+    one, other = drawn_problem(0, "a", 20), replace(drawn_problem(3, "a", 20), index=0)
     runs = {"x": results([one]), "y": results([other])}
     places, lines = read(page_points(runs, {"x": [one], "y": [other]}, room=10**6))
     assert sorted(places["x"] + places["y"]) == [0, 1]
@@ -74,8 +74,8 @@ def test_runs_on_other_points_have_lines_of_their_own() -> None:
 @pytest.mark.parametrize("room", [0, 8_000, 30_000])
 def test_the_page_keeps_to_its_room_and_takes_the_worst_first(room: int) -> None:
     error = np.random.default_rng(0).random(200)
-    views = [thin(replace(own, error=float(error[own.index]))) for own in planted(200)]
-    text = page_points({"a": results(views)}, {"a": views}, room=room)
+    problems = [thin(replace(own, error=float(error[own.index]))) for own in planted(200)]
+    text = page_points({"a": results(problems)}, {"a": problems}, room=room)
     places, lines = read(text)
     kept = np.flatnonzero(np.array(places["a"]) >= 0)
     assert len(text) <= max(room, 500)

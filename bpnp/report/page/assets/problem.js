@@ -1,4 +1,4 @@
-// One pair with the cameras of all runs, in space and in the image; a click picks a point in both.
+// One problem with the cameras of all runs, in space and in the image; a click picks a point in both.
 
 let open = {};
 const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
@@ -13,63 +13,64 @@ const projected = (pose, p) => { const [x, y, z] = toCamera(pose, p); return z >
 const xyz = (points) => Object.fromEntries(["x", "y", "z"].map((name, d) => [name, points.map((p) => p?.[d] ?? null)]));
 const extent = (points, d) => { const all = points.map((p) => p[d]); return [Math.min(...all), Math.max(...all)]; };
 
-function viewOf(series, i) {
-  const view = JSON.parse(LINES[series.lines[i]]);
-  const [[left, right], [top, bottom]] = [extent(view.points2d, 0), extent(view.points2d, 1)];
-  const cameras = [{ name: "true pose", colour: ink("text"), pose: view.truth }, ...SERIES.map((own, k) =>
-    ({ name: own.name, series: own, k, colour: ink(own.colour), pose: view.poses[own.run]?.[own.estimate] }))];
-  return { ...view, box: [left, top, right - left, bottom - top], photo: DATA.photos[series.ids[i]],
+function drawnProblem(series, i) {
+  const drawn = JSON.parse(LINES[series.lines[i]]);
+  const [[left, right], [top, bottom]] = [extent(drawn.points2d, 0), extent(drawn.points2d, 1)];
+  const cameras = [{ name: "true pose", colour: ink("text"), pose: drawn.truth }, ...SERIES.map((own, k) =>
+    ({ name: own.name, series: own, k, colour: ink(own.colour), pose: drawn.poses[own.run]?.[own.estimate] }))];
+  return { ...drawn, box: [left, top, right - left, bottom - top], photo: DATA.photos[series.ids[i]],
     cameras: cameras.filter(({ pose }) => pose) };
 }
 
 const swatch = (series) => byId(`series${SERIES.indexOf(series)}`).nextElementSibling.cloneNode(true);
 
-function openPair(i) {
+function openProblem(i) {
   const series = listed();
   const at = (other) => (other.ids === series.ids ? i : other.ids.indexOf(series.ids[i]));
   setState({ open: series.ids[i] });
-  byId("pair-title").textContent = series.ids[i];
+  byId("problem-title").textContent = series.ids[i];
   const runs = SERIES.filter((other) => at(other) >= 0);
-  byId("pair-numbers").tBodies[0].replaceChildren(...runs.map((other) => pairRow(other, at(other), swatch(other), other.name)));
+  const rows = runs.map((other) => problemRow(other, at(other), swatch(other), other.name));
+  byId("problem-numbers").tBodies[0].replaceChildren(...rows);
   const rank = chosen.indexOf(i);
   [byId("previous").disabled, byId("next").disabled] = [rank <= 0, rank < 0 || rank === chosen.length - 1];
   const owner = [series, ...runs].find((other) => other.lines[at(other)] >= 0);
-  [byId("views").hidden, byId("missing").hidden] = [!owner, Boolean(owner)];
-  if (!byId("pair").open) byId("pair").showModal();
-  open = { i, series, view: owner && viewOf(owner, at(owner)) };
+  [byId("drawings").hidden, byId("missing").hidden] = [!owner, Boolean(owner)];
+  if (!byId("problem").open) byId("problem").showModal();
+  open = { i, series, drawn: owner && drawnProblem(owner, at(owner)) };
   if (!owner) return;
-  byId("pose").replaceChildren(...open.view.cameras.map(({ name }, k) => element("option", { value: k }, name)));
-  byId("pose").value = Math.max(0, open.view.cameras.findIndex((camera) => camera.series === series));
-  byId("photo-label").hidden = !open.view.photo;
-  drawPair();
+  byId("pose").replaceChildren(...open.drawn.cameras.map(({ name }, k) => element("option", { value: k }, name)));
+  byId("pose").value = Math.max(0, open.drawn.cameras.findIndex((camera) => camera.series === series));
+  byId("photo-label").hidden = !open.drawn.photo;
+  drawProblem();
 }
 
 function step(by) {
   const next = chosen[chosen.indexOf(open.i) + by];
-  if (next !== undefined) openPair(next);
+  if (next !== undefined) openProblem(next);
 }
 
-function drawPair() {
-  if (!byId("pair").open || !open.view) return;
-  const { view, series } = open;
-  const camera = view.cameras[byId("pose").value];
-  const assigned = view.assigned[(camera?.series ?? series).run];
+function drawProblem() {
+  if (!byId("problem").open || !open.drawn) return;
+  const { drawn, series } = open;
+  const camera = drawn.cameras[byId("pose").value];
+  const assigned = drawn.assigned[(camera?.series ?? series).run];
   byId("lines").querySelector("[value=assigned]").disabled = !assigned;
   if (!assigned && byId("lines").value === "assigned") byId("lines").value = "true";
-  open.targets = { true: view.match3d, assigned }[byId("lines").value] ?? [];
+  open.targets = { true: drawn.match3d, assigned }[byId("lines").value] ?? [];
   byId("picked").textContent = "Click a point to see its number and its partner.";
-  drawScene(view);
-  open.ends = view.points3d.map((p) => camera && projected(camera.pose, p));
-  draw(byId("image"), image(view, camera, open.targets, byId("photo").checked && view.photo), { scrollZoom: true },
+  drawScene(drawn);
+  open.ends = drawn.points3d.map((p) => camera && projected(camera.pose, p));
+  draw(byId("image"), image(drawn, camera, open.targets, byId("photo").checked && drawn.photo), { scrollZoom: true },
     ({ curveNumber, pointNumber }) => {
       if (curveNumber === 2) pick(pointNumber, open.targets.indexOf(pointNumber));
       if (curveNumber === 3) pick(open.targets[pointNumber] ?? -1, pointNumber);
     });
   const seen = open.ends.filter(Boolean).length;
-  const hidden = seen < view.points3d.length ? "; the others lie behind the camera" : "";
-  say("image", `○ ${view.points2d.length} image points, × ${seen} of ${view.points3d.length} 3D points reprojected ` +
+  const hidden = seen < drawn.points3d.length ? "; the others lie behind the camera" : "";
+  say("image", `○ ${drawn.points2d.length} image points, × ${seen} of ${drawn.points3d.length} 3D points reprojected ` +
     `by ${camera?.name ?? "no pose"}${hidden}`, ". Dotted lines are wrong matches.");
-  byId("image").show = drawPair;
+  byId("image").show = drawProblem;
 }
 
 function say(id, what, more) {
@@ -133,28 +134,28 @@ function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, wid
 function thumbnail(series, i) {
   const picture = element("div");
   watch(picture, () => {
-    const view = viewOf(series, i);
-    const { data, layout } = image(view, view.cameras.find((camera) => camera.series === series), [], view.photo);
+    const drawn = drawnProblem(series, i);
+    const { data, layout } = image(drawn, drawn.cameras.find((camera) => camera.series === series), [], drawn.photo);
     layout.xaxis.visible = layout.yaxis.visible = false;
     draw(picture, { data, layout: { ...layout, margin: { l: 0, r: 0, t: 0, b: 0 } } }, { staticPlot: true });
   });
   const error = number(column(series, "rotation_error_deg")[i]);
-  return element("button", { onclick: () => openPair(i) }, picture, `${error} deg, ${series.ids[i]}`);
+  return element("button", { onclick: () => openProblem(i) }, picture, `${error} deg, ${series.ids[i]}`);
 }
 
 // Point j of space and point i of the image, -1 for none.
 function pick(i, j) {
-  const { view, ends } = open;
+  const { drawn, ends } = open;
   const words = [];
-  if (j >= 0) words.push(`3D point ${view.ids3d[j]} at (${view.points3d[j].map(number).join(", ")})`);
-  if (i >= 0) words.push(`2D point ${view.ids2d[i]} at (${view.points2d[i].map(number).join(", ")})`);
+  if (j >= 0) words.push(`3D point ${drawn.ids3d[j]} at (${drawn.points3d[j].map(number).join(", ")})`);
+  if (i >= 0) words.push(`2D point ${drawn.ids2d[i]} at (${drawn.points2d[i].map(number).join(", ")})`);
   if (i >= 0 && j >= 0 && ends[j]) {
-    const [a, b] = [[...view.points2d[i], 1], [...ends[j], 1]];
+    const [a, b] = [[...drawn.points2d[i], 1], [...ends[j], 1]];
     const angle = Math.atan2(Math.hypot(...cross(a, b)), a[0] * b[0] + a[1] * b[1] + 1);
     words.push(`reprojection error ${number((angle * 180) / Math.PI)} deg`);
   }
   byId("picked").textContent = words.join(" · ") + (i < 0 || j < 0 ? " · no partner" : "");
-  const spots = [xyz([view.points2d[i], ends[j]].filter(Boolean)), xyz([open.points[j]].filter(Boolean))];
+  const spots = [xyz([drawn.points2d[i], ends[j]].filter(Boolean)), xyz([open.points[j]].filter(Boolean))];
   Plotly.restyle("image", { x: [spots[0].x], y: [spots[0].y] }, [4]);
   Plotly.restyle("scene", { x: [spots[1].x], y: [spots[1].y], z: [spots[1].z] }, [1]);
 }

@@ -1,0 +1,289 @@
+"""Tables of results: what a column and a row are, the rows of runs and of the paper, on the terminal and in files."""
+
+import json
+import math
+from collections.abc import Hashable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich import box
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bpnp.report.results import Results, read_results
+from bpnp.report.runs import TrainingLog, lines_of, read_runs, trained_only
+from bpnp.report.terminal import WIDTH, Paper, SplitTable, number
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Values = Mapping[str, float | int | str]
+HERE = "here"
+CAPTION = (
+    "rot, repr: errors in degrees; trans: in scene units; quartiles Q1, Q2, Q3. 15deg 0.5, 10deg 1.0: % of problems "
+    "with both rotation and translation error within. sec: mean seconds a problem. No pose counts as 180 deg and inf."
+)
+# Options of the data that change no problem of a test.
+LOADING = {"batch_size", "eval_batch_size", "max_cells", "num_workers", "max_points", "fresh_subsets", "val_fraction"}
+
+
+@dataclass(frozen=True)
+class Column:
+    """Where a column's number is found, what is written above it, and whether it is a share (shown in %, more is
+    better), a count, or an error or a time (less is better)."""
+
+    key: str
+    header: str
+    share: bool = False
+    count: bool = False
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row: an estimate of a run or a method, its figures by column, and the share of outliers it was given.
+
+    source: "here", or the paper, whose figures are texts as printed. problems: equal for rows of the same problems,
+    among which the best figures are marked; None for a row that takes no part.
+    """
+
+    label: str
+    values: Values
+    source: str = HERE
+    rho: float | None = None
+    problems: Hashable = None
+
+    @property
+    def name(self) -> str:
+        """The label with the source or the share of outliers."""
+        name = self.label if self.source == HERE else f"{self.source}: {self.label}"
+        return name if self.rho is None else f"{name}, rho {self.rho:g}"
+
+
+ERRORS = (("rotation", "_deg", "rot"), ("translation", "", "trans"), ("reprojection", "_deg", "repr"))
+QUARTILES = tuple(
+    Column(f"{error}_q{i}{unit}", f"{short}\nQ{i}") for error, unit, short in ERRORS for i in (1, 2, 3)
+)  # fmt: skip
+RECALLS = (
+    Column("recall_joint_15deg_0.5", "15deg\n0.5", share=True),
+    Column("recall_joint_10deg_1", "10deg\n1.0", share=True),
+)
+SECONDS = Column("seconds_mean", "sec")
+RESULT_COLUMNS = (*QUARTILES, *RECALLS, Column("found", "found\n%", share=True), SECONDS)
+RECALL_COLUMNS = tuple(
+    Column(f"recall_{error}_{limit:g}{unit.lstrip('_')}", f"{short}\n{limit:g}", share=True)
+    for (error, unit, short), limits in zip(
+        ERRORS, ((1, 2, 5, 10, 20), (0.05, 0.1, 0.2, 0.5, 1), (0.25, 0.5, 1, 2)), strict=True
+    )
+    for limit in limits
+)
+FILE_COLUMNS = (Column("problems", "problems", count=True), *RESULT_COLUMNS)
+LATEX_COLUMNS = {
+    **{
+        (f"{error} Error", f"Q{i + 1}"): QUARTILES[3 * k + i]
+        for k, error in enumerate(("Rotation", "Translation", "Reproj."))
+        for i in range(3)
+    },
+    ("T", r"$\bar{x}$"): SECONDS,
+    (r"Recall (\%)", r"$15^\circ\!, 0.5$"): RECALLS[0],
+    (r"Recall (\%)", r"$10^\circ\!, 1$"): RECALLS[1],
+}
+
+# Campbell, Liu, Gould, ECCV 2020, tables 1 and 2, recalls from the text. R: the RANSAC estimate. SoftPOSIT, RANSAC and
+# GOSMA were stopped after 30 s; SoftPOSIT started from the mean pose (table 1) or near the true one (table 2).
+# A line a row: label | nine quartiles, seconds and, for some, the recall in %. Other data than ours, another machine.
+PRINTED: Mapping[Paper, tuple[str, Column, str]] = {
+    "modelnet40": ("ModelNet40", RECALLS[0], """
+        SoftPOSIT | 16.1 21.8 28.0 0.33 0.49 0.72 2.82 3.98 5.21 27
+        RANSAC    | 90.8 139  165  0.43 1.15 3.08 4.22 5.87 8.06 30
+        GOSMA     | 10.1 22.1 52.0 0.25 0.46 0.75 1.04 1.62 3.11 30
+        Lc        | 6.08 11.3 18.3 0.34 0.52 0.81 0.56 0.86 1.31 0.1
+        Lc Lp     | 4.88 9.66 16.0 0.04 0.08 0.15 0.36 0.61 1.03 0.1 72
+        Lc R      | 5.49 11.7 20.0 0.04 0.09 0.20 0.37 0.70 1.25 0.1
+        Lc Lp R   | 3.33 8.09 15.8 0.04 0.08 0.16 0.28 0.52 1.01 0.1"""),
+    "megadepth": ("MegaDepth", RECALLS[1], """
+        SoftPOSIT | 1.81 21.4 165  0.24 1.53 6.10 0.92 7.85 24.1 18
+        RANSAC    | 66.6 122  155  6.80 15.2 28.2 4.45 8.77 13.3 30
+        GOSMA     | 8.69 86.8 145  1.07 5.67 9.34 1.30 13.7 37.1 30
+        Lc        | 1.91 4.47 11.4 0.52 1.05 2.34 0.54 1.12 2.81 0.2
+        Lc Lp     | 1.32 3.31 8.84 0.21 0.46 1.08 0.21 0.53 1.64 0.2 73
+        Lc R      | 0.44 1.55 7.70 0.05 0.18 0.80 0.06 0.16 1.27 0.2
+        Lc Lp R   | 0.34 1.00 4.88 0.04 0.12 0.53 0.06 0.12 0.74 0.2 82"""),
+}  # fmt: skip
+
+
+def run_rows(runs: Mapping[str, Results], paper: Paper | None = None) -> list[Row]:
+    """A row per run and estimate, then what is printed."""
+    tested = {name: tested_problems(results) for name, results in runs.items()}
+    rows = [
+        Row(line.label, runs[line.run].estimates[line.estimate], problems=tested[line.run]) for line in lines_of(runs)
+    ]
+    return rows + paper_rows(paper)
+
+
+def tested_problems(results: Results) -> Hashable:
+    """Equal for results of the same problems: the same data, names and numbers of points."""
+    data = results.settings.get("data")
+    if isinstance(data, Mapping) and isinstance(data.get("init_args"), Mapping):
+        options = {key: value for key, value in data["init_args"].items() if key not in LOADING}
+        data = {**data, "init_args": options}
+    return json.dumps(data, sort_keys=True), frozenset((row.index, row.id, row.m, row.n) for row in results.rows)
+
+
+def paper_rows(paper: Paper | None) -> list[Row]:
+    """The printed rows of a data set; none without one."""
+    if paper is None:
+        return []
+    name, recall, text = PRINTED[paper]
+    keys = [column.key for column in (*QUARTILES, SECONDS, recall)]
+    lines = (line.split("|") for line in text.strip().splitlines())
+    return [
+        Row(label.strip(), dict(zip(keys, numbers.split(), strict=False)), f"paper, {name}") for label, numbers in lines
+    ]
+
+
+def cell(column: Column, values: Values) -> str:
+    """What a table shows of a column: a share in percent, a count whole, what was printed as it is, else `number`."""
+    value = values.get(column.key)
+    if value is None or isinstance(value, str):
+        return value or "-"
+    if column.count:
+        return f"{value:.0f}"
+    return f"{100 * value:.1f}" if column.share else number(value)
+
+
+def best_texts(columns: Sequence[Column], rows: Sequence[Row]) -> dict[tuple[Hashable, str], str]:
+    """By problems and column the best number of several rows as it is shown, so that what reads the same is marked the
+    same."""
+    best = {}
+    for problems in {row.problems for row in rows} - {None}:
+        alike = [row.values for row in rows if row.problems == problems]
+        for column in columns:
+            shown = [value for values in alike if isinstance(value := values.get(column.key), float)]
+            known = [value for value in shown if math.isfinite(value)]
+            if len(alike) > 1 and known and not column.count:
+                best[problems, column.key] = cell(column, {column.key: (max if column.share else min)(known)})
+    return best
+
+
+def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) -> SplitTable:
+    """Quartiles, joint recalls, share of problems with a pose and seconds per problem, a row per run and estimate.
+
+    The best number of each column is bold, among runs of the same problems. `paper` adds the published rows of that
+    data set, for orientation only: they are of other data and take no part in the comparison.
+    """
+    return table_of_rows(_title("Pose errors", runs), RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+
+
+def recall_table(runs: Mapping[str, Results]) -> SplitTable:
+    """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
+    caption = "% of problems with an error up to the number in the head: rot, repr in degrees; trans in scene units."
+    return table_of_rows(_title("Recall", runs), RECALL_COLUMNS, run_rows(runs), caption)
+
+
+def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> SplitTable:
+    """The rows on the terminal: ours with the best numbers bold, beneath them those of the paper."""
+    best = best_texts(columns, rows)
+    groups: tuple[list[tuple[Text, list[Text]]], ...] = ([], [])
+    for row in rows:
+        dim = "" if row.source == HERE else "dim"
+        texts = [(best.get((row.problems, column.key)), cell(column, row.values)) for column in columns]
+        cells = [Text(text, "bold" if text == most else dim) for most, text in texts]
+        groups[row.source != HERE].append((Text(row.name, dim), cells))
+    return SplitTable(title, [column.header for column in columns], groups, caption)
+
+
+def learning_table(before: Results, after: Results) -> Table:
+    """Correspondence loss and median rotation error of each estimate, untrained and trained, side by side.
+
+    Raises ValueError if the two are not of the same problems.
+    """
+    ids = [sorted({(row.index, row.id) for row in results.rows}) for results in (before, after)]
+    if ids[0] != ids[1]:
+        raise ValueError(f"expected the same problems untrained and trained, got {len(ids[0])} and {len(ids[1])}")
+    table = Table(title=_title("Learning", {"": after}), box=box.SIMPLE_HEAD)
+    table.add_column("")
+    for header in ("untrained", "trained"):
+        table.add_column(header, justify="right", no_wrap=True)
+    table.add_row("correspondence loss", *(number(results.correspondence_loss) for results in (before, after)))
+    for estimate in dict.fromkeys([*before.estimates, *after.estimates]):
+        medians = (results.estimates.get(estimate, {}).get("rotation_q2_deg") for results in (before, after))
+        table.add_row(Text(f"median rotation error, deg: {estimate}"), *map(number, medians))
+    return table
+
+
+def training_table(logs: Mapping[str, TrainingLog]) -> SplitTable:
+    """The last and the smallest value of each curve of each training."""
+    rows = []
+    for name, log in logs.items():
+        for curve, (steps, values) in log.curves.items():
+            texts = (f"{steps[-1]:.0f}", number(values[-1]), number(min(values)))
+            rows.append((Text(curve if len(logs) == 1 else f"{name}: {curve}"), [Text(text) for text in texts]))
+    return SplitTable("Training", ["steps", "last", "smallest"], [rows], "Nothing tested yet; try `bpnp test`.")
+
+
+def report(
+    paths: Sequence[Path], console: Console | None = None, *, paper: Paper | None = None, untrained: Path | None = None
+) -> None:
+    """Print the tables of one or several results folders, named by what their paths do not share.
+
+    `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
+    columns wide. Raises ValueError if a folder cannot be read.
+    """
+    if console is None:
+        console = Console()
+        console.width = max(console.width, WIDTH)
+    if logs := trained_only(paths):
+        console.print(training_table(logs))
+        return
+    runs = read_runs(paths)
+    console.print(results_table(runs, paper=paper))
+    console.print(recall_table(runs))
+    if untrained is not None:
+        console.print(learning_table(read_results(untrained), list(runs.values())[-1]))
+
+
+def table_frame(rows: Sequence[Row]) -> "DataFrame":
+    """Every figure in full, the paper's as printed, shares from 0 to 1; `source` tells them apart."""
+    from pandas import DataFrame
+
+    def full(column: Column, row: Row) -> float | int | str | None:
+        value = row.values.get(column.key)
+        return float(value) / 100 if column.share and isinstance(value, str) else value  # printed in percent
+
+    records = [[row.label, row.source, row.rho, *(full(column, row) for column in FILE_COLUMNS)] for row in rows]
+    return DataFrame(records, columns=["method", "source", "rho", *(c.key for c in FILE_COLUMNS)], dtype=object)
+
+
+def as_markdown(rows: Sequence[Row]) -> str:
+    """A table with the caption beneath; what is published is in italics."""
+    lines = [["method", *(" ".join(column.header.split()) for column in FILE_COLUMNS)]]
+    lines += [["---", *["---:"] * len(FILE_COLUMNS)]]
+    for row in rows:
+        name = row.name.replace("|", r"\|")
+        cells = [cell(column, row.values) for column in FILE_COLUMNS]
+        lines.append([name if row.source == HERE else f"*{name}*", *cells])
+    return "\n".join([*(f"| {' | '.join(cells)} |" for cells in lines), "", CAPTION, *note(rows), ""])
+
+
+def as_latex(rows: Sequence[Row]) -> str:
+    """A booktabs table with the paper's columns: quartiles, seconds, and both recalls."""
+    from pandas import DataFrame, MultiIndex
+
+    cells = [[row.name, *(cell(column, row.values) for column in LATEX_COLUMNS.values())] for row in rows]
+    frame = DataFrame(cells, columns=MultiIndex.from_tuples([("", "Method"), *LATEX_COLUMNS]))
+    style = frame.style.hide(axis="index").format(escape="latex")
+    align = "l" + "r" * len(LATEX_COLUMNS)
+    return style.to_latex(hrules=True, column_format=align, multicol_align="c", caption=" ".join(note(rows)) or None)
+
+
+def note(rows: Sequence[Row]) -> list[str]:
+    """A line on each source that is not ours."""
+    sources = dict.fromkeys(row.source for row in rows if row.source != HERE)
+    return [f"{source}: another data set than ours." for source in sources]
+
+
+def _title(what: str, runs: Mapping[str, Results]) -> str:
+    sizes = sorted({results.problems for results in runs.values()})
+    return f"{what}, {' or '.join(map(str, sizes))} problems"

@@ -1,0 +1,230 @@
+"""`bpnp table`: methods as they are named on the command line, and a `Trainer.test` of each on the same problems."""
+
+import json
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+from jsonargparse import ArgumentParser
+from lightning import LightningDataModule, Trainer
+from torch import nn
+from torch.utils.data import DataLoader, DistributedSampler
+
+from bpnp.files import packaged_config
+from bpnp.models import TrainedNet
+from bpnp.models.weights import checkpoint_path
+from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
+from bpnp.training.callbacks import interruptible
+from bpnp.training.results_writer import ResultsWriter
+from bpnp.training.task import BlindPnPTask
+
+SHORT_NAMES = {
+    "softposit": "bpnp.models.baselines.SoftPOSIT",
+    "ransac": "bpnp.models.baselines.RandomRansac",
+    "gosma": "bpnp.models.baselines.GOSMA",
+    "gopac": "bpnp.models.baselines.GOPAC",
+    "constellation": "bpnp.models.baselines.Constellation",
+    "hungarian": "bpnp.models.baselines.Hungarian",
+    "bpnpnet": "bpnp.models.BPnPNet",
+    "matcher": "bpnp.models.Matcher",
+    "search": "bpnp.models.Search",
+}
+TRAINED = (SHORT_NAMES["bpnpnet"], SHORT_NAMES["matcher"])
+ORDER_SEED = 0  # of the order in which `--limit` takes problems: the same for every method, and longer tables only add
+
+
+@dataclass(frozen=True)
+class Method:
+    """A row group of the table: a solver's class, its settings, and the checkpoint of its weights."""
+
+    label: str
+    class_path: str
+    init_args: dict[str, Any]
+    checkpoint: str | None = None
+    time_limit: float | None = None
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """All that the results depend on, as JSON has it; a checkpoint counts by its size and time too."""
+        described = asdict(self)
+        if self.checkpoint is not None:
+            state = Path(self.checkpoint).stat()
+            described["checkpoint_state"] = [state.st_size, int(state.st_mtime)]
+        return dict(json.loads(json.dumps(described, default=str)))
+
+    def build(self) -> nn.Module:
+        """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
+        if self.class_path in TRAINED and self.checkpoint is not None:
+            return TrainedNet.from_checkpoint(self.checkpoint)
+        init_args = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
+        solver: nn.Module = build(nn.Module, "solver", {"class_path": self.class_path, "init_args": init_args})
+        if self.time_limit is not None and "time_limit" in vars(solver):
+            vars(solver)["time_limit"] = self.time_limit
+        return solver.eval()
+
+
+def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> list[Method]:
+    """Methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path or a YAML file with a solver in it.
+
+    Raises ValueError for what names no method, a missing checkpoint, or two methods of one label.
+    """
+    methods = [_parse(text, time_limit) for text in texts]
+    labels = [method.label for method in methods]
+    doubled = next((label for label in labels if labels.count(label) > 1), None)
+    if doubled is not None:
+        raise ValueError(f"expected a label for each method, got {doubled!r} twice; try LABEL=METHOD")
+    return methods
+
+
+def _parse(text: str, time_limit: float | None) -> Method:
+    label, equals, what = text.partition("=")
+    what, at, checkpoint = (what if equals else text).partition("@")
+    class_path, init_args = _solver(what, text)
+    return Method(
+        label=label if equals else Path(what).stem if what.endswith(".yaml") else what.rpartition(".")[2],
+        class_path=class_path,
+        init_args=init_args,
+        checkpoint=str(checkpoint_path(checkpoint)) if at else None,
+        time_limit=time_limit,
+    )
+
+
+def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
+    if what in SHORT_NAMES:
+        return SHORT_NAMES[what], {}
+    what = packaged_config(what)
+    if what.endswith((".yaml", ".yml")):
+        solver = (_recipe(Path(what), "a solver").get("model") or {}).get("solver")
+        if isinstance(solver, str):
+            return solver, {}
+        if not isinstance(solver, dict) or "class_path" not in solver:
+            raise ValueError(f"expected model.solver.class_path in {what}, got none")
+        return solver["class_path"], solver.get("init_args") or {}
+    if "." in what:
+        return what, {}
+    raise ValueError(f"expected a method among {', '.join(SHORT_NAMES)}, a class path or a .yaml file, got {text!r}")
+
+
+def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
+    """`data` of a recipe's YAML with `--data.NAME=VALUE` overrides, as class_path and init_args.
+
+    Raises ValueError for a file without it, or for what its class does not accept.
+    """
+    data = _recipe(recipe, "`data`; try --data psb").get("data")
+    if not data:
+        raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
+    return checked(LightningDataModule, "data", data if isinstance(data, dict) else {"class_path": data}, overrides)
+
+
+def with_setting(data: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
+    """The same data with another value of a setting. Raises ValueError for data that have no such setting."""
+    return checked(LightningDataModule, "data", data | {"init_args": data["init_args"] | {name: value}})
+
+
+def _recipe(path: Path, what: str) -> dict[str, Any]:
+    if not path.is_file():
+        raise FileNotFoundError(f"expected a recipe with {what}, got no file {path}")
+    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+
+
+@dataclass(frozen=True)
+class MethodTest:
+    """A test of one method on one data set, into a folder; limit: problems, None for all."""
+
+    method: Method
+    data: dict[str, Any]
+    folder: Path
+    limit: int | None = None
+
+    def results(self) -> Results | None:
+        """The results that are there, of the wanted problems; None unless the test of all of these was finished.
+
+        Raises ValueError if the folder holds results of another method or of other data.
+        """
+        if not (self.folder / SUMMARY).is_file():
+            return None
+        results = read_results(self.folder)
+        wanted = plain({"method": self.method.identity, "data": self.data})
+        other = [key for key, value in wanted.items() if results.settings.get(key) != value]
+        if other:
+            raise ValueError(
+                f"expected {self.folder} without results of other settings, got other {', '.join(other)}; try another "
+                "--output"
+            )
+        chosen = set(problem_order(results.settings.get("size", 0))[: self.limit])
+        rows = tuple(row for row in results.rows if row.index in chosen)
+        if not results.settings.get("complete") or len({row.index for row in rows}) < max(len(chosen), 1):
+            return None
+        return replace(results, rows=rows, estimates=summarise(rows))
+
+    def run(self, *, progress_bar: bool = False) -> None:
+        """`test` the problems, each alone in its batch, so that its time is its own; results go into the folder."""
+        module = build(LightningDataModule, "data", self.data)
+        module.setup("test")
+        loader = module.test_dataloader()
+        if not isinstance(loader.sampler, DistributedSampler):
+            raise ValueError(
+                f"expected a data module of bpnp, whose problems can be chosen, got {self.data['class_path']}; try "
+                "`bpnp test` for each method, and `bpnp report` with their folders"
+            )
+        size = len(loader.dataset)
+        loader = DataLoader(
+            loader.dataset, sampler=[[(0, i)] for i in problem_order(size)[: self.limit]], batch_size=None
+        )
+        writer = ResultsWriter(str(self.folder))
+        writer.settings = {
+            "solver": {"class_path": self.method.class_path, "init_args": self.method.init_args},
+            "data": self.data, "checkpoint": self.method.checkpoint, "method": self.method.identity, "size": size,
+        }  # fmt: skip
+        messages = logging.getLogger("lightning.pytorch")
+        level, threads = messages.level, torch.get_num_threads()
+        messages.setLevel(logging.WARNING)
+        torch.set_num_threads(1)
+        torch.manual_seed(0)  # of a network without a checkpoint: its weights are the same in every process
+        trainer = Trainer(
+            accelerator="cpu", devices=1, callbacks=[writer], logger=False, enable_checkpointing=False,
+            enable_progress_bar=progress_bar, enable_model_summary=False,
+        )  # fmt: skip
+        try:
+            with interruptible(trainer):
+                trainer.test(BlindPnPTask(self.method.build()), loader, verbose=False)
+        finally:
+            messages.setLevel(level)
+            torch.set_num_threads(threads)
+
+
+def problem_order(size: int) -> list[int]:
+    """The fixed random order in which a limited table takes the problems of a data set of this size."""
+    return np.random.default_rng(ORDER_SEED).permutation(size).tolist()
+
+
+def checked(base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
+    """`class_path` and all `init_args` of a subclass of `base`, after `--NAME.SETTING=VALUE` overrides.
+
+    Raises ValueError, naming the class, for one that cannot be imported and for settings that it does not accept.
+    """
+    try:
+        chosen = _parser(base, name).parse_args([f"--{name}={json.dumps(settings)}", *overrides])
+    except Exception as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise ValueError(f"expected settings of {settings.get('class_path')}, got {reason}") from error
+    return dict(chosen.as_dict()[name])
+
+
+def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
+    """The object; raises as `checked` does, and as its constructor."""
+    known = checked(base, name, settings)
+    parser = _parser(base, name)
+    instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
+    return instantiate(parser.parse_object({name: known}))[name]
+
+
+def _parser(base: type, name: str) -> ArgumentParser:
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(base, name)
+    return parser
