@@ -40,36 +40,31 @@ class View:
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         return self.rotation.astype(np.float32), self.translation.astype(np.float32)
 
-    def sides(self, a: np.ndarray | None = None, b: np.ndarray | None = None) -> tuple[tuple, tuple]:
+    def sides(
+        self, a: np.ndarray | None = None, b: np.ndarray | None = None
+    ) -> tuple[WeightedBearings, WeightedPoints]:
         """Both sides with these weights, 1 by default, any labels, and points that are seen from everywhere."""
         one, free = np.ones(60, np.float32), np.full(60, -1, np.int32)
         points, everything = self.points.T.astype(np.float32).copy(), np.array([[0, 60, 0, 60]], np.uintp)
         return (
-            tuple(WeightedBearings(self.offsets, one if a is None else a, one, free)),
-            tuple(
-                WeightedPoints(
-                    points,
-                    one if b is None else b,
-                    one,
-                    free,
-                    everything,
-                    np.empty((6, 0), np.float32),
-                )
-            ),
+            WeightedBearings(self.offsets, one if a is None else a, one, free),
+            WeightedPoints(points, one if b is None else b, one, free, everything, np.empty((6, 0), np.float32)),
         )
 
     def tiles(self, largest: float) -> Tiles:
-        return build_tiles(WeightedBearings(*self.sides()[0])).with_margin(largest)
+        return build_tiles(self.sides()[0]).with_margin(largest)
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.1, 0.01, 0.0008])
 @pytest.mark.parametrize("relative", [0.3, 0.05])
 def test_the_assignment_on_clusters_is_the_product_form(entry: Any, spread: float, relative: float) -> None:
     view, scale, outlier = View(spread), relative * spread, 0.07
-    *scratch, q, _, _ = dense_scratch(60, 60)
+    scratch = dense_scratch(60, 60)
+    scratch.weight[:] = view.b
     likelihood = entry(assign)(
-        *view.sides(view.a, view.b), view.b, *view.pose(), np.float32(scale), np.float32(outlier), *scratch, q
-    )  # fmt: skip
+        *view.sides(view.a, view.b), *view.pose(), np.float32(scale), np.float32(outlier), scratch
+    )
+    q = scratch.q
     a, b, u = view.a.astype(float), view.b.astype(float), view.directions()
     k = np.maximum(1 - cdist(view.bearings, u, "sqeuclidean") / (2 * scale**2 * POWER), 0) ** POWER
     row = k @ b + outlier * b.sum()
@@ -83,19 +78,48 @@ def test_the_assignment_on_clusters_is_the_product_form(entry: Any, spread: floa
 @pytest.mark.parametrize("spread", [0.5, 0.01, 0.0008])
 def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(entry: Any, spread: float) -> None:
     view, scale, outlier = View(spread), 0.05 * spread, 0.002
-    tiles, (bearings, points), one = view.tiles(scale), view.sides(), np.ones(60, np.float32)
-    u, pairs, *sums, column, q = sparse_scratch(tiles, 60)[:6]
-    likelihood, matched = entry(assign_sparse)(
-        tuple(tiles), points, one, *view.pose(), np.float32(scale), np.float32(outlier), u, pairs, *sums, column, q
-    )
+    tiles, sides = view.tiles(scale), view.sides()
+    sparse, dense = sparse_scratch(tiles, 60), dense_scratch(60, 60)
+    sparse.weight[:] = dense.weight[:] = 1
+    at = *view.pose(), np.float32(scale), np.float32(outlier)
+    likelihood, matched, _ = entry(assign_sparse)(tiles, sides[1], *at, sparse)
     squared = cdist(view.bearings, view.directions(), "sqeuclidean")
     k = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
     assert likelihood == pytest.approx(np.log((k.mean(1) + outlier) / scale**2).mean(), abs=2e-3)
     assert 0.5 < matched < 50 / 60 + 0.05
-    dense = entry(assign)(
-        bearings, points, one, *view.pose(), np.float32(scale), np.float32(outlier), *dense_scratch(60, 60)[:-2]
-    )
-    assert dense == pytest.approx(likelihood, abs=0.1)
+    assert entry(assign)(*sides, *at, dense) == pytest.approx(likelihood, abs=0.1)
+
+
+@pytest.mark.parametrize("clumped", [False, True])
+def test_the_likelihood_on_tiles_is_exact_where_points_lie_together_and_in_a_mirror(clumped: bool) -> None:
+    """600 bearings of which most lie within the kernel's reach of one another, and 40 points: 38 tiles meet a point."""
+    rng = np.random.default_rng(3)
+    f = np.concatenate([rng.normal(0, 0.002 if clumped else 0.1, (500, 2)), rng.uniform(-0.3, 0.3, (100, 2))])
+    points = np.concatenate([rng.normal(0, 0.01 if clumped else 0.5, (30, 3)), rng.uniform(-1.5, 1.5, (10, 3))])
+    translation, scale, outlier = np.array([0.001, -0.002, 5.0], np.float32), np.float32(0.01), np.float32(20)
+    found = []
+    for sign in (1, -1):
+        bearings = np.column_stack([f * (sign, 1), np.ones(600)])
+        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
+        one, free = np.ones(600, np.float32), np.full(600, -1, np.int32)
+        side = WeightedBearings(np.ascontiguousarray((bearings - FORWARD).T, np.float32), one, one, free)
+        mirrored = (points * (sign, 1, 1)).T.astype(np.float32).copy()
+        scene = WeightedPoints(
+            mirrored, one[:40], one[:40], free[:40], np.empty((0, 4), np.uintp), np.empty((6, 0), np.float32)
+        )
+        tiles = build_tiles(side).with_margin(float(scale))
+        turned, moved = np.eye(3, dtype=np.float32)[None].copy(), (translation * (sign, 1, 1))[None].astype(np.float32)
+        result = np.zeros((1, 3), np.float32)
+        scales = np.array([scale], np.float32)
+        descend_sparse(tiles, scene, turned, moved, scales, outlier, 3, result, sparse_scratch(tiles, 40))
+        found.append(result[0].copy())
+        camera = mirrored.T.astype(float) + translation * (sign, 1, 1)
+        seen = camera / np.linalg.norm(camera, axis=1, keepdims=True)
+        squared = cdist(bearings, seen, "sqeuclidean")
+        kernel = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
+        expected = np.log(kernel.mean(1) / scale**2 + outlier).mean()
+        assert result[0, 0] == pytest.approx(expected, abs=2e-3)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
 
 
 @pytest.mark.parametrize("spread", [0.5, 0.01])
@@ -143,7 +167,7 @@ def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: floa
     descend(bearings, points, *poses[0], scales, np.float32(0.5), score, dense_scratch(60, 60))
     tiles = view.tiles(0.1)
     scratch = sparse_scratch(tiles, 60)
-    descend_sparse(tuple(tiles), points, *poses[1], scales, np.float32(0.5), 3, result, scratch)
+    descend_sparse(tiles, points, *poses[1], scales, np.float32(0.5), 3, result, scratch)
     for values in (score, result[:, 0]):
         assert values[1] == -math.inf
         assert np.isfinite(values[[0, 2]]).all()

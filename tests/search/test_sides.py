@@ -113,7 +113,7 @@ def test_a_point_is_seen_fully_within_its_cone_and_hardly_behind_it(entry: Any) 
     scene = Scene(replace(sets, cosines3d=np.full(120, 0.3)), 0, DEFAULT)
     pose = scene.enter(rotation, TRANSLATION)
     weight = np.empty(120, np.float32)
-    entry(visible_weights)(tuple(scene.sides()[1]), *pose, weight)
+    entry(visible_weights)(scene.sides()[1], *pose, weight)
     camera = sets.points3d @ rotation.T + TRANSLATION
     cosine = -((sets.normals3d @ rotation.T) * camera).sum(1) / np.linalg.norm(camera, axis=1)
     softness = DEFAULT.facing.softness

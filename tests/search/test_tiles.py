@@ -24,24 +24,25 @@ def test_pairs_are_all_that_are_within_reach(entry: Any, count: int, labelled: b
     labels2d, labels3d = (rng.integers(-1, 2 if labelled else 0, size=k).astype(np.int32) for k in (count, n))
     a = rng.uniform(0.5, 2, count).astype(np.float32)
     tiles = build_tiles(WeightedBearings(f, a, a, labels2d)).with_margin(float(scale))
-    _, (cells, start, order, met, point, kernel, end), sums, row, column, q, *_ = sparse_scratch(tiles, n)
-    entry(sort_points)(tuple(tiles), u, cells, start, order)
-    entry(meet)(tuple(tiles), labels3d, u, scale, start, order, met, point, kernel, end)
+    scratch = sparse_scratch(tiles, n)
+    near, sums, row, column, q = scratch.near, scratch.sums, scratch.row, scratch.column, scratch.q
+    entry(sort_points)(tiles, u, scratch.cells, scratch.start, scratch.order)
+    assert entry(meet)(tiles, labels3d, u, scale, scratch.start, scratch.order, near)
 
     squared = cdist(f.T, u.T, "sqeuclidean")
     fits = (labels2d[:, None] == labels3d) | (labels2d[:, None] < 0) | (labels3d < 0)
     expected = np.where((squared < (REACH * scale) ** 2) & fits, np.exp(-squared / (2 * scale**2)), 0)
     values = rng.uniform(0.5, 1, n).astype(np.float32)
-    entry(add_to_bearings)(values, point, kernel, end, sums)
+    entry(add_to_bearings)(values, near, sums)
     by_place = {
         tuple(at): total for at, total in zip(tiles.f.transpose(0, 2, 1).reshape(-1, 3), sums.ravel(), strict=True)
     }
     found = np.array([by_place[tuple(at)] for at in f.T])
     np.testing.assert_allclose(found, expected @ values, rtol=2e-3, atol=1e-4)
     row[:] = tiles.a
-    entry(add_to_points)(row, point, kernel, end, column)
+    entry(add_to_points)(row, near, column)
     np.testing.assert_allclose(column, a @ expected, rtol=2e-3, atol=1e-4)
-    entry(add_moments)(tiles.f, u, row, values, point, kernel, end, q)
+    entry(add_moments)(tiles.f, u, row, values, near, q)
     weight = a[:, None] * expected * values
     residual = np.einsum("ij,ijc->cj", weight, f.T[:, None] - u.T)
     np.testing.assert_allclose(q, [*residual, weight.sum(0)], rtol=2e-3, atol=1e-4)

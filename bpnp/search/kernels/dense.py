@@ -11,13 +11,12 @@ in (w, s). Whatever is overwritten comes from the caller: without an allocation 
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from bpnp.search.kernels.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
-from bpnp.search.kernels.weighted import visible_weights
+from bpnp.search.kernels.weighted import Array, WeightedBearings, WeightedPoints, visible_weights
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
@@ -119,27 +118,42 @@ def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
         u[0, j], u[1, j], u[2, j] = x, y, z
 
 
+class DenseScratch(NamedTuple):
+    """What `descend` overwrites, for m bearings and n points."""
+
+    kernel: Array  # (n, m)
+    base: Array  # (m,)
+    row: Array  # (m,)
+    u: Array  # (3, n)
+    column: Array  # (n,)
+    weight: Array  # (n,) of the points under the pose at hand
+    q: Array  # (4, n)
+    system: Array  # (8, 6)
+
+
+def dense_scratch(m: int, n: int) -> DenseScratch:
+    return DenseScratch(*(np.empty(shape, F) for shape in ((n, m), m, m, (3, n), n, n, (4, n), (8, 6))))
+
+
 @part
-def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: Any, scale: Any, outlier: Any,
-           kernel: Any, base: Any, row: Any, u: Any, column: Any, q: Any) -> Any:  # fmt: skip
+def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: Any, outlier: Any, scratch: Any) -> Any:
     """Fill q with the soft assignment in product form; return the mean log-likelihood of the bearings.
 
     The kernel is (1 + z/256)^256, z = -|f - u|^2 / 2 s^2: within 3 % of exp(z) where it exceeds 0.02, and without a
-    call. bearings, points: a `WeightedBearings` and a `WeightedPoints` as tuples, both in the order of their labels.
-    weight (n,): of the points under this pose. scale: s, radians. outlier: o of `Scene.outlier_density`. kernel (n, m),
-    base (m,), row (m,), u (3, n), column (n,): scratch.
+    call. bearings, points: a `WeightedBearings` and a `WeightedPoints`, both in the order of their labels; the weights
+    of the points under this pose are in the scratch. scale: s, radians. outlier: o of `Scene.outlier_density`.
     """
-    f, a, odds2d = bearings[0], bearings[1], bearings[2]
-    p, odds3d, blocks = points[0], points[2], points[4]
+    f, a, p, blocks = bearings.f, bearings.a, points.p, points.blocks
+    kernel, base, row, u, column, weight, q, _ = scratch
     m, n = f.shape[1], p.shape[1]
     total_a, total_b = sum_of(a), sum_of(weight) + F(1e-20)
     sharp = F(1) / (scale * scale * F(POWER))
     for i in range(m):
-        row[i] = outlier * total_b * odds2d[i]
+        row[i] = outlier * total_b * bearings.odds[i]
         base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
     directions(p, rotation, translation, u)
     for j in range(n):
-        column[j] = outlier * total_a * odds3d[j]
+        column[j] = outlier * total_a * points.odds[j]
         q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
     for k in range(len(blocks)):
         first, last = blocks[k, 0], blocks[k, 1]
@@ -185,29 +199,22 @@ def assign(bearings: Any, points: Any, weight: Any, rotation: Any, translation: 
 
 
 @compiled
-def descend(bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any,
-            scratch: Any) -> None:  # fmt: skip
+def descend(
+    bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
+) -> None:
     """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
 
     score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix. bearings, points: as for `assign`. outlier: o / s^2 of `Scene.outlier_density`. scratch: `dense_scratch`.
+    not fix. bearings, points: as for `assign`, or the same as plain tuples. outlier: o / s^2 of
+    `Scene.outlier_density`. scratch: `dense_scratch`.
     """
-    p = points[0]
-    kernel, base, row, u, column, q, weight, system = scratch
+    image, scene = WeightedBearings(*bearings), WeightedPoints(*points)
     for k in range(len(rotation)):
         for step in range(len(scales)):
             scale = scales[step]
-            visible_weights(points, rotation[k], translation[k], weight)
-            score[k] = assign(
-                bearings, points, weight, rotation[k], translation[k], scale, outlier * scale * scale, kernel, base,
-                row, u, column, q,
-            )  # fmt: skip
-            fixed = move(q, p, rotation[k], translation[k], F(RELAXATION), system)
+            visible_weights(scene, rotation[k], translation[k], scratch.weight)
+            score[k] = assign(image, scene, rotation[k], translation[k], scale, outlier * scale * scale, scratch)
+            fixed = move(scratch.q, scene.p, rotation[k], translation[k], F(RELAXATION), scratch.system)
             if not (fixed and math.isfinite(score[k])):
                 score[k] = -np.inf
                 break
-
-
-def dense_scratch(m: int, n: int) -> tuple[NDArray[np.float32], ...]:
-    """What `descend` overwrites, for m bearings and n points."""
-    return tuple(np.empty(shape, F) for shape in ((n, m), m, m, (3, n), n, (4, n), n, (8, 6)))

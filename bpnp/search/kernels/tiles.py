@@ -17,7 +17,6 @@ from bpnp.search.kernels.weighted import WeightedBearings
 
 REACH = 3.0  # scales; the kernel is below 0.012 beyond
 LANES = 16  # bearings of a tile
-MOST_TILES = 12  # of a point, of those with neighbours
 CELLS = 64  # along the longer side of the grid
 
 
@@ -46,6 +45,17 @@ class Tiles(NamedTuple):
         return self._replace(low=low, cell=cell, shape=np.floor((high - low) / cell).astype(np.int32) + 1)
 
 
+class Near(NamedTuple):
+    """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1].
+
+    point: (e,). kernel: (e, LANES), of the tile's bearings and this point. end: (c + 1,).
+    """
+
+    point: NDArray[np.int32]
+    kernel: NDArray[np.float32]
+    end: NDArray[np.int32]
+
+
 def build_tiles(bearings: WeightedBearings) -> Tiles:
     """Tiles of bearings, cut from stripes across x that are sorted by y, before there is a grid (`with_margin`)."""
     x, y = bearings.f[:2]
@@ -64,8 +74,8 @@ def build_tiles(bearings: WeightedBearings) -> Tiles:
 @part
 def sort_points(tiles: Any, u: Any, cells: Any, start: Any, order: Any) -> None:
     """order (n,): the points, seen in directions u (3, n), by their cells; those of cell c end at start[c]."""
-    low, shape = tiles[5], tiles[7]
-    inverse = F(1) / tiles[6]
+    low, shape = tiles.low, tiles.shape
+    inverse = F(1) / tiles.cell
     for c in range(len(start)):
         start[c] = 0
     for j in range(len(cells)):
@@ -92,29 +102,30 @@ def cells_between(first: Any, last: Any, low: Any, cell: Any, size: Any) -> tupl
 
 
 @part
-def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, met: Any, point: Any, kernel: Any,
-         end: Any) -> None:  # fmt: skip
-    """Pairs e of a tile t and a point near it, end[t] <= e < end[t + 1]: point[e], and kernel[e, k] for bearing k of t.
+def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Any) -> bool:
+    """Pairs e of a tile t and a point near it, end[t] <= e < end[t + 1]: point[e], and kernel[e, k] for bearing k of t;
+    False if `near`, a `Near`, has no place for all of them.
 
     The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond REACH.
     """
-    f, label, box, low, cell, shape = tiles[0], tiles[3], tiles[4], tiles[5], tiles[6], tiles[7]
+    f, label, box, low, cell, shape = tiles.f, tiles.label, tiles.box, tiles.low, tiles.cell, tiles.shape
+    point, kernel, end = near
     radius = F(REACH) * scale
     bound, sharp = radius * radius, F(-1 / 128) / (scale * scale)
-    for j in range(len(met)):
-        met[j] = 0
     place = end[0]
     for t in range(len(f)):
         i0, i1 = cells_between(box[t, 0] - radius, box[t, 2] + radius, low[0], cell, shape[0])
         j0, j1 = cells_between(box[t, 1] - radius, box[t, 3] + radius, low[1], cell, shape[1])
         for i in range(i0, i1 + 1):
             for e in range(start[i * shape[1] + j0], start[1 + i * shape[1] + j1]):
+                if place + 1 >= len(point):
+                    return False
                 j = order[e]
-                x, y, z, own, total = u[0, j], u[1, j], u[2, j], labels[j], F(0)
+                x, y, z, wanted, total = u[0, j], u[1, j], u[2, j], labels[j], F(0)
                 for k in range(LANES):
                     dx, dy, dz = f[t, 0, k] - x, f[t, 1, k] - y, f[t, 2, k] - z
                     squared = dx * dx + dy * dy + dz * dz
-                    partners = (own < 0) | (label[t, k] < 0) | (label[t, k] == own)
+                    partners = (wanted < 0) | (label[t, k] < 0) | (label[t, k] == wanted)
                     v = sharp * min(squared, bound)
                     v = F(1) + v * (F(1) + v * (F(0.5) + v * F(1 / 6)))
                     v = v * v
@@ -126,16 +137,16 @@ def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, me
                     kernel[place, k] = v
                     total += v
                 # Without a branch: the next pair takes the place of one that does not count.
-                counts = (total > 0) & (met[j] < MOST_TILES)
                 point[place] = j
-                met[j] += counts
-                place += counts
+                place += total > 0
         end[t + 1] = place
+    return True
 
 
 @part
-def add_to_bearings(values: Any, point: Any, kernel: Any, end: Any, sums: Any) -> None:
+def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
     """sums (c, LANES): sum_j K_ij values_j."""
+    point, kernel, end = near
     for t in range(len(sums)):
         for k in range(LANES):
             sums[t, k] = 0
@@ -146,8 +157,9 @@ def add_to_bearings(values: Any, point: Any, kernel: Any, end: Any, sums: Any) -
 
 
 @part
-def add_to_points(values: Any, point: Any, kernel: Any, end: Any, sums: Any) -> None:
+def add_to_points(values: Any, near: Any, sums: Any) -> None:
     """sums (n,): sum_i K_ij values_i, of values (c, LANES)."""
+    point, kernel, end = near
     for j in range(len(sums)):
         sums[j] = 0
     for t in range(len(values)):
@@ -159,8 +171,9 @@ def add_to_points(values: Any, point: Any, kernel: Any, end: Any, sums: Any) -> 
 
 
 @part
-def add_moments(f: Any, u: Any, row: Any, column: Any, point: Any, kernel: Any, end: Any, q: Any) -> None:
+def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> None:
     """q (4, n): sum_i W_ij (f_i - u_j) and sum_i W_ij, W_ij = row_i K_ij column_j."""
+    point, kernel, end = near
     for j in range(len(column)):
         q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
     for t in range(len(f)):

@@ -49,8 +49,8 @@ class WeightedPoints(NamedTuple):
 
 @part
 def visible_weights(points: Any, rotation: Any, translation: Any, weight: Any) -> None:
-    """weight (n,): b_j v_j of points, a `WeightedPoints` as a tuple, under a pose (3, 3), (3,)."""
-    p, b, cones = points[0], points[1], points[5]
+    """weight (n,): b_j v_j of points, a `WeightedPoints`, under a pose (3, 3), (3,)."""
+    p, b, cones = points.p, points.b, points.cones
     if cones.shape[1] == 0:
         for j in range(len(b)):
             weight[j] = b[j]
