@@ -14,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.augment import Augmentation
-from bpnp.datamodules.module import ProblemDataModule, hold_out
+from bpnp.datamodules.module import hold_out
 from bpnp.datamodules.problem import Problem
 from bpnp.datamodules.store import Made, Recipe, Row, Store, cached, is_store, open_store, prepare
-from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredProblems, check_limits, problem_row, scene_rows
+from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.geometry import MIN_POINTS
 
@@ -29,7 +28,7 @@ PROBED = 50  # samples that decide which side W_gt is indexed by
 AGREEMENT = 0.1  # median distance of a projected 3D point to its 2D point, normalised
 
 
-class AuthorsDataModule(ProblemDataModule):
+class AuthorsDataModule(StoredDataModule):
     """The problems that Campbell et al. (ECCV 2020) published, with their split; some are held out for validation.
 
     Works without a Trainer: `setup()`, then the loaders.
@@ -39,13 +38,8 @@ class AuthorsDataModule(ProblemDataModule):
             which is then converted once into cache_dir.
         dataset: modelnet40, megadepth or data61_2d3d; none for the only one that is there.
         val_fraction: share of the training problems that is held out for validation, at random.
-        min_points: problems with fewer matches are left out; at least 4.
-        max_points: largest number of matches in training, a random subset of more; none for all.
-        fresh_subsets: draw new subsets, outliers and rotations every epoch in training.
-        eval_max_points: the same as max_points in validation, testing and prediction, where it is fixed.
-        rotate: turn the 3D points of each training problem by a random rotation.
         cache_dir: where the authors' files are converted to; none for BPNP_CACHE, else the user's cache folder.
-        loading: options of `ProblemDataModule`: batch_size, eval_batch_size, train_outliers, test_outliers, seed, ...
+        options: those of `StoredDataModule`.
     """
 
     def __init__(
@@ -54,43 +48,27 @@ class AuthorsDataModule(ProblemDataModule):
         *,
         dataset: str | None = None,
         val_fraction: float = 0.05,
-        min_points: int = 4,
-        max_points: int | None = 1000,
-        fresh_subsets: bool = True,
-        eval_max_points: int | None = None,
-        rotate: bool = False,
         cache_dir: str | None = None,
-        **loading: Any,
+        **options: Any,
     ) -> None:
-        super().__init__(**loading)
-        check_limits(min_points, max_points, eval_max_points)
-        self.root, self.dataset, self.cache_dir = Path(root), dataset, cache_dir
-        self._opened: Store | None = None
-        self.val_fraction, self.min_points, self.fresh = val_fraction, min_points, fresh_subsets
-        evaluation = Augmentation(eval_max_points, clutter=0.0)
-        self.augmentations = dict.fromkeys(("val", "test", "predict"), evaluation)
-        self.augmentations["train"] = Augmentation(max_points, clutter=0.0, rotate=rotate)
+        super().__init__(root, train_scenes=["train"], val_scenes=["val"], test_scenes=["test"], **options)
+        self.dataset, self.cache_dir, self.held_out = dataset, cache_dir, val_fraction
 
     def prepare_data(self) -> None:
         """Convert in one process, for `setup` to open in all."""
-        self._store()
+        self._open()
 
-    def _source(self, part: str, seed: tuple[int, int]) -> StoredProblems:
-        store = self._store()
-        rows = split_rows(store, "train" if part in ("train", "val") else "test")
-        if part in ("train", "val"):
-            training, held_out = hold_out(len(rows), self.val_fraction, seed=self.seed)
-            rows = rows[training if part == "train" else held_out]
-        return StoredProblems(store, rows, min_points=self.min_points)
-
-    def _store(self) -> Store:
-        """The problems, opened once, and converted now if they are not."""
-        if self._opened is None and is_store(self.root):
-            self._opened = open_store(self.root, PROBLEMS)
-        elif self._opened is None:
-            recipe = authors_recipe(self.root, self.dataset)
-            self._opened = cached(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
-        return self._opened
+    def _open(self) -> dict[str, Any]:
+        """The rows of each part. The problems are opened once, and converted now if they are not."""
+        if not hasattr(self, "store"):
+            if is_store(self.root):
+                self.store = open_store(self.root, PROBLEMS)
+            else:
+                recipe = authors_recipe(Path(self.root), self.dataset)
+                self.store = cached(recipe, str(recipe.parameters["dataset"]), self.cache_dir)
+        rows = split_rows(self.store, "train")
+        training, held_out = hold_out(len(rows), self.held_out, seed=self.seed)
+        return {"train": rows[training], "val": rows[held_out], "test": split_rows(self.store, "test")}
 
 
 def prepare_authors(source: Path, output: Path, *, dataset: str | None = None) -> Store:

@@ -28,7 +28,7 @@ def data_for(recipe: str, folder: Path) -> list[str]:
         for i in range(5):
             plant_model(folder / "scenes" / f"scene{i}" / "sparse" / "0", seed=i)
         return [*small, f"--data.root={folder / 'scenes'}"]
-    if recipe.startswith(("sfm", "maps")):
+    if recipe.startswith("synthetic_maps"):
         return [*small, "--data.num_points=30", "--data.train_pairs=4", "--data.val_pairs=2", "--data.test_pairs=2"]
     small += ["--data.num_points=30", "--data.pool_size=64", "--data.train_pairs=4", f"--data.cache_dir={folder}"]
     if recipe.startswith("quickstart"):

@@ -6,8 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from jsonargparse import ArgumentParser
+from lightning import LightningDataModule
 
-from bpnp.datamodules import ColmapDataModule, Problem, ProblemSource, write_problems
+import bpnp.datamodules
+from bpnp.datamodules import Problem, ProblemSource, StoredDataModule, write_problems
 from bpnp.datamodules.augment import Augmentation
 from bpnp.datamodules.loader import ProblemDataset, problem_loader
 from bpnp.datamodules.store import Store, StoreError, open_store
@@ -116,6 +119,19 @@ def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) 
 
 
 def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
-    data = ColmapDataModule(str(store.folder), test_scenes=["s1"], val_scenes=["s2"])
+    data = StoredDataModule(str(store.folder), test_scenes=["s1"], val_scenes=["s2"])
     data.setup()
     assert {name for batch in data.test_dataloader() for name in batch.ids} == {f"scène 1/{i}" for i in range(1, 12, 3)}
+
+
+@pytest.mark.parametrize(
+    ("earlier", "today"),
+    [("SfmSceneDataModule", "SyntheticMapDataModule"), ("PreprocessedDataModule", "AuthorsDataModule")],
+)
+def test_class_paths_of_earlier_yaml_files_load(earlier: str, today: str) -> None:
+    parser = ArgumentParser(exit_on_error=False)
+    parser.add_subclass_arguments(LightningDataModule, "data")
+    root = {} if earlier.startswith("Sfm") else {"root": "nowhere"}
+    arguments = {"data": {"class_path": f"bpnp.datamodules.{earlier}", "init_args": root | {"batch_size": 3}}}
+    data = parser.instantiate(parser.parse_object(arguments)).data
+    assert (type(data), data.batch_size) == (getattr(bpnp.datamodules, today), 3)

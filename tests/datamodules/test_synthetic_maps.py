@@ -253,13 +253,13 @@ def test_density_is_uneven_as_that_of_keypoints() -> None:
 
 
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
-    (tmp_path / "sfm.yaml").write_text(
+    (tmp_path / "data.yaml").write_text(
         "{num_points: 48, outliers: [0, 0.5], views: [1, 2], kinds: {statue: 1, street: 2}, noise_px: 1,"
         " train_pairs: 8, val_pairs: 3, test_pairs: 3, batch_size: 4, train_outliers: {ratio: [0, 1]}}"
     )
     parser = ArgumentParser()
     parser.add_class_arguments(SyntheticMapDataModule, "data")
-    data = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'sfm.yaml'}"])).data
+    data = parser.instantiate_classes(parser.parse_args([f"--data={tmp_path / 'data.yaml'}"])).data
     with pytest.raises(ValueError, match="expected `setup` before the train loader"):
         data.train_dataloader()
     data.setup()
