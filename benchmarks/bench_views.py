@@ -27,7 +27,7 @@ from view_pairs import LEAST_PAIRS, MOST_POINTS, Array, ViewPair, disturbed, sce
 
 from bpnp import PosePrior, solve
 from bpnp.cameras import camera_from
-from bpnp.maps.views import VIEW_DEGREES, VIEW_SHARE
+from bpnp.maps.localize import VIEW_DEGREES, VIEW_SHARE
 from bpnp.models import TrainedNet
 from bpnp.models.weights import pretrained_names
 from bpnp.solving.problem import problem_from

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import same_shape
+from bpnp.cameras import is_opencv, same_shape
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -105,6 +105,13 @@ def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
             return image.size, image.getexif().get_ifd(IFD_EXIF)
     except OSError as error:
         raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
+
+
+def pixels_from(keypoints: Any, camera: Any) -> Any:
+    """The pixels (m, 2) of a list of cv2.KeyPoint as their camera counts them; anything else as it is."""
+    if not isinstance(keypoints, (list, tuple)) or not all(hasattr(point, "pt") for point in keypoints):
+        return keypoints
+    return np.array([point.pt for point in keypoints]).reshape(-1, 2) + (0.0 if is_opencv(camera) else CENTRE)
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:

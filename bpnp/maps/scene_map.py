@@ -1,5 +1,7 @@
 """A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
+import math
+import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,11 +16,13 @@ from torch import nn
 from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape, scaled_camera
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.maps.localize import localize
-from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size
-from bpnp.maps.views import Array, Cones, Region, View, covering_order, viewing_cones
+from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
+from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size, pixels_from
+from bpnp.maps.views import Array, Cones, View, covering_order, viewing_cones
 from bpnp.search.starts import PosePrior
+from bpnp.solving.arguments import source_from
 from bpnp.solving.solution import Solution
+from bpnp.solving.sources import Options
 
 LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
 SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera is taken for that of a photo
@@ -165,12 +169,29 @@ class SceneMap:
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
-        if isinstance(keypoints, (list, tuple)) and keypoints and all(hasattr(point, "pt") for point in keypoints):
-            keypoints = np.array([point.pt for point in keypoints]) + (0.0 if is_opencv(camera) else CENTRE)
-        regions = self.regions(views)
-        return localize(
-            regions, keypoints, camera, scores=scores, prior=prior, solver=solver, seed=seed, time_limit=time_limit
-        )
+        start, pixels, best = time.monotonic(), pixels_from(keypoints, camera), list[tuple[Region, Solution]]()
+        if time_limit is not None and not 0 < time_limit < math.inf:
+            raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
+        strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
+        used = pixels if strongest is None else np.asarray(pixels)[strongest]
+        module, regions, tries, over = source_from(solver), self.regions(views), 0, False
+        for settings in (BRIEF, LONGER):
+            for region in regions:
+                remaining = None if time_limit is None else time_limit - (time.monotonic() - start)
+                if over := over or (bool(best) and remaining is not None and remaining <= 0):
+                    break
+                tries += 1
+                limit = None if remaining is None else max(remaining, 1e-3)
+                asks = solver == "auto" and settings is LONGER  # not of every view of the map
+                options = Options(module, asks, seed=seed, time_limit=limit, settings=settings)
+                solution = counted(near_view(region, used, camera, prior, options), tries)
+                best = sorted([*best, (region, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
+                over = solution.verdict == "confident"
+            regions = iter([region for region, _ in best])
+        if not best:
+            raise ValueError("expected a map with views that see 4 or more points, got none")
+        solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels, camera)
+        return replace(solution, seconds=time.monotonic() - start)
 
     def localize_photo(
         self,

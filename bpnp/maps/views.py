@@ -1,4 +1,4 @@
-"""The views of a map: which points they see and from where, and in which order to look near them."""
+"""The views of a map: which points they see and from where, and in which order they cover the map."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -9,11 +9,8 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from bpnp.cameras import Camera
-from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]
-VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which one sees a third of the other's points
-VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
 # A local feature is found again from some way beside the cameras that saw it, and hardly from farther: of the points
 # that photos of five models see, 95 % are seen from 22 degrees or less beyond the directions of the track, where of the
 # points that project into these photos and are not seen 21 to 85 % would be seen from more than 30 degrees beyond.
@@ -44,24 +41,6 @@ class Cones(NamedTuple):
 
     axes: Array
     cosines: Array
-
-
-@dataclass(frozen=True, eq=False)
-class Region:
-    """Points (k, 3) of the map that one view, or several, see, their ids and cones, and the view to look near.
-
-    distance: from the view to its own points, the median.
-    """
-
-    view: View
-    points3d: Array
-    point_ids: NDArray[np.int64]
-    cones: Cones
-    distance: float
-
-    def prior(self) -> PosePrior:
-        """The view's pose, as wide as photos of one place lie apart."""
-        return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
 
 
 def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integer]]]) -> Cones:

@@ -83,6 +83,12 @@ def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pyt
     place.run("a.png", "b.png")
     assert "kept 2 of 2 photos, solved before with the same content and options" in capsys.readouterr().out
     assert file.stat().st_mtime_ns == before
+    file.write_text(file.read_text()[:1000])  # not whole, whatever results.json has of it
+    place.run("a.png", "b.png")
+    assert "kept 1 of 2 photos" in capsys.readouterr().out
+    (place.folder / "out/results.json").unlink()
+    place.run("a.png", "b.png")
+    assert "kept 2 of 2 photos" in capsys.readouterr().out
     assert (place.folder / "out/poses.txt").read_text() == poses
 
 
