@@ -8,18 +8,21 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
-from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import event
-from numba.core.codegen import JITCodeLibrary
-from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
-from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
-from numba.core.types import BaseFunction
-from numba.core.untyped_passes import InlineClosureLikes
 
 # Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
+KNOWN = (0, 60) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69)  # private parts are as they were tested
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
+
+if KNOWN:
+    from bpnp.loops import shortcuts
+else:
+    logging.getLogger(__name__).warning(
+        "expected numba 0.60 to 0.68, got %s: loops are compiled slowly and in each process; try numba<0.69",
+        numba.__version__,
+    )
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -35,7 +38,9 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     there ends the process), and is optimised and kept with its callers alone, which saves another quarter.
     """
     part = "no_cpython_wrapper" in options
-    options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "pipeline_class": _LoopCompiler}
+    options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    if KNOWN:
+        options["pipeline_class"] = shortcuts.LoopCompiler
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -43,8 +48,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             *(_FILES[known] for known in function.__globals__.values() if isinstance(known, Dispatcher))
         )
         try:
-            dispatcher: Any = numba.njit(function, cache=not part, **options)
-            if not part:
+            dispatcher: Any = numba.njit(function, cache=KNOWN and not part, **options)
+            if KNOWN and not part:
                 stats = [os.stat(file) for file in sorted(files)]
                 dispatcher._cache._cache_file._source_stamp = [(stat.st_mtime, stat.st_size) for stat in stats]
         except RuntimeError:  # numba finds no folder for its cache
@@ -55,74 +60,11 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compiled
 
 
-class _LoopCode(JITCodeLibrary):
-    """The code of a loop, and of its wrapper for Python, which only takes arrays apart and is not optimised."""
-
-    def add_ir_module(self, ir_module: Any) -> None:
-        if ir_module.name == "wrapper":
-            for function in ir_module.functions:
-                if not function.is_declaration:
-                    function.attributes.add("noinline")
-                    function.attributes.add("optnone")
-        super().add_ir_module(ir_module)
-
-
-class _PartCode(JITCodeLibrary):
-    """The code of a function that is linked into those that call it, as numba translated it."""
-
-    def _optimize_final_module(self) -> None:
-        """Leave it to the callers."""
-
-    def _finalize_final_module(self) -> None:
-        self._finalized = True
-
-
-class _LoopCompiler(Compiler):
-    """Compiles a loop, or a part of one, which gets no machine code of its own."""
-
-    def __init__(self, typing: Any, target: Any, _: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
-        code = (_PartCode if flags.no_cpython_wrapper else _LoopCode)(target.codegen(), "loop")
-        code.enable_object_caching()
-        super().__init__(typing, target, code, args, result, flags, *rest)
-        if flags.no_cpython_wrapper:
-            self.state.targetctx.get_executable = _without_machine_code
-
-    def define_pipelines(self) -> Any:
-        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
-        the end of each variable's life, which matters where references are counted."""
-        (pipeline,) = super().define_pipelines()
-        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
-        if not self.state.flags.nrt:
-            unused.add(IRLegalization)
-        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
-        pipeline.finalize()
-        return [pipeline]
-
-
-def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
-    """What stands for the function among numba's; `Compiler` gives each compilation a copy of the target."""
-    return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
-
-
-_FUNCTION: Any = BaseFunction  # of numba, or an operator
-_resolve = _FUNCTION.get_call_type
-_RESOLVED: dict[Any, Any] = {}
-
-
-def _resolve_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
-    """As `get_call_type` of a function of numba's, whose answer for each kind of arguments is kept."""
-    key = function, context, tuple(args), tuple(kws.items())
-    if key not in _RESOLVED:
-        _RESOLVED[key] = _resolve(function, context, args, kws)
-    return _RESOLVED[key]
-
-
 class _Compilation(event.Listener):
     """Logs one line when the first of this package's functions is compiled, for it takes seconds.
 
-    Meanwhile Python's collector of cycles rests, which would find nothing and take an eighth of the time, and numba
-    looks up what an operator does with some types once, not at each use, which takes a sixth. numba compiles one
-    function at a time, whatever the thread, and those that it calls within it.
+    Meanwhile Python's collector of cycles rests, which would find nothing and take an eighth of the time, and
+    `shortcuts` are taken. numba compiles one function at a time, whatever the thread, and those that it calls within.
     """
 
     made, depth, collected = False, 0, False
@@ -136,14 +78,16 @@ class _Compilation(event.Listener):
         if not self.depth:
             self.collected = gc.isenabled()
             gc.disable()
-            _FUNCTION.get_call_type = _resolve_once
+            if KNOWN:
+                shortcuts.resolve_once(True)
         self.depth += 1
 
     def on_end(self, event: event.Event) -> None:
         if _is_ours(event):
             self.depth -= 1
             if not self.depth:
-                _FUNCTION.get_call_type = _resolve
+                if KNOWN:
+                    shortcuts.resolve_once(False)
                 if self.collected:
                     gc.enable()
 

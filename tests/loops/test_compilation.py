@@ -87,7 +87,7 @@ def test_what_rests_while_a_loop_is_compiled_goes_on_afterwards(
     """Python's collector, and numba's own way to resolve the types of a call."""
     printed, _ = started(package, str(tmp_path / "cache"), NOTE_STATE + before).communicate(timeout=120)
     compiling, called, values, last = printed.splitlines()
-    assert (compiling, called, values) == ("False bpnp.loops.compilation", "False bpnp.loops.compilation", "8 10")
+    assert (compiling, called, values) == ("False bpnp.loops.shortcuts", "False bpnp.loops.shortcuts", "8 10")
     assert last == f"{collects} numba.core.types.functions"
 
 
@@ -108,6 +108,18 @@ def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> 
         assert logged.count("compiling") == 1
 
 
+def test_another_version_of_numba_compiles_without_shortcuts_and_says_so(package: Path, tmp_path: Path) -> None:
+    for version in ("0.99.0rc1", "1.2.3"):
+        ask = f"import numba\nnumba.__version__ = '{version}'\nfrom bpnp.loop import double\nprint(double(4))"
+        environment = {**os.environ, "PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(tmp_path)}
+        done = subprocess.run(
+            [sys.executable, "-c", ask], env=environment, cwd=package, capture_output=True, text=True, check=True
+        )
+        assert done.stdout == "8\n"
+        assert f"got {version}: loops are compiled slowly" in done.stderr
+        assert not list(tmp_path.rglob("*.nbi"))
+
+
 def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, tmp_path: Path) -> None:
     """All find the loop's value, and what they leave in the cache is whole: the next one compiles nothing."""
     cache, gate = str(tmp_path / "cache"), tmp_path / "gate"
@@ -126,7 +138,15 @@ SIGNATURES = """
 import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
-from bpnp import solve
+from bpnp import GravityPrior, PosePrior, solve
+from bpnp.search.warm_up import warm_up
+def signatures():
+    loops = {loop for name in list(sys.modules) if name.startswith("bpnp.search.")
+             for loop in vars(sys.modules[name]).values()
+             if isinstance(loop, Dispatcher) and not loop.targetoptions.get("no_cpython_wrapper")}
+    return sorted(f"{loop.py_func.__name__}:{len(loop.signatures)}" for loop in loops)
+warm_up()
+print(*signatures())
 for n in (10, 100):
     points = np.random.default_rng(0).normal(size=(n, 3))
     seen = points + (0, 0, 6)
@@ -134,14 +154,20 @@ for n in (10, 100):
     solve(image, points)
     solve(image.astype(np.float32), np.asfortranarray(points), labels2d=labels, labels3d=labels.astype(np.int32))
     solve(image, points, normals3d=-seen / np.linalg.norm(seen, axis=1, keepdims=True))
-loops = {loop for name in list(sys.modules) if name.startswith("bpnp.") for loop in vars(sys.modules[name]).values()
-         if isinstance(loop, Dispatcher) and not loop.targetoptions.get("no_cpython_wrapper")}
-print(*sorted(f"{loop.py_func.__name__}:{len(loop.signatures)}" for loop in loops if loop.signatures))
+    solve(image, points, prior=GravityPrior((0, 1, 0), (0, 1, 0)), time_limit=2)
+    solve(image, points, prior=PosePrior(np.eye(3), None, 1.0), time_limit=2)
+    solve(image, points, prior=PosePrior(np.eye(3), (0, 0, 6), 4.0, 0.3), time_limit=2)
+    random = np.random.default_rng(1).normal(size=(n, 3)) + (0, 0, 9)
+    solve(random[:, :2] / random[:, 2:], points, normals3d=points / np.linalg.norm(points, axis=1, keepdims=True),
+          time_limit=3)
+print(*signatures())
 """
 
 
-def test_whatever_the_arrays_of_a_pair_each_loop_is_compiled_once() -> None:
+def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem() -> None:
     done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, check=True)
-    names, counts = zip(*(entry.split(":") for entry in done.stdout.split()), strict=True)
-    assert {"descend", "descend_sparse", "sweep", "vary"} <= set(names)
+    warm, used = done.stdout.splitlines()
+    names, counts = zip(*(entry.split(":") for entry in warm.split()), strict=True)
+    assert {"descend_on_clusters", "descend_on_points", "add_shifted", "add_up", "sweep", "vary"} <= set(names)
     assert set(counts) == {"1"}
+    assert used == warm

@@ -199,22 +199,27 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 
 
 @compiled
-def descend(
+def descend_on_clusters(
     bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
 ) -> None:
-    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
-
-    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix. bearings, points: as for `assign`, or the same as plain tuples. outlier: o / s^2 of
-    `Scene.outlier_density`. scratch: `dense_scratch`.
-    """
-    image, scene = WeightedBearings(*bearings), WeightedPoints(*points)
+    """`descend`."""
     for k in range(len(rotation)):
         for step in range(len(scales)):
             scale = scales[step]
-            visible_weights(scene, rotation[k], translation[k], scratch.weight)
-            score[k] = assign(image, scene, rotation[k], translation[k], scale, outlier * scale * scale, scratch)
-            fixed = move(scratch.q, scene.p, rotation[k], translation[k], F(RELAXATION), scratch.system)
+            visible_weights(points, rotation[k], translation[k], scratch.weight)
+            score[k] = assign(bearings, points, rotation[k], translation[k], scale, outlier * scale * scale, scratch)
+            fixed = move(scratch.q, points.p, rotation[k], translation[k], F(RELAXATION), scratch.system)
             if not (fixed and math.isfinite(score[k])):
                 score[k] = -np.inf
                 break
+
+
+def descend(bearings: Any, points: Any, *rest: Any) -> None:
+    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
+
+    bearings, points: as for `assign`, or the same as plain tuples. rest: rotation, translation, scales, outlier,
+    o / s^2 of `Scene.outlier_density`, score, and `dense_scratch`.
+    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
+    not fix.
+    """
+    descend_on_clusters(WeightedBearings(*bearings), WeightedPoints(*points), *rest)

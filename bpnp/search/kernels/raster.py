@@ -42,7 +42,7 @@ def add_up(
     raster (g, g), rows are y; its outermost cells are 0. The first one begins at -half in both coordinates; per_cell
     cells a unit. rotation (S, 3, 3), translation (S, 3). weight (n,), cell (n,) int32: overwritten.
     """
-    scene = WeightedPoints(*points)
+    scene = WeightedPoints(*points)  # they may come as a plain tuple
     cells, values = np.int32(len(raster)), raster.reshape(-1)
     last = F(cells - 1)
     for k in range(len(rotation)):

@@ -121,7 +121,7 @@ def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation:
 
 
 @compiled
-def _descend(
+def descend_on_points(
     tiles: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int, result: Any,
     scratch: Any,
 ) -> int:  # fmt: skip
@@ -167,7 +167,7 @@ def descend_sparse(
     tiles, points, done = Tiles(*tiles), WeightedPoints(*points), 0
     while True:
         rest = rotation[done:], translation[done:], scales, outlier, patience, result[done:], scratch
-        done += int(_descend(tiles, points, *rest))
+        done += int(descend_on_points(tiles, points, *rest))
         if done == len(rotation):
             return
         scratch = sparse_scratch(tiles, len(points.b), 2 * len(scratch.near.point))
