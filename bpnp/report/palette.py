@@ -17,7 +17,7 @@ INKS = {
     "panel": ("#f5f6f8", "#1d2128"),
     "focus": ("#0b57d0", "#8ab4f8"),
     "wrong": ("#b3261e", "#ff8a80"),
-} | {f"c{i}": pair for i, pair in enumerate(zip(LIGHT, DARK, strict=True))}
+} | {f"c{i}": inks for i, inks in enumerate(zip(LIGHT, DARK, strict=True))}
 QUIET = INKS["quiet"][0]
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))

@@ -163,7 +163,9 @@ class MethodTest:
         return replace(results, rows=rows, estimates=summarise(rows))
 
     def run(self, *, progress_bar: bool = False) -> None:
-        """`test` the problems, each alone in its batch, so that its time is its own; results go into the folder."""
+        """`test` the problems, each alone in its batch, so that its time is known; results go into the folder.
+
+        Raises ValueError for a method that gives no pose."""
         module = build(LightningDataModule, "data", self.data)
         module.setup("test")
         loader = module.test_dataloader()
@@ -196,6 +198,8 @@ class MethodTest:
         finally:
             messages.setLevel(level)
             torch.set_num_threads(threads)
+        if not writer.rows:
+            raise ValueError(f"expected a pose from {self.method.label!r}, got predictions without one")
 
 
 def problem_order(size: int) -> list[int]:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from small_data import small_net
+from torch import nn
 
 from bpnp.cli import main
 from bpnp.files import claimed
@@ -105,6 +106,23 @@ class Failing(RandomRansac):
         if Failing.solved == 3:
             raise KeyboardInterrupt
         return super().forward(batch)
+
+
+class Poseless(nn.Module):
+    """Answers without a pose."""
+
+    def forward(self, batch: Batch) -> Prediction:
+        return Prediction()
+
+
+def test_a_method_without_poses_is_named(
+    recipes: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["table", recipes[1], "--methods", "it=test_table_command.Poseless", recipes[-1], "--limit=1"]
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    assert stop.value.code == 2
+    assert "expected a pose from 'it', got predictions without one" in capsys.readouterr().err
 
 
 def test_a_method_that_was_interrupted_starts_again(recipes: list[str], tmp_path: Path) -> None:

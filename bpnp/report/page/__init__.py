@@ -1,1 +1,1 @@
-"""The page of a report: one HTML file with tables, plotly charts and every pair."""
+"""The page of a report: one HTML file with tables, plotly charts and every problem."""

@@ -70,7 +70,7 @@ def _described(settings: Mapping[str, Any]) -> str:
             kind = str(part["class_path"]).rpartition(".")[2]
             said.append(f"{name} {kind}" + (f" ({options})" if options and name == "data" else ""))
     if settings.get("complete") is False:
-        said.append("interrupted before the last pair")
+        said.append("interrupted before the last problem")
     if settings.get("checkpoint"):
         said.append(f"checkpoint {settings['checkpoint']}")
     return ", ".join(said)

@@ -33,7 +33,7 @@ COLUMNS = {  # of the table of problems: head and hover text
     "inliers": ("inliers", "2D points with a reprojected 3D point beside them"),
     "m": ("2D points", "2D points of the problem"),
     "n": ("3D points", "3D points of the problem"),
-    "matches": ("true matches", "3D points with a true match"),
+    "matches": ("matches", "3D points with a true match"),
     "iterations": ("iterations", "iterations of the solver"),
     "seconds": ("sec", "seconds, the problem's share of its batch"),
 }

@@ -30,8 +30,7 @@ function openProblem(i) {
   setState({ open: series.ids[i] });
   byId("problem-title").textContent = series.ids[i];
   const runs = SERIES.filter((other) => at(other) >= 0);
-  const rows = runs.map((other) => problemRow(other, at(other), swatch(other), other.name));
-  byId("problem-numbers").tBodies[0].replaceChildren(...rows);
+  byId("problem-numbers").tBodies[0].replaceChildren(...runs.map((s) => problemRow(s, at(s), swatch(s), s.name)));
   const rank = chosen.indexOf(i);
   [byId("previous").disabled, byId("next").disabled] = [rank <= 0, rank < 0 || rank === chosen.length - 1];
   const owner = [series, ...runs].find((other) => other.lines[at(other)] >= 0);
