@@ -84,9 +84,8 @@ def open_store(folder: str | Path, kind: str) -> Store:
     path = Path(folder)
     for name, (size, checksum) in _manifest(path, kind)["files"].items():
         file = path / name
-        found = file.stat().st_size if file.is_file() else None
-        if found != size:
-            got = "no such file" if found is None else f"{found} bytes"
+        if not file.is_file() or file.stat().st_size != size:
+            got = f"{file.stat().st_size} bytes" if file.is_file() else "no such file"
             raise StoreError(f"expected {file} of {size} bytes, got {got}; try copying or preparing again")
         if _checksum(file) != checksum:
             raise StoreError(f"expected {file} as it was written, got other bytes; try copying or preparing again")

@@ -82,10 +82,10 @@ def read_records(folder: Path) -> ModelRecords:
     """
     suffix = model_format(folder)
     if suffix is None:
-        found = ", ".join(sorted(path.name for path in folder.glob("*"))[:8])
+        files = ", ".join(sorted(path.name for path in folder.glob("*"))[:8])
         raise ColmapError(
             f"expected a COLMAP model (cameras, images and points3D, all .bin or all .txt) in {folder}, got "
-            f"{found or 'no file'}; try the folder sparse/0 of a scene"
+            f"{files or 'no file'}; try the folder sparse/0 of a scene"
         )
     paths = [folder / f"{name}.{suffix}" for name in FILES]
     contents = [_content(path) for path in paths]
@@ -131,10 +131,10 @@ def _rewrite_text(paths: list[Path], contents: list[bytes], target: str) -> None
                 "model again, or add the line break if it is whole"
             )
         header = re.search(rb"^# Number of \w+: (\d+)", content, re.MULTILINE)
-        found = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
-        if header and int(header[1]) > found:
+        records = sum(not line.startswith(b"#") for line in content.splitlines()) // FILES[path.stem]
+        if header and int(header[1]) > records:
             raise ColmapError(
-                f"expected {int(header[1])} records in {path} as its header says, got {found}: it is truncated; try "
+                f"expected {int(header[1])} records in {path} as its header says, got {records}: it is truncated; try "
                 "copying the model again, or correct the header if records were removed on purpose"
             )
     try:

@@ -2,9 +2,8 @@
 
 import logging
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -90,41 +89,19 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
             continue
         if record.camera_id not in cameras:
             where = f"camera {record.camera_id} of image {record.name!r} in {path}"
-            cameras[record.camera_id] = camera_of(records.cameras.get(record.camera_id), where)
+            cameras[record.camera_id] = _camera_of(records.cameras.get(record.camera_id), where)
         camera = cameras[record.camera_id]
         image = _registered(record, camera, ids)
         images.append(_with_keypoints(image, record, ids, points3d, lost) if keypoints else image)
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
-    found = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost), ids)
-    if found.notable:
-        logger.warning("not used in %s: %s", path, found.notable)
-    return found
+    reconstruction = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost), ids)
+    if reconstruction.notable:
+        logger.warning("not used in %s: %s", path, reconstruction.notable)
+    return reconstruction
 
 
-def read_projections(folder: Path) -> dict[str, Callable[[NDArray[np.float64]], NDArray[np.float64]]]:
-    """By image name, the function from rays (k, 3) in camera coordinates to places (k, 2) in the image, as shares of
-    its width and height, distortion included. A photo may have another size than the camera's image.
-
-    Raises ColmapError as `read_reconstruction`.
-    """
-    records = read_records(folder)
-    cameras = {image.camera_id: image for image in records.images}
-    lenses = {
-        key: camera_of(records.cameras.get(key), f"camera {key} of image {image.name!r} in {folder}")
-        for key, image in cameras.items()
-    }
-    sizes = {key: np.array(records.cameras[key].size, np.float64) for key in lenses}
-    if not all((size > 0).all() for size in sizes.values()):
-        raise ColmapError(f"expected cameras with a width and a height in {folder}, got 0; try another model")
-
-    def place(rays: NDArray[np.float64], *, key: int) -> NDArray[np.float64]:
-        return lenses[key].project(rays) / sizes[key]
-
-    return {image.name: partial(place, key=image.camera_id) for image in records.images}
-
-
-def camera_of(record: CameraRecord | None, where: str) -> Camera:
+def _camera_of(record: CameraRecord | None, where: str) -> Camera:
     """The camera of a record; `where` names it in the error for one that is missing or not usable."""
     if record is None:
         raise ColmapError(f"expected {where}, got no such camera; try another model")

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.ndimage import map_coordinates
 
+from bpnp.cameras import Camera, image_size
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, model_format
-from bpnp.datamodules.colmap.reconstruction import read_projections
+from bpnp.datamodules.colmap.reconstruction import ImagePoints, read_reconstruction
 
 # What lies between the folder of a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
 # <scene>/dense/0/sparse.
@@ -111,16 +112,18 @@ def photo_finder(root: Path) -> Callable[[str, Box], Pixels | None]:
     Raises ColmapError if `root` holds no COLMAP model.
     """
     models = {name: folder for scene in find_scenes(root).values() for name, folder in scene.items()}
-    projections = cache(read_projections)
+
+    @cache
+    def images(model: str) -> dict[str, ImagePoints]:
+        return {image.name: image for image in read_reconstruction(models[model], keypoints=False).images}
 
     def find(name: str, box: Box) -> Pixels | None:
         model = max((model for model in models if name.startswith(f"{model}/")), key=len, default=None)
         if model is None:
             return None
-        image = name[len(model) + 1 :]
-        path = image_file(models[model], image)
-        project = projections(models[model]).get(image)
-        if path is None or project is None:
+        image = images(model).get(name[len(model) + 1 :])
+        path = None if image is None else image_file(models[model], image.name)
+        if image is None or path is None:
             return None
         try:
             with Image.open(path) as file:
@@ -128,7 +131,7 @@ def photo_finder(root: Path) -> Callable[[str, Box], Pixels | None]:
         except (OSError, ValueError) as error:
             logger.warning("photo %s cannot be read: %s", path, error)
             return None
-        return _resampled(photo, project, box)
+        return _resampled(photo, image.camera, box)
 
     return find
 
@@ -139,13 +142,15 @@ def image_file(model: Path, image: str) -> Path | None:
     return next((path for path in paths if path.is_file()), None)
 
 
-def _resampled(photo: Pixels, project: Callable[[NDArray[np.float64]], NDArray[np.float64]], box: Box) -> Pixels:
+def _resampled(photo: Pixels, camera: Camera, box: Box) -> Pixels:
     left, top, right, bottom = box
     height = int(np.clip(round(WIDTH * (bottom - top) / (right - left)), 16, 2 * WIDTH))
     x = left + (np.arange(WIDTH) + 0.5) / WIDTH * (right - left)
     y = top + (np.arange(height) + 0.5) / height * (bottom - top)
     rays = np.stack([*np.meshgrid(x, y), np.ones((height, WIDTH))], -1).reshape(-1, 3)
-    size = np.array(photo.shape[1::-1])
-    column, row = (project(rays) * size - 0.5).T  # COLMAP's origin is the corner of the first pixel
+    if (size := image_size(camera)) is None:
+        raise ColmapError("expected a camera with a width and a height in the COLMAP model, got 0; try another model")
+    scale = np.array(photo.shape[1::-1]) / size  # a photo may have another size than the camera's image
+    column, row = (camera.project(rays) * scale - 0.5).T  # COLMAP's origin is the corner of the first pixel
     channels = [map_coordinates(photo[..., c], [row, column], order=1, cval=0) for c in range(3)]
     return np.stack(channels, -1).reshape(height, WIDTH, 3)

@@ -101,8 +101,8 @@ def open_archive(source: Path) -> MeshFiles:
 
 def _named(paths: Iterable[str]) -> dict[str, str]:
     """Path of each mesh by its name, ``<class>/<split>/<stem>``; the training meshes first. Others are no meshes."""
-    found = (ENTRY.fullmatch(path) for path in paths if "__MACOSX" not in path)
-    entries = {f"{match[1]}/{match[2].lower()}/{match[3]}": match[0] for match in found if match}
+    meshes = (ENTRY.fullmatch(path) for path in paths if "__MACOSX" not in path)
+    entries = {f"{mesh[1]}/{mesh[2].lower()}/{mesh[3]}": mesh[0] for mesh in meshes if mesh}
     order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
     return {name: entries[name] for name in order}
 

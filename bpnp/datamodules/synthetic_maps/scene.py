@@ -206,8 +206,8 @@ def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *
     facing[~normals.any(1)] = 1.0
     chance = scene.repeatability[near]
     chance = np.where(chance > 0, chance, ONE_PHOTO if alone else 0.0)
-    found = GRAZING * rng.random(len(near)) < chance * np.minimum(facing, GRAZING)
-    near = near[found]
+    detected = GRAZING * rng.random(len(near)) < chance * np.minimum(facing, GRAZING)
+    near = near[detected]
     near = near[~hidden(scene, camera.centre, scene.points[near])]
     return Sight(near, np.stack([x[near], y[near]], -1) / depth[near, None], depth[near])
 
