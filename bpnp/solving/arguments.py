@@ -1,5 +1,9 @@
-"""The arguments of `solve_many`, one entry a pair. Every function raises ValueError for what is not usable."""
+"""The arguments of `solve` and `solve_many`, checked: each function raises ValueError for what is not usable.
 
+`where` names the problem in the errors, where there are several.
+"""
+
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +16,14 @@ from torch import nn
 from bpnp.cameras import Camera, camera_from
 from bpnp.search.starts import GravityPrior, PosePrior
 
+Array = npt.NDArray[np.float64]
+Labels = npt.NDArray[np.int64]
 Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
-EXPECTED = "expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned'"
+UNIT_NORM = 1e-3  # largest error of a length
+WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
+INSIDE_ONE_PIXEL = 3.0
+WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
 
 
 def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
@@ -46,85 +55,205 @@ def device_from(wanted: str | torch.device | None) -> torch.device | None:
     return device
 
 
-def each_set(name: str, values: Any, size: int | None, axes: int = 2) -> list[Any]:
-    """The arrays of the pairs, of `axes` axes each; one array is shared by all where their number is known.
-
-    None, for what is not known of any pair, is shared too.
-    """
-    if size is not None and (values is None or getattr(values, "ndim", 0) == axes):
-        return [values] * size
-    wanted = f"expected `{name}` as a sequence of arrays, one a pair"
-    if getattr(values, "ndim", axes + 1) != axes + 1:
-        raise ValueError(f"{wanted}, got shape {tuple(values.shape)}")
-    try:
-        found = list(values)
-    except TypeError as error:
-        raise ValueError(f"{wanted}, got {values!r:.60}") from error
-    if not found or (size is not None and len(found) != size):
-        count = "one array a pair" if size is None else f"{size} arrays as in `points2d`"
-        raise ValueError(f"expected {count} in `{name}`, got {len(found)}")
-    return found
+def each_set(name: str, values: Any, count: int | None, axes: int = 2) -> list[Any]:
+    """The arrays of `count` problems, of `axes` axes each; one array, or None, is shared by all where that is known."""
+    dims = getattr(values, "ndim", axes + 1)
+    if count is not None and (values is None or dims == axes):
+        return [values] * count
+    if dims != axes + 1 or not hasattr(values, "__iter__"):
+        got = f"{values!r:.60}" if dims == axes + 1 else f"shape {tuple(values.shape)}"
+        raise ValueError(f"expected `{name}` as a sequence of arrays, one a problem, got {got}")
+    arrays = list(values)
+    if not arrays or len(arrays) != (count or len(arrays)):
+        wanted = "one array a problem" if count is None else f"{count} arrays as in `points2d`"
+        raise ValueError(f"expected {wanted} in `{name}`, got {len(arrays)}")
+    return arrays
 
 
-def each_of(name: str, given: Any, size: int) -> list[Any]:
-    """A list has one each; anything else is for all."""
-    if not isinstance(given, list):
-        return [given] * size
-    if len(given) != size:
-        raise ValueError(f"expected {size} of `{name}`, one a pair, got {len(given)}")
-    return given
+def each_of(name: str, value: Any, count: int) -> list[Any]:
+    """A list has one each; anything else is for all problems."""
+    if not isinstance(value, list):
+        return [value] * count
+    if len(value) != count:
+        raise ValueError(f"expected {count} of `{name}`, one a problem, got {len(value)}")
+    return value
 
 
-def each_camera(given: Any, size: int) -> list[Camera | None]:
+def each_camera(value: Any, count: int) -> list[Camera | None]:
     """One camera for all, or a list or stack of them. A 3x3 matrix as a list of lists is one camera."""
-    if getattr(given, "ndim", 2) == 3:
-        given = list(given)
-    elif isinstance(given, list) and given and not isinstance(given[0], tuple):
-        rows = isinstance(given[0], str) or np.ndim(given[0]) == 1  # (model, parameters), or the rows of one matrix
-        given = tuple(given) if rows else given
-    return [None if one is None else camera_from(one) for one in each_of("camera", given, size)]
+    if getattr(value, "ndim", 2) == 3:
+        value = list(value)
+    elif isinstance(value, list) and value and not isinstance(value[0], tuple):
+        rows = isinstance(value[0], str) or np.ndim(value[0]) == 1  # (model, parameters), or the rows of one matrix
+        value = tuple(value) if rows else value
+    return [None if one is None else camera_from(one) for one in each_of("camera", value, count)]
 
 
-def checked_prior(given: Any) -> Prior | None:
+def positive(name: str, value: float | int | None, *, finite: bool = False) -> float | None:
+    """The number as a float; None stays."""
+    if value is not None and not (value > 0 and (value < math.inf or not finite)):
+        raise ValueError(f"expected a positive `{name}`, got {value}")
+    return None if value is None else float(value)
+
+
+def checked_prior(prior: Any) -> Prior | None:
     """A prior with its numbers as float64 arrays, or a net: itself, of a checkpoint, or "learned", the packaged one."""
-    if given is None:
+    if prior is None:
         return None
-    if isinstance(given, (nn.Module, str, Path)):
-        return _checked_net(given)
-    if isinstance(given, PosePrior):
-        rotation = _array("prior.rotation", given.rotation, (3, 3))
+    if isinstance(prior, PosePrior):
+        rotation = _vector("prior.rotation", prior.rotation, (3, 3))
         off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if off > 1e-3 or np.linalg.det(rotation) < 0:
             raise ValueError(f"expected a rotation in `prior.rotation`, got {rotation.tolist()}")
-        shift = None if given.translation is None else _array("prior.translation", given.translation, (3,))
+        shift = None if prior.translation is None else _vector("prior.translation", prior.translation, (3,))
         for name in ("rotation_sigma_deg", "translation_sigma"):
-            if not getattr(given, name) > 0:
-                raise ValueError(f"expected a positive `prior.{name}`, got {getattr(given, name)}")
+            positive(f"prior.{name}", getattr(prior, name))
         if off > ROUNDING:
             rotation = Rotation.from_matrix(rotation).as_matrix()
-        return given._replace(rotation=rotation, translation=shift)
-    if isinstance(given, GravityPrior):
-        camera = _array("prior.up_camera", given.up_camera, (3,))
-        scene = _array("prior.up_scene", given.up_scene, (3,))
-        if not (camera.any() and scene.any() and given.sigma_deg > 0):
-            raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {given}")
-        return GravityPrior(camera, scene, given.sigma_deg)
-    raise ValueError(f"{EXPECTED}, got {given!r:.60}")
-
-
-def _checked_net(given: nn.Module | str | Path) -> nn.Module:
+        return prior._replace(rotation=rotation, translation=shift)
+    if isinstance(prior, GravityPrior):
+        camera, scene = (_vector(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
+        if not (camera.any() and scene.any() and prior.sigma_deg > 0):
+            raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {prior}")
+        return GravityPrior(camera, scene, prior.sigma_deg)
     from bpnp.models.weights import LEARNED, TrainedNet  # where a network is asked for
 
-    if isinstance(given, (str, Path)):
-        learned = str(given) == "learned"
-        return TrainedNet.from_pretrained(LEARNED) if learned else TrainedNet.from_checkpoint(given)
-    if isinstance(given, TrainedNet):
-        return given
-    raise ValueError(f"{EXPECTED}, got {given!r:.60}")
+    if isinstance(prior, (str, Path)):
+        return TrainedNet.from_pretrained(LEARNED) if str(prior) == "learned" else TrainedNet.from_checkpoint(prior)
+    if isinstance(prior, TrainedNet):
+        return prior
+    raise ValueError(
+        f"expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned', got {prior!r:.60}"
+    )
 
 
-def _array(name: str, values: Any, shape: tuple[int, ...]) -> npt.NDArray[np.float64]:
-    array = np.asarray(values.detach().cpu() if hasattr(values, "detach") else values, np.float64)
+def _vector(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    array = numbers(name, values, "")
     if array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"expected finite `{name}` of shape {shape}, got {array.tolist()}")
     return array
+
+
+def numbers(name: str, values: Any, where: str) -> Array:
+    """The values in float64."""
+    if isinstance(values, torch.Tensor):
+        values = values.detach().cpu().double().numpy() if not values.is_complex() else values.numpy()
+    try:
+        array = np.asarray(values)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"{array.dtype}")
+        return array.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
+
+
+def keypoints(values: Any, where: str) -> Array:
+    """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays or lists of cv2.KeyPoint, and
+    rows of four or more numbers that begin with x and y (scale, orientation, strength)."""
+    if isinstance(values, (list, tuple)) and len(values) and all(hasattr(value, "pt") for value in values):
+        values = [value.pt for value in values]
+    points = one_row_each(numbers("points2d", values, where))
+    return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
+
+
+def one_row_each(points: Array) -> Array:
+    """(k, 1, d) as OpenCV has them, as (k, d)."""
+    return points[:, 0] if points.ndim == 3 and points.shape[1] == 1 else points
+
+
+def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int, where: str) -> None:
+    """Points (k, width), k `fewest` or more, all finite."""
+    if points.ndim != 2 or points.shape[1] not in widths:
+        shapes = " or ".join(f"(k, {width})" for width in widths)
+        swapped = points.ndim == 2 and points.shape[1] in (2, 3)
+        hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
+        raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
+    if len(points) < fewest:
+        raise ValueError(f"expected {fewest} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
+    bad = np.flatnonzero(~np.isfinite(points).all(-1))
+    if len(bad):
+        raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
+
+
+def unit_bearings(rays: Array, where: str) -> Array:
+    """Bearings (m, 3) of length one, to rounding."""
+    length = np.linalg.norm(rays, axis=-1, keepdims=True)
+    if np.abs(length - 1).max() > UNIT_NORM:
+        worst = float(length[np.abs(length - 1).argmax(), 0])
+        raise ValueError(
+            f"expected unit bearings in `points2d` of shape (m, 3){where}, got one of length {worst:g} (are points2d "
+            "and points3d swapped?); try points2d of shape (m, 2), or to divide by the lengths"
+        )
+    return rays / length
+
+
+def normalised(points2d: Array, camera: Camera | None, where: str) -> Array:
+    """Points (m, 2) on the normalised image plane, undistorted."""
+    if camera is None:
+        if np.median(np.linalg.norm(points2d, axis=-1)) > WIDEST:
+            raise ValueError(
+                f"expected normalised image coordinates without a `camera`{where}, got values up to "
+                f"{np.abs(points2d).max():g}, which look like pixels; try camera=K"
+            )
+        return points2d
+    if np.abs(points2d).max() < INSIDE_ONE_PIXEL and camera.focal > 100:
+        raise ValueError(
+            f"expected pixels with a `camera`{where}, got values up to {np.abs(points2d).max():g}, which look "
+            "normalised; try without the camera"
+        )
+    return camera.normalise(points2d)
+
+
+def checked_normals(values: Any, count: int, where: str) -> Array | None:
+    """Unit normals (n, 3) of `count` 3D points."""
+    if values is None:
+        return None
+    normals = _one_each("normals3d", numbers("normals3d", values, where), (count, 3), where)
+    length = np.linalg.norm(normals, axis=-1)
+    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_NORM))
+    if len(bad):
+        raise ValueError(
+            f"expected unit vectors in `normals3d`{where}, got {normals[bad[0]].tolist()} at point {bad[0]}; "
+            "try to divide by the lengths"
+        )
+    return np.asarray(normals / length[:, None])
+
+
+def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where: str) -> tuple[Labels, Labels] | None:
+    """Integer labels of the 2D and the 3D points, -1 for any; both or neither."""
+    if labels2d is None and labels3d is None:
+        return None
+    for name, values in (("labels2d", labels2d), ("labels3d", labels3d)):
+        if values is None:
+            raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
+    return _labels("labels2d", labels2d, counts[0], where), _labels("labels3d", labels3d, counts[1], where)
+
+
+def _labels(name: str, values: Any, count: int, where: str) -> Labels:
+    values = values.detach().cpu() if isinstance(values, torch.Tensor) else values
+    labels = _one_each(name, np.asarray(values), (count,), where)
+    if labels.dtype.kind not in "iu":
+        raise ValueError(f"expected integers in `{name}`{where}, got {labels.dtype}; try .astype(int)")
+    if labels.min(initial=0) < -1:
+        raise ValueError(f"expected labels of 0 or more, or -1 for any, in `{name}`{where}, got {labels.min()}")
+    return labels.astype(np.int64)
+
+
+def checked_scores(name: str, values: Any, count: int, where: str) -> Array | None:
+    """Probabilities (count,) that a point has a partner, in (0, 1]."""
+    if values is None:
+        return None
+    scores = _one_each(name, numbers(name, values, where), (count,), where)
+    bad = np.flatnonzero(~((scores > 0) & (scores <= 1)))
+    if len(bad):
+        raise ValueError(
+            f"expected probabilities above 0 and up to 1 in `{name}`{where}, got {scores[bad[0]]} at point {bad[0]}; "
+            "try to divide by the largest"
+        )
+    return scores
+
+
+def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...], where: str) -> npt.NDArray[Any]:
+    if values.shape != shape:
+        raise ValueError(f"expected `{name}` of shape {shape} as `points{name[-2:]}`{where}, got {values.shape}")
+    return values

@@ -1,6 +1,9 @@
-"""One-to-one matches of two point sets in the image, and the pose that fits them best."""
+"""One-to-one matches of two point sets in the image, the pose that fits them best, and the `Solution` made of both."""
 
+import math
+import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -10,33 +13,124 @@ from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bip
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from bpnp.geometry import MIN_POINTS
+from bpnp.search.evidence.uncertainty import linearised, pose_covariance
+from bpnp.search.verdict import SearchResult
+from bpnp.solving.problem import Problem
+from bpnp.solving.solution import Candidate, Solution, SolutionStats
+
 Array = npt.NDArray[np.float64]
-Matches = npt.NDArray[np.int64]  # (k, 2): a place in the first set and one in the second
-Allowed = Callable[[npt.NDArray[np.int64], npt.NDArray[np.int64]], npt.NDArray[np.bool_]]
-DENSE = 4096  # pairs up to which all of them are compared
+Labels = npt.NDArray[np.int64]
+Allowed = Callable[[Labels, Labels], npt.NDArray[np.bool_]]
+DENSE = 4096  # possible matches up to which all of them are compared
 NEIGHBOURS = 8  # of a point that can be its match; more only where the radius is far too large
+SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
+FIT_ROUNDS = 5
+SIGNIFICANT = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand
 
 
-def anyone(i: npt.NDArray[np.int64], j: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Every pair of places may be matched."""
+def finished(problem: Problem, result: SearchResult, seconds: float, inlier_threshold: float | None) -> Solution:
+    """What a search of so many seconds found, with matches, a last fit to them, and the inliers of every candidate."""
+    start, found = time.perf_counter(), result.candidates
+    if not len(found):
+        return without_pose(problem, result.reason, inlier_threshold, seconds)
+    threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+    poses = list(zip(found.rotation, found.translation, strict=True))
+    if result.batches:  # an enumerated pose is a least-squares fit in float64 already
+        poses[0] = _fitted(problem, *poses[0], threshold)
+    projected, *others = (problem.view(*pose) for pose in poses)
+    matches = one_to_one(problem.image, projected, threshold, problem.allowed)
+    counts = [count_one_to_one(problem.image, seen, threshold, problem.allowed) for seen in others]
+    candidates = tuple(
+        Candidate(rotation, translation - rotation @ problem.origin, score, count, alarms)
+        for (rotation, translation), score, count, alarms in zip(
+            poses, found.score.tolist(), [len(matches), *counts], found.log10_false_alarms.tolist(), strict=True
+        )
+    )
+    i, j = matches.T
+    camera = problem.sets.points3d[j] @ poses[0][0].T + poses[0][1]
+    sine = np.linalg.norm(np.cross(problem.sets.bearings[i], camera), axis=-1)
+    angles = np.degrees(np.arctan2(sine, (problem.sets.bearings[i] * camera).sum(-1)))
+    errors = np.linalg.norm(problem.image[i] - projected[j], axis=-1)
+    count = float(found.matched[0]) * min(len(problem.image), len(problem.points3d))
+    linear = None if result.verdict == "failed" else linearised(problem.sets, *poses[0], result.residual)
+    covariance = pose_covariance(problem.sets, linear, count, problem.origin)
+    return Solution(
+        rotation=candidates[0].rotation,
+        translation=candidates[0].translation,
+        matches=np.stack([problem.usable[i], j], -1),
+        inlier_count=len(matches),
+        inlier_ratio=len(matches) / min(len(problem.points2d), len(problem.points3d)),
+        inlier_threshold=threshold,
+        reprojection_error=float(errors.mean()) if len(matches) else math.nan,
+        reprojection_error_deg=float(angles.mean()) if len(matches) else math.nan,
+        unit=problem.unit,
+        covariance=np.full((6, 6), math.nan) if covariance is None else covariance,
+        candidates=candidates,
+        verdict=result.verdict,
+        reason=result.reason,
+        log10_false_alarms=result.log10_false_alarms,
+        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", *problem.left_out),
+        seconds=seconds + time.perf_counter() - start,
+        points2d=problem.points2d,
+        points3d=problem.points3d,
+        camera=problem.camera,
+    )
+
+
+def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
+    dropped, taken = problem.left_out
+    return Solution(
+        inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
+        unit=problem.unit,
+        verdict="failed",
+        reason=reason,
+        stats=SolutionStats(dropped2d=dropped, taken2d=taken),
+        seconds=seconds,
+        points2d=problem.points2d,
+        points3d=problem.points3d,
+        camera=problem.camera,
+    )
+
+
+def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:
+    """Least squares on mutually nearest points, where that explains them significantly better than the search's pose.
+
+    The search weighs all matches by their probability, which is the better estimate unless its steps in float32 were
+    too coarse for the data. At an optimum of the same precision n log(S / S_min), S the sum of n squared residuals, is
+    distributed as chi-squared with 6 degrees of freedom.
+    """
+    for _ in range(FIT_ROUNDS):
+        i, j = mutual_nearest(problem.image, problem.view(rotation, translation), threshold, problem.allowed).T
+        if len(i) < MIN_POINTS:
+            break
+        target, project = problem.image[i], partial(problem.project, points=problem.sets.points3d[j])
+        trial = fit_pose(project, target, rotation, translation, scale=threshold)
+        before, after = (float(((project(*pose) - target) ** 2).sum()) for pose in ((rotation, translation), trial))
+        if not before > after * math.exp(SIGNIFICANT / target.size):
+            break
+        rotation, translation = trial
+    return rotation, translation
+
+
+def anyone(i: Labels, j: Labels) -> npt.NDArray[np.bool_]:
+    """Every image point may be matched to every scene point."""
     return np.ones(np.shape(i), np.bool_)
 
 
-def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Matches:
-    """As many pairs (i, j) with |image_i - projected_j| <= radius as there can be with no point in two of them (paper
-    Eq. 1), and of such sets one with the least sum of squared distances. Ordered by i; NaN is no one's match.
+def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Labels:
+    """As many matches (i, j) with |image_i - projected_j| <= radius as there can be with no point in two of them (paper
+    Eq. 1), and of such sets one with the least sum of squared distances: (k, 2), ordered by i; NaN is no one's match.
 
-    allowed: which pairs, given as places i and j, may be matched. A minimum-weight matching, in which leaving an image
-    point out costs more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
+    allowed: which places i and j may be matched. A minimum-weight matching, in which leaving an image point out costs
+    more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
     """
-    pairs, distance = _near(image, projected, radius, allowed)
-    if not len(pairs):
-        return pairs
-    # Only points of a near pair take part. Column `count + i` stands for leaving row i out.
-    rows, row = np.unique(pairs[:, 0], return_inverse=True)
-    columns, column = np.unique(pairs[:, 1], return_inverse=True)
-    if len(rows) == len(pairs) == len(columns):
-        return pairs  # no point has a choice
+    matches, distance = _near(image, projected, radius, allowed)
+    # Only points that are near another take part. Column `count + i` stands for leaving row i out.
+    rows, row = np.unique(matches[:, 0], return_inverse=True)
+    columns, column = np.unique(matches[:, 1], return_inverse=True)
+    if len(rows) == len(matches) == len(columns):
+        return matches  # no point has a choice
     count, every = len(columns), np.arange(len(rows))
     cost = (distance / radius) ** 2 + 1e-9  # zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
@@ -47,23 +141,23 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
 
 
 def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:
-    """How many pairs `one_to_one` has: a maximum matching, faster than one of least cost."""
-    pairs, _ = _near(image, projected, radius, allowed)
-    if all(np.bincount(side).max(initial=0) <= 1 for side in pairs.T):
-        return len(pairs)  # no point has a choice
-    graph = csr_array((np.ones(len(pairs)), tuple(pairs.T)), shape=(len(image), len(projected)))
+    """How many matches `one_to_one` has: a maximum matching, faster than one of least cost."""
+    matches, _ = _near(image, projected, radius, allowed)
+    if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
+        return len(matches)  # no point has a choice
+    graph = csr_array((np.ones(len(matches)), tuple(matches.T)), shape=(len(image), len(projected)))
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
-def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Matches:
-    """Pairs within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
-    pairs, distance = _near(image, projected, radius, allowed)
-    nearest = np.ones(len(pairs), np.bool_)
-    for side, size in enumerate((len(image), len(projected))):
+def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Labels:
+    """Matches within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
+    matches, distance = _near(image, projected, radius, allowed)
+    nearest = np.ones(len(matches), np.bool_)
+    for side, size in zip(matches.T, (len(image), len(projected)), strict=True):
         least = np.full(size, np.inf)
-        np.minimum.at(least, pairs[:, side], distance)
-        nearest &= distance == least[pairs[:, side]]
-    return pairs[nearest]
+        np.minimum.at(least, side, distance)
+        nearest &= distance == least[side]
+    return matches[nearest]
 
 
 def fit_pose(
@@ -86,25 +180,25 @@ def fit_pose(
     return pose(found.x)
 
 
-def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Matches, Array]:
-    """Allowed pairs (e, 2) within `radius`, ordered, and their distances; of many points, among the nearest of each."""
+def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Labels, Array]:
+    """Allowed matches (e, 2) within `radius`, ordered, and their distances; among the nearest of many points."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= DENSE:
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
-        pairs = np.argwhere(distance <= radius)
+        matches = np.argwhere(distance <= radius)
     else:
         forward, backward = _neighbours(image, projected[seen], radius), _neighbours(projected[seen], image, radius)
         both = np.concatenate([forward, backward[:, ::-1]])
-        # One number a pair: unique rows would be sorted as records, ten times as long.
-        pairs = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
-    pairs[:, 1] = seen[pairs[:, 1]]
-    pairs = pairs[allowed(*pairs.T)]
-    return pairs, np.linalg.norm(image[pairs[:, 0]] - projected[pairs[:, 1]], axis=-1)
+        # One number a match: unique rows would be sorted as records, ten times as long.
+        matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
+    matches[:, 1] = seen[matches[:, 1]]
+    matches = matches[allowed(*matches.T)]
+    return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
 
 
-def _neighbours(points: Array, others: Array, radius: float) -> Matches:
-    """Pairs of each point with the nearest others within `radius`."""
+def _neighbours(points: Array, others: Array, radius: float) -> Labels:
+    """Places (e, 2) of each point and of the nearest others within `radius`."""
     count = min(NEIGHBOURS, len(others))
     distance, index = cKDTree(others).query(points, range(1, count + 1), distance_upper_bound=radius)
-    own, nth = np.nonzero(np.isfinite(distance))
-    return np.stack([own, index[own, nth]], -1)
+    point, nth = np.nonzero(np.isfinite(distance))
+    return np.stack([point, index[point, nth]], -1)

@@ -13,16 +13,19 @@ from bpnp.search.looks.sequence import Proposals
 from bpnp.search.refine import score_poses
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
-from bpnp.solving.problem import Array, Problem
+from bpnp.solving.arguments import Array
+from bpnp.solving.problem import Problem
 from bpnp.types import Batch
 
 if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
 VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
-MOST_PAIRS = 2**22  # of a 2D and a 3D point: seconds of a matcher, whose time and memory grow with them
+MOST_CELLS = (
+    2**22
+)  # of an assignment, 2D points x 3D points: seconds of a matcher, whose time and memory grow with them
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
-DRAWN = 80_000  # triples of an assignment; one pair in fifty is right, one triple in 10^5, but some nearly are
+DRAWN = 80_000  # triples of an assignment; one match in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene
 
 
@@ -50,7 +53,7 @@ def pose_prior(net: nn.Module, problem: Problem, deadline: Deadline) -> PosePrio
     if not len(asked.candidates):
         return None
     rotation, translation = asked.best
-    centre = rotation @ problem.local3d.mean(0) + translation
+    centre = rotation @ problem.sets.points3d.mean(0) + translation
     return PosePrior(rotation, translation, NET_SIGMA_DEG, NET_SIGMA_SHIFT * float(np.linalg.norm(centre)) + 1e-12)
 
 
@@ -75,12 +78,12 @@ def proposals_for(problem: Problem, seed: int) -> Proposals | None:
     that for scenes in any axes, unless the points are too many for it."""
     if isinstance(problem.prior, PosePrior):
         return partial(_of_packaged, VIEW_MATCHER, problem, seed)
-    too_many = len(problem.bearings) * len(problem.points3d) > MOST_PAIRS
+    too_many = len(problem.image) * len(problem.points3d) > MOST_CELLS
     return None if too_many or problem.prior is not None else partial(_of_packaged, SCENE_MATCHER, problem, seed)
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
-    """Poses (s, 3, 3), (s, 3) of triples of pairs drawn in proportion to the root of a matcher's assignment.
+    """Poses (s, 3, 3), (s, 3) of triples of matches drawn in proportion to the root of a matcher's assignment.
 
     Drawn in proportion to the assignment itself they are too alike where it is wrong.
     """
@@ -136,7 +139,7 @@ def view_for(net: nn.Module, problem: Problem) -> View:
     rotation = np.asarray(problem.prior.rotation, np.float64)
     if problem.prior.translation is not None:
         return View(rotation, np.asarray(problem.prior.translation) + rotation @ problem.origin)
-    turned, image = problem.local3d @ rotation.T, _seen(problem)
+    turned, image = problem.sets.points3d @ rotation.T, _seen(problem)
     centre, middle = np.median(turned, 0), np.median(image, 0)
     across = np.median(np.linalg.norm((turned - centre)[:, :2], axis=1))
     depth = across / max(float(np.median(np.linalg.norm(image - middle, axis=1))), 1e-6)
@@ -155,7 +158,7 @@ def _given(net: nn.Module, members: list[Problem]) -> tuple[list[View], Batch]:
     batch = Batch.from_arrays(
         [_seen(problem).astype(np.float32) for problem in members],
         [
-            (problem.local3d @ view.rotation.T + view.translation).astype(np.float32)
+            (problem.sets.points3d @ view.rotation.T + view.translation).astype(np.float32)
             for problem, view in zip(members, views, strict=True)
         ],
     )

@@ -1,4 +1,4 @@
-"""Pairs shared among processes: much of a search is Python, which threads would run one after the other."""
+"""Problems shared among processes: much of a search is Python, which threads would run one after the other."""
 
 import multiprocessing
 import multiprocessing.process
@@ -12,10 +12,11 @@ import torch
 from threadpoolctl import threadpool_limits
 
 Result = TypeVar("Result")
+Progress = Callable[[int, int, float], None]  # problem, batches of starts so far, seconds
 
 
 def in_processes(
-    work: Callable[[int, Callable[..., None]], Result], items: Sequence[int], count: int, tell: Callable[..., None]
+    work: Callable[[int, Progress], Result], items: Sequence[int], count: int, tell: Progress
 ) -> Iterator[tuple[int, Result]]:
     """work(item, tell) of all items in `count` forks of this process, each with one thread; in the order they end.
 
@@ -24,7 +25,8 @@ def in_processes(
     """
     context = multiprocessing.get_context("fork")
     ticket = context.Value("q", 0)
-    workers: dict[Any, multiprocessing.process.BaseProcess] = {}
+    workers: dict[Any, multiprocessing.process.BaseProcess] = {}  # by the end of their pipe
+    content: Any
     try:
         for _ in range(min(count, len(items))):
             here, there = context.Pipe(duplex=False)
@@ -34,39 +36,32 @@ def in_processes(
                 worker.start()
             there.close()  # else its end would not be seen
             workers[here] = worker
-        left = len(items)
-        while left:
-            for connection in wait(list(workers)):
-                kind, content = _received(connection)
-                if kind == "told":
-                    tell(*content)
-                elif kind == "failed":
-                    raise content
-                elif kind == "done":
-                    left -= 1
-                    yield content
-                    if not left:
-                        return
-                else:
+        missing = len(items)
+        while missing:
+            connections: list[Any] = wait(list(workers))
+            for connection in connections:
+                try:
+                    kind, content = connection.recv()
+                except EOFError:
                     ended = workers.pop(connection)
                     ended.join()
                     if ended.exitcode or not workers:
                         raise RuntimeError(
-                            f"a process that solved pairs ended with status {ended.exitcode}, possibly out of memory; "
-                            "try fewer threads (torch.set_num_threads, OMP_NUM_THREADS)"
-                        )
+                            f"a process that solved problems ended with status {ended.exitcode}, possibly out of "
+                            "memory; try fewer threads (torch.set_num_threads, OMP_NUM_THREADS)"
+                        ) from None
+                    continue
+                if kind == "told":
+                    tell(*content)
+                elif kind == "failed":
+                    raise content
+                else:
+                    missing -= 1
+                    yield content
     finally:
         for each in workers.values():
             each.kill()  # a library may have replaced the handler of SIGTERM
             each.join()
-
-
-def _received(connection: Any) -> tuple[str, Any]:
-    try:
-        received: tuple[str, Any] = connection.recv()
-    except EOFError:
-        return "ended", None
-    return received
 
 
 def _run(work: Callable[..., Any], items: Sequence[int], ticket: Any, results: Connection) -> None:

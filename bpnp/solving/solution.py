@@ -50,7 +50,7 @@ class Candidate:
 class SolutionStats:
     """How the search went: rounds (batches of starts), what it left as residual, whether it stopped by itself because
     the evidence was safe; how many 2D points could not be undistorted and were left out, and how many were left to
-    other pairs of the same image (`solve_many`)."""
+    other problems of the same image (`solve_many`)."""
 
     iterations: int = 0
     residual: float = math.nan
@@ -61,7 +61,7 @@ class SolutionStats:
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Solution:
-    """The pose of one pair of point sets, camera = R p + t; without a pose NaN, no matches and the verdict "failed".
+    """The pose of one problem, camera = R p + t; without a pose NaN, no matches and the verdict "failed".
 
     rotation: (3, 3). translation: (3,), scene units.
     matches: (k, 2) places of a 2D and of a 3D point in the arrays that were given; no point is in two of them.
@@ -80,7 +80,7 @@ class Solution:
         better than chance, and this one, if there is one, is a guess. reason: why, in words.
     log10_false_alarms: how many poses are expected to fit as well if the image had nothing to do with the scene
         (docs/verdict.md), as a logarithm to base 10; infinite without a pose.
-    seconds: for this pair; a share of the time where many were solved together.
+    seconds: for this problem; a share of the time where many were solved together.
     view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
         the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.

@@ -1,8 +1,8 @@
-"""Where the candidate poses of a solution come from: the search, a trained module, or one after the other."""
+"""From problems to their solutions: by the search, by a trained module, or by one after the other."""
 
 import multiprocessing
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -14,25 +14,24 @@ from bpnp.loops.parallel import Deadline
 from bpnp.search.enumeration.search import is_crowd
 from bpnp.search.many import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.verdict import SearchResult
-from bpnp.solving.finishing import finished, without_pose
+from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for
 from bpnp.solving.problem import Problem
-from bpnp.solving.processes import in_processes
+from bpnp.solving.processes import Progress, in_processes
 from bpnp.solving.solution import Solution
 
-GPU_PAIRS, GPU_CELLS = 64, 2**26  # solved together by a module: pairs, and pairs x 2D points x 3D points
-
+TOGETHER = 2**26  # cells of the assignments, 2D points x 3D points, that a module solves together on a GPU
 WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
-
-Progress = Callable[[int, int, float], None]  # pair, batches of starts so far, seconds
+# Of a time limit, what is left for matching: seconds, and seconds a 2D or 3D point.
+MATCHING, MATCHING_A_POINT = 1.5e-3, 8e-6
 
 
 class Options(NamedTuple):
-    """What applies to all pairs; see `bpnp.solve`.
+    """What applies to all problems; see `bpnp.solve`.
 
     solver: None for the search. asks: whether a search in doubt asks packaged matchers for poses (`proposals_for`).
-    device: None for that of each module. settings: of the search.
+    time_limit: seconds a problem, None for none. until: when all of it has to end. device: None for that of each
+    module. settings: of the search.
     """
 
     solver: nn.Module | None = None
@@ -44,106 +43,108 @@ class Options(NamedTuple):
     device: torch.device | None = None
     progress: Progress | None = None
     settings: SearchSettings = DEFAULT
+    until: Deadline = Deadline()
+
+    def deadline(self, problem: Problem) -> Deadline:
+        """When to leave off searching, so that matching ends in time too; of a problem that is begun now."""
+        end = min(self.until.at, Deadline.after(self.time_limit).at)
+        return Deadline(end - MATCHING - MATCHING_A_POINT * (len(problem.image) + len(problem.points3d)))
 
 
 def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
     """The solution of each problem, which has its number."""
-    solutions = {
-        i: without_pose(problem, problem.degenerate, options.inlier_threshold)
-        for i, problem in problems.items()
-        if problem.degenerate is not None
-    }
-    rest = {i: problem for i, problem in problems.items() if i not in solutions}
-    for problem in rest.values():
-        for net in (options.solver, problem.prior):
-            if isinstance(net, nn.Module):
-                view_for(net, problem)  # before anything is solved
-    if options.solver is None and not any(isinstance(problem.prior, nn.Module) for problem in rest.values()):
-        return solutions | dict(_shared(rest, options))
-    for i, result, seconds in (_searched if options.solver is None else _predicted)(rest, options):
-        solutions[i] = finished(problems[i], result, seconds, options.inlier_threshold)
-    return solutions
+    solutions: dict[int, Solution] = {}
+    solvable: dict[int, Problem] = {}
+    copies: dict[int, nn.Module] = {}
+    for i, problem in problems.items():
+        if problem.degenerate is not None:
+            solutions[i] = without_pose(problem, problem.degenerate, options.inlier_threshold)
+            continue
+        net = problem.prior if isinstance(problem.prior, nn.Module) else None
+        for module in (options.solver, net):
+            if module is not None:
+                view_for(module, problem)  # raises before anything is solved
+        if net is not None:
+            copies[id(net)] = copies.get(id(net)) or evaluation_copy(net, options.device)
+            problem = replace(problem, prior=copies[id(net)])
+        solvable[i] = problem
+    if options.solver is not None:
+        return solutions | dict(_by_module(evaluation_copy(options.solver, options.device), solvable, options))
+    if copies:  # a process would copy the networks
+        return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
+    return solutions | dict(_by_searches(solvable, options))
 
 
-def _shared(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
-    """Number and solution of each problem, of the search: in as many processes as torch has threads, where that pays.
+def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
+    """In as many processes as torch has threads, where that pays.
 
     The first one is solved here: it compiles what all need, and tells how long one takes.
     """
+    silent = options.progress is None
 
     def solved(i: int, tell: Progress) -> Solution:
-        ((_, result, seconds),) = _searched({i: problems[i]}, options._replace(progress=tell if listening else None))
-        return finished(problems[i], result, seconds, options.inlier_threshold)
+        return _by_search(i, problems[i], options._replace(progress=None if silent else tell))
 
-    listening, tell = options.progress is not None, options.progress or (lambda *_: None)
-    first, *others = problems or (None,)
-    if first is None:
-        return
-    solution = solved(first, tell)
-    yield first, solution
+    tell = options.progress or (lambda *_: None)
+    waiting = list(problems)
+    seconds = 0.0
+    if waiting:
+        first = waiting.pop(0)
+        solution = solved(first, tell)
+        seconds = solution.seconds * len(waiting)
+        yield first, solution
     workers = 1 if multiprocessing.current_process().daemon else torch.get_num_threads()  # which may have no children
-    if workers > 1 and len(others) > 1 and solution.seconds * len(others) > WORTH_FORKING:
-        yield from in_processes(solved, others, workers, tell)
+    if workers > 1 and len(waiting) > 1 and seconds > WORTH_FORKING:
+        yield from in_processes(solved, waiting, workers, tell)
     else:
-        yield from ((i, solved(i, tell)) for i in others)
+        yield from ((i, solved(i, tell)) for i in waiting)
 
 
-def _searched(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
-    """Number, result and seconds of each problem, of the search."""
-    priors = [problem.prior for problem in problems.values()]
-    nets = {id(net): evaluation_copy(net, options.device) for net in priors if isinstance(net, nn.Module)}
-    for i, problem in problems.items():
-        start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
-        net = nets.get(id(problem.prior))
-        result = search_poses(
-            problem.sets, around=None if net is None else pose_prior(net, problem, deadline), clutter=options.clutter,
-            proposals=proposals_for(problem, options.seed) if options.asks else None, seed=options.seed,
-            deadline=deadline, settings=options.settings,
-            progress=None if options.progress is None else partial(options.progress, i),
-        )  # fmt: skip
-        if not len(result.candidates) and deadline.passed():
-            result = replace(result, reason=f"no pose was found in {options.time_limit:g} s; try a longer time limit")
-        yield i, result, time.perf_counter() - start
+def _by_search(i: int, problem: Problem, options: Options) -> Solution:
+    start, deadline = time.perf_counter(), options.deadline(problem)
+    result = search_poses(
+        problem.sets,
+        around=pose_prior(problem.prior, problem, deadline) if isinstance(problem.prior, nn.Module) else None,
+        clutter=options.clutter,
+        proposals=proposals_for(problem, options.seed) if options.asks else None,
+        seed=options.seed,
+        deadline=deadline,
+        settings=options.settings,
+        progress=None if options.progress is None else partial(options.progress, i),
+    )
+    seconds = time.perf_counter() - start
+    if not len(result.candidates) and deadline.passed():
+        limit = options.time_limit or seconds
+        result = replace(result, reason=f"no pose was found in {limit:.3g} s; try a longer time limit")
+    return finished(problem, result, seconds, options.inlier_threshold)
 
 
-def _predicted(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, SearchResult, float]]:
-    """Number, result and seconds of each problem, of a module.
-
-    A matcher's assignment of many points proposes poses, from which the search goes on. Of other modules the poses
-    count; on a GPU they get pairs of similar size together.
-    """
+def _by_module(net: nn.Module, problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
+    """A matcher's assignment of many points proposes poses, from which the search goes on. Of other modules the poses
+    count; on a GPU they get problems of similar size together."""
     from bpnp.models.matcher import Matcher  # the networks, where one is given
 
-    assert options.solver is not None
-    net = evaluation_copy(options.solver, options.device)
-    others = dict(problems)
-    if isinstance(net, Matcher):
-        for i, problem in problems.items():
-            sets = problem.sets
-            if not is_crowd(sets):
-                continue
-            del others[i]
-            start, deadline = time.perf_counter(), Deadline.after(options.time_limit)
-            result = search_proposed(
-                sets, partial(proposed, net, problem, options.seed), clutter=options.clutter, seed=options.seed,
-                deadline=deadline, settings=options.settings,
-            )  # fmt: skip
-            yield i, result, time.perf_counter() - start
-    for group in [[i] for i in others] if device_of(net).type == "cpu" else _groups(others):
-        start = time.perf_counter()
-        found = predicted(net, [problems[i] for i in group], Deadline.after(options.time_limit))
-        seconds = (time.perf_counter() - start) / len(group)
-        yield from ((i, result, seconds) for i, result in zip(group, found, strict=True))
-
-
-def _groups(problems: Mapping[int, Problem]) -> Iterator[list[int]]:
-    """Pairs of similar size, to solve together."""
-    group: list[int] = []
-    cells = {i: len(problem.bearings) * len(problem.points3d) for i, problem in problems.items()}
+    groups: list[list[int]] = []
+    cells = {i: len(problem.image) * len(problem.points3d) for i, problem in problems.items()}
     for i in sorted(problems, key=cells.__getitem__):
-        if group and (len(group) == GPU_PAIRS or cells[i] * (len(group) + 1) > GPU_CELLS):
-            yield group
-            group = []
-        group.append(i)
-    if group:
-        yield group
+        start, problem = time.perf_counter(), problems[i]
+        if isinstance(net, Matcher) and is_crowd(problem.sets):
+            result = search_proposed(
+                problem.sets,
+                partial(proposed, net, problem, options.seed),
+                clutter=options.clutter,
+                seed=options.seed,
+                deadline=options.deadline(problem),
+                settings=options.settings,
+            )
+            yield i, finished(problem, result, time.perf_counter() - start, options.inlier_threshold)
+        elif groups and device_of(net).type != "cpu" and cells[i] * (len(groups[-1]) + 1) <= TOGETHER:
+            groups[-1].append(i)
+        else:
+            groups.append([i])
+    for group in groups:
+        start, members = time.perf_counter(), [problems[i] for i in group]
+        results = predicted(net, members, options.deadline(members[-1]))
+        seconds = (time.perf_counter() - start) / len(group)
+        for i, result in zip(group, results, strict=True):
+            yield i, finished(problems[i], result, seconds, options.inlier_threshold)

@@ -239,12 +239,12 @@ def test_a_missing_checkpoint_is_named() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([X, X[:3]], [P, P]), "4 or more points in `points2d` in pair 1, got 3"),
+        (([X, X[:3]], [P, P]), "4 or more points in `points2d` in problem 1, got 3"),
         (([X], [P, P]), "1 arrays as in `points2d` in `points3d`, got 2"),
-        ((X, P), r"`points2d` as a sequence of arrays, one a pair, got shape \(20, 2\)"),
-        (([], []), "one array a pair in `points2d`, got 0"),
+        ((X, P), r"`points2d` as a sequence of arrays, one a problem, got shape \(20, 2\)"),
+        (([], []), "one array a problem in `points2d`, got 0"),
         ((5, P), "`points2d` as a sequence"),
-        (([X, X], P, [K]), "2 of `camera`, one a pair, got 1"),
+        (([X, X], P, [K]), "2 of `camera`, one a problem, got 1"),
     ],
 )
 def test_of_many_pairs_the_wrong_one_is_named(arguments, message: str) -> None:
