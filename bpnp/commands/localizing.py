@@ -65,14 +65,16 @@ def localize(
         time_limit: seconds a photo.
         seed: of the search.
     """
+    from bpnp.datamodules.colmap.model_files import model_format
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, read_views
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
     from bpnp.solving.arguments import source_from
 
-    if map.is_file():
-        hint = "; are MAP and PHOTO swapped?" if any(photo.is_dir() for photo in photos) else ""
-        raise ValueError(f"expected MAP as the folder of a COLMAP model, got the file {map}{hint}")
+    swapped = any(model_format(photo) for photo in photos)
+    if map.is_file() or (swapped and not model_format(map)):
+        hint = "; are MAP and PHOTO swapped?" if swapped else ""
+        raise ValueError(f"expected MAP as the folder of a COLMAP model, got {map}{hint}")
     if keypoints is not None and not keypoints.is_file():
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would

@@ -51,22 +51,18 @@ def photo_files(paths: Iterable[Path], besides: Path | None = None) -> dict[str,
     Raises ValueError for none, or one name twice.
     """
     files: dict[str, Path] = {}
+    left_out = None if besides is None else besides.resolve()
     for path in paths:
         if not path.exists():
             raise ValueError(f"expected a photo or a folder of photos, got {path}, which does not exist")
-        for file in _photos_in(path, besides) if path.is_dir() else [path]:
+        inside = (file for file in sorted(path.rglob("*")) if file.suffix.lower() in SUFFIXES)
+        for file in (f for f in inside if left_out not in f.resolve().parents) if path.is_dir() else [path]:
             name = file.relative_to(path).as_posix() if path.is_dir() else file.name
             if files.setdefault(name, file) != file:
                 raise ValueError(f"expected photos of different names, got {files[name]} and {file}")
     if not files:
         raise ValueError("expected one or more photos, or folders with some, got none")
     return files
-
-
-def _photos_in(folder: Path, besides: Path | None) -> list[Path]:
-    left_out = None if besides is None else besides.resolve()
-    inside = (file for file in folder.rglob("*") if file.suffix.lower() in SUFFIXES)
-    return sorted(file for file in inside if left_out not in file.resolve().parents)
 
 
 def photo_size(photo: Path) -> Size:

@@ -2,13 +2,10 @@
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-
-if TYPE_CHECKING:
-    from bpnp.datamodules.colmap.model_files import ModelRecords
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -46,7 +43,9 @@ def read_points3d(
     COLMAP model, its folder or its points3D. Raises ValueError that names the file and what is wrong in it.
     """
     if path.is_dir() or path.stem == COLMAP_POINTS:
-        return _colmap(path).points3d, None, None
+        from bpnp.datamodules.colmap.model_files import read_records
+
+        return read_records(path if path.is_dir() else path.parent).points3d, None, None
     if path.suffix.lower() not in ARRAYS:
         from bpnp.datamodules.meshes.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
 
@@ -131,16 +130,11 @@ def _annotated(
     return points, normals, labels.astype(np.int64)
 
 
-def _colmap(path: Path) -> "ModelRecords":
-    """The COLMAP model in a folder, or around one of its files."""
-    from bpnp.datamodules.colmap.model_files import read_records
-
-    return read_records(path if path.is_dir() else path.parent)
-
-
 def _camera_of(path: Path, image: str | None) -> tuple[Any, ...]:
     """The camera of an image of a COLMAP model, or the only one that it has."""
-    model = _colmap(path)
+    from bpnp.datamodules.colmap.model_files import read_records
+
+    model = read_records(path if path.is_dir() else path.parent)
     used = {record.name: record.camera_id for record in sorted(model.images, key=lambda record: record.name)}
     some = ", ".join([*used][:8])
     if image is not None and used.get(image) not in model.cameras:

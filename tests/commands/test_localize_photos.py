@@ -89,8 +89,10 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         error = fails(*plain, *out, *given)
         assert message in error
         assert "could not be tried" not in error
-    error = fails("localize", str(tmp_path / "plain.jpg"), str(model), *out)
-    assert error.rstrip().endswith("got the file " + str(tmp_path / "plain.jpg") + "; are MAP and PHOTO swapped?")
+    for swapped in (tmp_path / "plain.jpg", photos):
+        error = fails("localize", str(swapped), str(model), *out)
+        assert error.rstrip().endswith(f"got {swapped}; are MAP and PHOTO swapped?")
+    assert f"folder of a COLMAP model, got {plain[2]}\n" in fails("localize", plain[2], plain[2], *out)
     error = fails(*plain, *out)
     assert "focal length in the EXIF data" in error
     assert "or views of this size, got neither: the map's are of 3072 x 2048; try --camera with the camera" in error
