@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.page.charts import RECALLS, recall_chart
 from bpnp.report.points import FEW, ProblemPoints, read_points
@@ -84,24 +82,13 @@ def _curves(results: Results) -> dict[str, Any]:
 
 
 def _pictures(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
-    pictures: dict[str, Any] = {"test/recall": image(recall_curve({"test": results}))}
+    import wandb
+
     # Problems with many points: the worst and some others, as a test keeps them.
     worst = sorted(problems, key=lambda problem: (len(problem.points2d) <= FEW, -problem.error))[:MOST_PICTURES]
-    if worst:
-        pictures["test/worst_problems"] = [
-            image(plot_problem(problem), caption=str(_text(problem.id))) for problem in worst
-        ]
-    return pictures
-
-
-def image(figure: Any, *, caption: str | None = None) -> Any:
-    """A matplotlib figure as a W&B image."""
-    import wandb
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    canvas = FigureCanvasAgg(figure)
-    canvas.draw()
-    return wandb.Image(np.asarray(canvas.buffer_rgba())[..., :3], caption=caption)
+    drawn = [wandb.Image(plot_problem(problem), caption=str(_text(problem.id))) for problem in worst]
+    pictures: dict[str, Any] = {"test/recall": wandb.Image(recall_curve({"test": results}))}
+    return pictures | ({"test/worst_problems": drawn} if drawn else {})
 
 
 def _text(value: Any) -> Any:

@@ -21,7 +21,6 @@ from bpnp.files import written_whole
 from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import read_checkpoint
-from bpnp.report.dashboards import image
 from bpnp.report.figures import plot_problem, save_figure
 from bpnp.report.points import ProblemPoints, points_from
 from bpnp.types import Batch, Prediction
@@ -215,8 +214,8 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
 def _draw(trainer: Trainer, problems: list[ProblemPoints]) -> None:
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
-            pictures = [image(plot_problem(problem), caption=problem.id) for problem in problems]
-            logger.log_image("val/problems", pictures)
+            names = [problem.id for problem in problems]
+            logger.log_image("val/problems", [plot_problem(problem) for problem in problems], caption=names)
         elif isinstance(logger, TensorBoardLogger):
             for number, problem in enumerate(problems):
                 logger.experiment.add_figure(f"val/problem{number}", plot_problem(problem), trainer.global_step)

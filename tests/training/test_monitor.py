@@ -118,8 +118,8 @@ def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None
     assert len(speeds) == 3
     assert min(speeds) > 0
     drawn = sorted(path.relative_to(tmp_path / "pictures") for path in (tmp_path / "pictures").rglob("*.png"))
-    assert [str(path) for path in drawn] == [f"epoch_000{e}/pair{p}.png" for e in (0, 2) for p in (0, 1)]
-    first, again = (imread(tmp_path / "pictures" / f"epoch_000{epoch}" / "pair0.png") for epoch in (0, 2))
+    assert [str(path) for path in drawn] == [f"epoch_000{e}/problem{p}.png" for e in (0, 2) for p in (0, 1)]
+    first, again = (imread(tmp_path / "pictures" / f"epoch_000{epoch}" / "problem0.png") for epoch in (0, 2))
     np.testing.assert_array_equal(first, again)
     with pytest.raises(ValueError, match="expected pairs >= 1 and every >= 0, got 0 and 1"):
         TrainingMonitor(pairs=0, every=1)
@@ -142,7 +142,7 @@ def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: p
     assert logger.experiment.offline
     logger.experiment.finish()
     (run,) = (tmp_path / "runs" / "wandb").glob("offline-run-*")
-    assert len(list(run.glob("files/media/images/val/pairs_*.png"))) == 2
+    assert len(list(run.glob("files/media/images/val/problems_*.png"))) == 2
     assert is_written(next(run.glob("*.wandb")), b"val/true_match_mass")
     assert not (tmp_path / "pictures").exists()
 
@@ -157,7 +157,7 @@ def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
     events.Reload()
     assert [event.value for event in events.Scalars("val/true_match_mass")] == pytest.approx([0.25] * 3)
     assert len(events.Scalars("train/pairs_per_second")) == 3
-    for name in ("val/pair0", "val/pair1"):
+    for name in ("val/problem0", "val/problem1"):
         pictures = events.Images(name)
         assert len(pictures) == 2
         assert min(picture.width for picture in pictures) > 300
