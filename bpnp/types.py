@@ -50,6 +50,16 @@ class SolveStats(Tensors):
     residual: Float[Tensor, " b"]
     converged: Bool[Tensor, " b"]
 
+    @classmethod
+    def of(cls, converged: Bool[Tensor, " b"], *, residual: Float[Tensor, " b"] | None = None) -> "SolveStats":
+        """Of a solver without iterations: one each. Its residual, if it has none, is 0 where it converged, else inf.
+
+        >>> SolveStats.of(torch.tensor([True, False])).residual.tolist()
+        [0.0, inf]
+        """
+        known = torch.where(converged, 0.0, torch.inf) if residual is None else residual
+        return cls(torch.ones_like(converged, dtype=torch.long), known, converged)
+
 
 @dataclass(frozen=True)
 class Pose(Tensors):

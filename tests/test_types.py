@@ -1,3 +1,4 @@
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,7 +158,7 @@ def test_a_batch_moves_and_pins_as_a_tensor_does() -> None:
 
 
 def test_a_prediction_moves_with_its_poses() -> None:
-    stats = SolveStats(torch.ones(2, dtype=torch.long), torch.zeros(2), torch.ones(2, dtype=torch.bool))
+    stats = SolveStats.of(torch.ones(2, dtype=torch.bool))
     rotation = torch.eye(3).repeat(2, 1, 1)
     rotation[1] = torch.nan
     pose = Pose(rotation, torch.zeros(2, 3), stats)
@@ -166,3 +167,12 @@ def test_a_prediction_moves_with_its_poses() -> None:
     assert moved.poses["pnp"].rotation.dtype == moved.poses["pnp"].stats.residual.dtype == torch.float64
     assert moved.poses["pnp"].stats.iterations.dtype == torch.long
     assert moved.assignment is None
+
+
+def test_the_solver_of_the_contributing_guide_solves_batches() -> None:
+    guide = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
+    names: dict[str, type[torch.nn.Module]] = {}
+    exec(guide.split("```python\n")[1].split("```")[0], names)
+    pose = names["InFront"]()(Batch.from_arrays(np.zeros((2, 5, 2)), np.zeros((2, 7, 3)))).poses["in_front"]
+    assert pose.translation.tolist() == [[0, 0, 4]] * 2
+    assert pose.stats.converged.all()
