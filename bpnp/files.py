@@ -1,4 +1,4 @@
-"""Files and folders written whole or not at all, locks, checksums, the packaged configurations, the user's cache."""
+"""Files and folders written whole or not at all, locks, the packaged configurations, the user's cache."""
 
 import hashlib
 import json
@@ -6,7 +6,6 @@ import os
 import shutil
 import signal
 import threading
-import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -110,14 +109,6 @@ def interruptions_later() -> Iterator[None]:
         signal.signal(signal.SIGINT, handler)
         if held:
             signal.raise_signal(signal.SIGINT)
-
-
-def checksum(*parts: bytes | memoryview) -> int:
-    """CRC-32 of the bytes of all parts, one after the other: it differs where data were damaged after the writing."""
-    value = 0
-    for part in parts:
-        value = zlib.crc32(part, value)
-    return value
 
 
 def fingerprint(content: Any) -> str:

@@ -27,10 +27,8 @@ from bpnp.cameras import camera_models, read_text_model
 FILES = {"cameras": 1, "images": 2, "points3D": 1}  # lines of a record in a text file
 TRACK_ELEMENT = 8
 KEYPOINT = np.dtype([("position", "<f8", 2), ("point_id", "<i8")])  # no point: 2^64 - 1 in the file, so -1 here
-# A point's track of `track_length` (image, keypoint) follows, 8 bytes each.
-POINT = np.dtype(
-    [("point_id", "<i8"), ("position", "<f8", 3), ("colour", "u1", 3), ("error", "<f8"), ("track_length", "<u8")]
-)
+POINT = np.dtype([("point_id", "<i8"), ("position", "<f8", 3)])
+COLOUR_AND_ERROR = 3 + 8  # bytes after these, before the length of a point's track; it follows, 8 bytes an element
 
 
 class ColmapError(ValueError):
@@ -59,13 +57,12 @@ class ImageRecord:
 
 @dataclass(frozen=True)
 class ModelRecords:
-    """What the three files hold. points3d (n, 3) has the ids `point_ids` and `track_lengths` observations."""
+    """What the three files hold. points3d (n, 3) has the ids `point_ids`."""
 
     cameras: dict[int, CameraRecord]
     images: list[ImageRecord]
     point_ids: NDArray[np.int64]
     points3d: NDArray[np.float64]
-    track_lengths: NDArray[np.int64]
 
 
 def model_format(folder: Path) -> str | None:
@@ -98,13 +95,7 @@ def read_records(folder: Path) -> ModelRecords:
     for path, count in zip(paths, (len(cameras), len(images), len(points)), strict=True):
         if not count:
             raise ColmapError(f"expected cameras, images and points in a COLMAP model, got none in {path}; try another")
-    return ModelRecords(
-        cameras=cameras,
-        images=images,
-        point_ids=points["point_id"].copy(),
-        points3d=points["position"].copy(),
-        track_lengths=points["track_length"].astype(np.int64),
-    )
+    return ModelRecords(cameras, images, points["point_id"].copy(), points["position"].copy())
 
 
 def _content(path: Path) -> mmap.mmap:
@@ -220,8 +211,8 @@ def _images(cursor: _Cursor) -> Iterator[ImageRecord]:
 def _points(cursor: _Cursor) -> NDArray[Any]:
     starts = array("q")
     for _ in cursor.records():
-        starts.append(cursor.skip(POINT.itemsize))
-        (track_length,) = _COUNT.unpack_from(cursor.content, cursor.offset - _COUNT.size)
+        starts.append(cursor.skip(POINT.itemsize + COLOUR_AND_ERROR))
+        (track_length,) = cursor.take(_COUNT)
         cursor.skip(TRACK_ELEMENT * track_length)
     content = np.frombuffer(cursor.content, np.uint8)
     points = np.empty(len(starts), POINT)
