@@ -27,12 +27,10 @@ MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
 
 @dataclass(frozen=True)
 class RandomCameras:
-    """How cameras are drawn. The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40.
+    """How cameras are drawn, see `MeshDataModule`: t = (x, y, distance + z), each of x, y, z in +-translation_range.
 
-    rotation: "euler" draws R = Rz Ry Rx with each angle uniform in `euler_range` (degrees); "so3" draws R uniformly.
-    translation_range, distance: t = (x, y, distance + z), each of x, y, z uniform in +-translation_range; scene units.
-    focal: pixels. The paper's image has 640 x 480 pixels, but points beyond its border are kept, there and here.
-    noise_px: standard deviation of the normal noise on each 2D coordinate, in pixels.
+    The defaults are those of Campbell et al. (ECCV 2020) for ModelNet40. The paper's image has 640 x 480 pixels, but
+    points beyond its border stay, there and here.
     """
 
     rotation: Literal["euler", "so3"] = "euler"
