@@ -52,9 +52,8 @@ class Box(NamedTuple):
     bottom: float
 
 
-PhotoFinder = Callable[
-    [str, Box], Array | None
-]  # (id of a problem, box) to (h, w, 3) uint8 that fills the box, or None
+# Of the id of a problem and a box, (h, w, 3) uint8 that fills the box, or None.
+PhotoFinder = Callable[[str, Box], Array | None]
 
 
 def picture_box(points2d: Array) -> Box:

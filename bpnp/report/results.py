@@ -241,18 +241,15 @@ def write_results(
 def read_results(folder: Path | str) -> Results:
     """Read what `write_results` wrote. Raises ValueError that names the file: missing, of another format, incomplete,
     or with a value that is no number."""
-    path = Path(folder) / SUMMARY
+    path = _existing(Path(folder) / SUMMARY)
     try:
-        summary = json.loads(_existing(path).read_bytes())
-    except ValueError as error:
-        raise ValueError(f"expected JSON in {path}, got {error}" if path.is_file() else str(error)) from error
-    version = summary.get("format") if isinstance(summary, dict) else None
-    if version != FORMAT:
-        raise ValueError(
-            f"expected results of format {FORMAT} in {path}, got {version!r}; try `bpnp test` again, or the bpnp that "
-            "wrote them"
-        )
-    rows = _read_rows(Path(folder) / ROWS)
+        summary = dict(json.loads(path.read_bytes()))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"expected JSON in {path}, got {error}") from error
+    if summary.get("format") != FORMAT:
+        wrong = f"expected results of format {FORMAT} in {path}, got {summary.get('format')!r}"
+        raise ValueError(f"{wrong}; try `bpnp test` again, or the bpnp that wrote them")
+    rows = _read_rows(_existing(Path(folder) / ROWS))
     try:
         loss, problems = summary["correspondence_loss"], summary["problems"]
         results = Results(
@@ -292,7 +289,6 @@ def _existing(path: Path) -> Path:
 def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     from pandas import read_csv
 
-    _existing(path)
     try:
         frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
         missing = [name for name in TYPES if name not in frame]
