@@ -86,13 +86,13 @@ def table(
         missing = [test for test in every if test.results() is None]
         if len(missing) < len(every):
             say(f"{len(every) - len(missing)} of {len(every)} tests are finished, in {output}", to=out)
-        with progress() as shown:
-            task = shown.add_task("methods", total=len(missing))
-            if processes == 1:
-                for test in missing:
-                    test.run()
-                    shown.advance(task)
-            else:
+        if processes == 1:
+            for test in missing:
+                say(f"testing {test.method.label} in {test.folder}", to=out)
+                test.run(progress_bar=out.is_interactive)
+        else:
+            with progress() as shown:
+                task = shown.add_task("tests", total=len(missing))
                 for _ in in_processes(lambda i, _: missing[i].run(), range(len(missing)), processes, tell=_nothing):
                     shown.advance(task)
         rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
