@@ -13,8 +13,9 @@ from PIL import Image
 from planted_model import HEIGHT, WIDTH, Planted, plant_model
 from scipy.spatial.transform import Rotation
 
-from bpnp import SceneMap
+from bpnp import SceneMap, Solution
 from bpnp.cli import main
+from bpnp.maps.many_photos import PhotoTask, SolutionFolder, attempt, photo_task
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
@@ -139,6 +140,25 @@ def test_other_views_and_options_are_solved_again(place: Place, capsys: pytest.C
     assert "solved again, with other options: a.png" in capsys.readouterr().out
     content = json.loads((place.folder / "out/results.json").read_text())["photos"]
     assert [content[name]["made_with"]["seed"] for name in ("a.png", "b.png")] == [3, 0]
+
+
+def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_changed(place: Place) -> None:
+    scene = SceneMap.from_colmap(place.folder / "map")
+
+    def task(name: str, *views: str) -> PhotoTask:
+        options = {"camera": CAMERA, "keypoints": place.folder / "database.db", "solver": "search", "seed": 0}
+        lines = {"a.png": views, "b.png": ["photo 1.jpg"]}
+        return photo_task(scene, name, place.folder / name, map_content="this", views=lines, **options)
+
+    for name in ("a.png", "b.png"):
+        before = task(name, "photo 2.jpg")
+        solution = attempt(scene, before)
+        assert isinstance(solution, Solution)
+        SolutionFolder(place.folder / "out", "this").keep(before, solution)
+    folder = SolutionFolder(place.folder / "out", "this")
+    assert folder.changes(task("a.png", "photo 2.jpg")) == []
+    assert folder.changes(task("a.png", "photo 0.jpg")) == ["views"]
+    assert folder.changes(task("b.png", "photo 0.jpg")) == []
 
 
 def test_poses_are_those_of_all_runs_also_after_a_photo_that_failed(place: Place, fails: Callable[..., str]) -> None:
