@@ -5,9 +5,8 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.enumeration.hypotheses import Enumeration
-from bpnp.search.enumeration.points import ImageSide, scene_side
-from bpnp.search.enumeration.priors import prior_arrays
+from bpnp.search.enumeration.points import ImageSide, prior_arrays, scene_side
+from bpnp.search.enumeration.poses import Enumeration
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 from bpnp.solving.matches import fit_pose

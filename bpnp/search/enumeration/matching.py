@@ -6,28 +6,11 @@ Poses are (4, 3): R, and t below it. `scene`, `image`, `prior`: `ScenePoints`, `
 import math
 from typing import Any, NamedTuple
 
-from bpnp.search.enumeration.p3p import part
-from bpnp.search.enumeration.points import Array, ImagePoints, Places, ScenePoints
+from bpnp.search.enumeration.minimal_solvers import part
+from bpnp.search.enumeration.points import Array, ImagePoints, Places, PosePriorArrays, ScenePoints
 from bpnp.search.enumeration.settings import Rules
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
-
-
-class PosePriorArrays(NamedTuple):
-    """What is known of the pose, in the frames of the points.
-
-    directions: (k, 8) rows a, b, weight and largest squared distance of R a from b. place: (4,) the translation and the
-    largest squared distance from it. rays, points: (m, 3) and (n, 3) in frames whose z axis is the known direction,
-    empty if there is none. turns: (3, 3, 3), R is the first one, and the others times the cosine and sine of the angle
-    about this direction; where the rotation is known, at no angle. sine2: squared, of the largest turn from it, or 1.
-    """
-
-    directions: Array
-    place: Array
-    rays: Array
-    points: Array
-    turns: Array
-    sine2: float
 
 
 class Problem(NamedTuple):

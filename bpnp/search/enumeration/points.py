@@ -1,5 +1,5 @@
-"""What the compiled loops read of both sides: a scene's points with tables of their triangles, and an image's points in
-a grid."""
+"""What the compiled loops read of one problem: scene points with tables of their triangles, image points in a grid, and
+what a prior says in their frames."""
 
 import functools
 import math
@@ -9,7 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.starts import turned_to
+from bpnp.search.enumeration.settings import EnumerationSettings
+from bpnp.search.enumeration.symmetries import Motion, near_symmetries
+from bpnp.search.point_sets import PointSets
+from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
 Array = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -64,6 +67,23 @@ class Triangles(NamedTuple):
     orientation: Places
 
 
+class PosePriorArrays(NamedTuple):
+    """What is known of the pose, in the frames of the points.
+
+    directions: (k, 8) rows a, b, weight and largest squared distance of R a from b. place: (4,) the translation and the
+    largest squared distance from it. rays, points: (m, 3) and (n, 3) in frames whose z axis is the known direction,
+    empty if there is none. turns: (3, 3, 3), R is the first one, and the others times the cosine and sine of the angle
+    about this direction; where the rotation is known, at no angle. sine2: squared, of the largest turn from it, or 1.
+    """
+
+    directions: Array
+    place: Array
+    rays: Array
+    points: Array
+    turns: Array
+    sine2: float
+
+
 class SceneSide:
     """The scene of one problem, or of many: a device is seen in frame after frame. size: the extent that is the unit.
 
@@ -93,6 +113,16 @@ class SceneSide:
     def has_triangles(self, size: int, near: int) -> bool:
         """Whether they are there already."""
         return (size, min(near, self.nearest.shape[1])) in self._triangles
+
+    @functools.cached_property
+    def symmetries(self) -> list[Motion]:
+        """Of the points of the arrays."""
+        return near_symmetries(self.arrays.points)
+
+    @property
+    def knows_symmetries(self) -> bool:
+        """Whether they are there already."""
+        return "symmetries" in vars(self)
 
 
 class ImageSide:
@@ -236,3 +266,49 @@ def _area(flat: Array, radius: float) -> float:
     centred = flat - flat.mean(0)
     axes = np.linalg.eigh(centred.T @ centred)[1]
     return float((np.ptp(centred @ axes, axis=0) + 2 * radius).prod())
+
+
+def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
+    """Rotation and translation, if the prior tells both."""
+    if not isinstance(prior, PosePrior) or prior.translation is None or not math.isfinite(prior.translation_sigma):
+        return None
+    return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
+
+
+def prior_arrays(
+    sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
+) -> tuple[PosePriorArrays, float]:
+    """The prior in the frames of both sides, and the log of the share of all poses that it allows.
+
+    Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
+    image shows a turn best.
+    """
+    prior, place, log_share = sets.prior, np.array([0, 0, 0, math.inf]), 0.0
+    none, sine2 = np.empty((0, 3)), 1.0
+    if prior is None:
+        return PosePriorArrays(np.empty((0, 8)), place, none, none, np.zeros((3, 3, 3)), sine2), log_share
+    if isinstance(prior, GravityPrior):
+        camera, up = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (prior.up_camera, prior.up_scene))
+        directions = _rows(up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg), settings)
+        from_camera, from_scene = turned_to(image.turn @ camera), turned_to(up)
+    else:
+        known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
+        rotation = image.turn @ known
+        from_camera, from_scene = np.eye(3), rotation
+        directions = _rows(np.eye(3), rotation.T, math.sqrt(2) * sigma, settings)
+        if (predicted := predicted_pose(prior)) is not None:
+            middle = image.turn @ (known @ scene.centre + predicted[1]) / scene.size
+            place = np.append(middle, (settings.sigmas * prior.translation_sigma / scene.size) ** 2)
+        most = min(settings.sigmas * sigma, math.pi)
+        log_share, sine2 = math.log((most - math.sin(most)) / math.pi), math.sin(min(most, math.pi / 2)) ** 2
+    about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
+    rays = np.ascontiguousarray(image.arrays.rays[:, :3] @ from_camera.T)
+    points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
+    return PosePriorArrays(directions, place, rays, points, from_camera.T @ about @ from_scene, sine2), log_share
+
+
+def _rows(scene: Array, camera: Array, sigma: float, settings: EnumerationSettings) -> Array:
+    """Directions (k, 3) of the scene that are seen as those of the camera, with `sigma` radians."""
+    weight = np.full((len(scene), 1), settings.prior_weight / sigma)
+    farthest = np.full((len(scene), 1), (2 * math.sin(min(settings.sigmas * sigma, math.pi) / 2)) ** 2)
+    return np.ascontiguousarray(np.concatenate([scene, camera, weight, farthest], 1))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
+from bpnp.search.enumeration.points import predicted_pose
 from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses, margin
-from bpnp.search.enumeration.priors import predicted_pose
 from bpnp.search.enumeration.settings import DEFAULT, EnumerationSettings
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings

@@ -1,6 +1,5 @@
 """Rigid motions that take a constellation nearly onto itself: from one pose they give its twins."""
 
-import functools
 import math
 
 import numpy as np
@@ -13,7 +12,6 @@ SHARE = 0.6  # of the points that must come to lie near one
 APART_DEG = 10.0  # between two motions, and from no motion at all
 MOST_POINTS, MOST_TRIPLES, MOST_MOTIONS = 64, 1500, 32
 REFERENCES = 3  # wide triples of which the images are looked for; a motion may leave a point of one of them alone
-REMEMBERED = 64  # constellations
 
 
 def near_symmetries(points3d: Array) -> list[Motion]:
@@ -29,32 +27,26 @@ def near_symmetries(points3d: Array) -> list[Motion]:
     points = np.ascontiguousarray(points3d, np.float64)
     if not 4 <= len(points) <= MOST_POINTS:
         return []
-    return _remembered(points.tobytes())
-
-
-@functools.lru_cache(maxsize=REMEMBERED)
-def _remembered(packed: bytes) -> list[Motion]:
-    points = np.frombuffer(packed).reshape(-1, 3)
     middle = points.mean(0)
     size = float(np.sqrt(((points - middle) ** 2).sum(-1).mean()))
     if not size > 0:
         return []
     unit = (points - middle) / size
-    found: list[tuple[int, Motion]] = []
+    motions: list[tuple[int, Motion]] = []
     for reference in _wide_triples(unit):
-        for motion in _laid_onto(unit, reference):
-            distance = np.linalg.norm((unit @ motion[0].T + motion[1])[:, None] - unit, axis=-1)
-            near = distance.min(1) < TOLERANCE
-            if near.sum() < SHARE * len(unit):
-                continue
-            turn, shift = _fitted(unit[near], unit[distance.argmin(1)[near]])
-            found.append((int(near.sum()), (turn, shift)))
-    kept: list[Motion] = [(np.eye(3), np.zeros(3))]
+        turns, shifts = _fitted(unit[list(reference)], unit[_images(unit, reference)])
+        moved = unit @ turns.transpose(0, 2, 1) + shifts[:, None]
+        squared = (moved**2).sum(-1)[..., None] - 2 * moved @ unit.T + (unit**2).sum(-1)
+        near = squared.min(-1) < TOLERANCE**2
+        for k in np.flatnonzero(near.sum(-1) >= SHARE * len(unit)):
+            onto = squared[k].argmin(-1)[near[k]]
+            motions.append((int(near[k].sum()), _fitted(unit[near[k]], unit[onto])))
+    distinct: list[Motion] = [(np.eye(3), np.zeros(3))]
     least = 1 + 2 * math.cos(math.radians(APART_DEG))
-    for _, motion in sorted(found, key=lambda entry: -entry[0]):
-        if len(kept) <= MOST_MOTIONS and all(float((motion[0] * other).sum()) < least for other, _ in kept):
-            kept.append(motion)
-    return [(turn, size * shift + middle - turn @ middle) for turn, shift in kept[1:]]
+    for _, motion in sorted(motions, key=lambda entry: -entry[0]):
+        if len(distinct) <= MOST_MOTIONS and all(float((motion[0] * turn).sum()) < least for turn, _ in distinct):
+            distinct.append(motion)
+    return [(turn, size * shift + middle - turn @ middle) for turn, shift in distinct[1:]]
 
 
 def _wide_triples(points: Array) -> list[tuple[int, int, int]]:
@@ -70,18 +62,18 @@ def _wide_triples(points: Array) -> list[tuple[int, int, int]]:
     return triples
 
 
-def _laid_onto(points: Array, reference: tuple[int, int, int]) -> list[Motion]:
-    """The motions that take the reference triple to each ordered triple with nearly the same sides."""
+def _images(points: Array, reference: tuple[int, int, int]) -> NDArray[np.int64]:
+    """Ordered triples (t, 3) with nearly the same sides as the reference."""
     distance = np.linalg.norm(points[:, None] - points, axis=-1)
     a, b, c = reference
     ab, ac, bc = (np.abs(distance - distance[i, j]) < 2 * TOLERANCE for i, j in ((a, b), (a, c), (b, c)))
-    images = np.argwhere(ab[:, :, None] & ac[:, None, :] & bc[None])[:MOST_TRIPLES]
-    return [_fitted(points[list(reference)], points[image]) for image in images]
+    return np.argwhere(ab[:, :, None] & ac[:, None, :] & bc[None])[:MOST_TRIPLES]
 
 
 def _fitted(source: Array, target: Array) -> Motion:
-    """The least-squares motion that takes `source` (k, 3) to `target` (Kabsch)."""
-    from_middle, to_middle = source.mean(0), target.mean(0)
-    left, _, right = np.linalg.svd((target - to_middle).T @ (source - from_middle))
-    turn = left @ np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))]) @ right
+    """The least-squares motion that takes `source` (k, 3) to `target` (k, 3), or to each of (t, k, 3) (Kabsch)."""
+    from_middle, to_middle = source.mean(0), target.mean(-2)
+    left, _, right = np.linalg.svd((target - to_middle[..., None, :]).swapaxes(-1, -2) @ (source - from_middle))
+    left[..., 2] *= np.sign(np.linalg.det(left @ right))[..., None]
+    turn = left @ right
     return turn, to_middle - turn @ from_middle

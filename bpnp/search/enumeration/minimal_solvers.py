@@ -1,4 +1,4 @@
-"""Perspective-three-point for one triple at a time, compiled: the solver of `bpnp.robust.p3p` without a batch.
+"""Minimal solvers, compiled: three matches (P3P, the solver of `bpnp.robust.p3p` without a batch), or two and a prior.
 
 The three pairs of points are 01, 12, 20. The caller puts the longest side of the scene's triangle between 1 and 2.
 A division by zero is infinite, as in C; every root is tested before it is used. Poses are (4, 3): R, and t below it.
@@ -16,6 +16,8 @@ from bpnp.search.kernels.vectors import cross, rotated
 part = compiler(_nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
+LEVEL = 1e-6  # sine of both rays' height, below which a known vertical says nothing about their depths
+UPRIGHT = 1e-3  # horizontal part of the way between two points, below which it says nothing about the heading
 
 
 @part
@@ -232,3 +234,59 @@ def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, d
         d1 -= scale * (a0 * (e1 * a2 - b1 * e2) + b1 * b2 * e0)
         d2 -= scale * (a1 * (e2 * a0 - b2 * e0) + b2 * b0 * e1)
     return bool(worst < TOLERANCE and depths[0] > 0 and depths[1] > 0 and depths[2] > 0)
+
+
+@part
+def p2p(i: int, j: int, a: int, b: int, problem: Any, poses: Any) -> int:
+    """Fill `poses` with those under which points a and b are seen along the rays i and j, a direction being known; how
+    many there are, up to two.
+
+    f, g: the rays, p, q: the points, in frames whose z axis is the direction. With d g - c f = R (q - p), its z
+    component is linear in the depths c and d, and the length of its horizontal part quadratic (Kukelova, Bujnak,
+    Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010).
+    """
+    prior, points, rays = problem.prior, problem.scene.points, problem.image.rays
+    f, g, p, q = prior.rays[i], prior.rays[j], prior.points[a], prior.points[b]
+    if max(abs(f[2]), abs(g[2])) < LEVEL:
+        return 0
+    rise, along0, along1 = q[2] - p[2], q[0] - p[0], q[1] - p[1]
+    length2 = along0 * along0 + along1 * along1
+    if length2 < UPRIGHT * UPRIGHT * (length2 + rise * rise):
+        return 0
+    # The way R (q - p) lies in the plane of the rays: a turn of the known rotation has to bring it there.
+    n0, n1, n2 = cross(f[0], f[1], f[2], g[0], g[1], g[2])
+    volume = n0 * along0 + n1 * along1 + n2 * rise
+    if volume * volume > prior.sine2 * (n0 * n0 + n1 * n1 + n2 * n2) * (length2 + rise * rise):
+        return 0
+    # The depth x of the ray with the smaller z is free; the other depth is shift + slope x.
+    swap = abs(f[2]) > abs(g[2])
+    slope = g[2] / f[2] if swap else f[2] / g[2]
+    shift = -rise / f[2] if swap else rise / g[2]
+    if swap:  # d = x, c = shift + slope x
+        u0, u1, v0, v1 = -shift * f[0], -shift * f[1], g[0] - slope * f[0], g[1] - slope * f[1]
+    else:  # c = x, d = shift + slope x
+        u0, u1, v0, v1 = shift * g[0], shift * g[1], slope * g[0] - f[0], slope * g[1] - f[1]
+    square, half, constant = v0 * v0 + v1 * v1, u0 * v0 + u1 * v1, u0 * u0 + u1 * u1 - length2
+    discriminant = half * half - square * constant
+    if not (discriminant >= 0 and square > 0):
+        return 0
+    count = 0
+    larger = -(half + math.copysign(math.sqrt(discriminant), half))
+    for root in range(2):
+        x = constant / larger if root else larger / square
+        other = shift + slope * x
+        c, d = (other, x) if swap else (x, other)
+        if not (0 < c < math.inf and 0 < d < math.inf):
+            continue
+        way0, way1 = d * g[0] - c * f[0], d * g[1] - c * f[1]
+        cosine, sine = (along0 * way0 + along1 * way1) / length2, (along0 * way1 - along1 * way0) / length2
+        size = 1 / math.sqrt(cosine * cosine + sine * sine)
+        cosine, sine, turns, pose = cosine * size, sine * size, prior.turns, poses[count]
+        for r in range(3):
+            for s in range(3):
+                pose[r, s] = turns[0, r, s] + cosine * turns[1, r, s] + sine * turns[2, r, s]
+        turned = rotated(pose, points[a, 0], points[a, 1], points[a, 2])
+        for r in range(3):
+            pose[3, r] = c * rays[i, r] - turned[r]
+        count += 1
+    return count
