@@ -125,5 +125,6 @@ def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Cand
         if scene.deadline.passed():
             break
         first_scale = settings.end_scale * float(poses.scale[i])
-        ends.append(anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True))
+        end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
+        ends.append(end if len(ends) < count else replace(end, hits=np.zeros_like(end.hits)))
     return best_distinct(Candidates.concatenated([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)

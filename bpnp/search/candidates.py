@@ -22,7 +22,7 @@ class Candidates:
     score: (c,) mean log-likelihood of the bearings, nats; -inf for a pose that the points do not fix.
     matched: (c,) expected share of min(m, n) points that have a partner.
     scale: (c,) standard deviation of the residuals per axis, radians, at which score and matched were taken.
-    hits: (c,) batches whose own starts ended at this pose.
+    hits: (c,) independent starts that ended at this pose.
     log10_false_alarms: (c,) how likely chance fits as well (`bpnp.search.evidence.false_alarms`), log10_rough: the same
         at scales far beyond that of the residuals; NaN before they are weighed.
     """
@@ -81,12 +81,10 @@ def best_distinct(
     *,
     degrees: float | None = None,
     shift: float | None = None,
-    sources: NDArray[np.int64] | None = None,
 ) -> Candidates:
     """The best `count` poses of a scene of which no two are closer than `degrees` and `shift`, best first.
 
-    degrees, shift: by default those of the settings. sources: (c,) the batch that each candidate is from, by default
-    the same. A pose has the hits of all poses that are the same: the most of each batch, added up over the batches.
+    degrees, shift: by default those of the settings. A pose has the hits of all poses that are the same.
     """
     limits = (
         scene.settings.same_deg if degrees is None else degrees,
@@ -94,16 +92,16 @@ def best_distinct(
     )
     poses = candidates.rotation, candidates.translation * scene.shift_weight
     kept = distinct(*poses, candidates.preference, count, *limits)
+    if not len(kept):
+        return candidates[kept]
     same = same_pose(*poses, kept, *limits)
-    origin = np.zeros(len(candidates), np.int64) if sources is None else sources
-    own = (np.where(same & (origin == source), candidates.hits, 0).max(-1, initial=0) for source in np.unique(origin))
-    return replace(candidates[kept], hits=np.asarray(sum(own, start=np.zeros(len(kept), np.int64))))
+    first = same & (np.cumsum(same, 0) == 1)  # a pose near two counts for the better one
+    return replace(candidates[kept], hits=first @ candidates.hits)
 
 
 def merged(parts: Sequence[Candidates], scene: Scene) -> Candidates:
     """The best distinct poses of several batches; a pose has the hits of all batches that found it."""
-    sources = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    return best_distinct(Candidates.concatenated(parts), scene, scene.settings.kept, sources=sources)
+    return best_distinct(Candidates.concatenated(parts), scene, scene.settings.kept)
 
 
 def in_user_frame(candidates: Candidates, scene: Scene) -> Candidates:

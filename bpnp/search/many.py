@@ -1,27 +1,23 @@
 """Pose from two unmatched point sets, without training: many starts, annealed; batch after batch until one is safe."""
 
-import math
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
 from functools import cache
+from itertools import islice
 
 import numpy as np
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import run_batch
 from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.search import is_crowd, is_few, search_few
-from bpnp.search.looks.nearby import cooled, drawn_around, is_near, nearby_batch
-from bpnp.search.looks.sequence import Proposals, beside_best, from_looks, proposed
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
+from bpnp.search.schedule import Proposals, only_proposed, turns
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.starts import PosePrior, Prior, draw_poses
-from bpnp.search.verdict import SearchResult, is_exhausted, judged, no_pose, weighed_leaders
+from bpnp.search.starts import Prior
+from bpnp.search.verdict import SearchResult, judged, no_pose
 
-ROUND = 3  # batches with a prior, of which the last is without
 Progress = Callable[[int, float], None]  # batches so far, seconds
 
 
@@ -84,30 +80,39 @@ def search_poses(
     if any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, sets, few)
-    if (safe := _from_batches(pool, around, tell)) is not None:
-        return safe
-    result = pool.result()
-    # Where most batches end at one pose, and chance explains it for want of points, none is hidden beside it.
-    ended_alike = len(pool.candidates) and pool.candidates.hits[0] > pool.batches / 2
-    cones = sets.cones3d is not None and crowd  # few points were enumerated
-    doubtful = result.log10_false_alarms > (0.0 if sets.prior is None else settings.evidence.false_alarms)
-    if doubtful and (cones or not ended_alike) and not deadline.passed():
-        asked = proposals if sets.prior is None and crowd else None
-        if (safe := from_looks(pool, settings.anywhere if cones else (), asked)) is not None:
-            return safe
-        result = pool.result()
-    result = beside_best(pool, result)
-    if proposals is None or sets.prior is None or result.verdict == "confident" or deadline.passed():
-        return result
-    pool.merge(proposed(pool, proposals))
+    return _until_certain(pool, turns(pool, around, proposals if crowd else None), tell)
+
+
+def _until_certain(
+    pool: Pool, turns: Iterator[Candidates], tell: Callable[[int], None] = lambda turns: None
+) -> SearchResult:
+    """Turn after turn until the verdict is settled or the budget is spent."""
+    settings, finished = pool.scene.settings, 0.0
+    thinned = len(pool.sets.bearings) > settings.fine.bearings
+    for found in islice(turns, settings.turns):
+        pool.turns += 1
+        pool.merge(found)
+        tell(pool.turns)
+        bettered = thinned and pool.alarms < finished - settings.evidence.lead  # on all points more of them match
+        if bettered or pool.missed() <= settings.evidence.missed:
+            finished, result = min(finished, pool.alarms), pool.result(1)
+            if result.verdict == "confident" or result.settled:
+                return result
+        if pool.scene.deadline.passed():
+            break
     return pool.result()
 
 
 @one_blas_thread
 def search_proposed(
-    sets: PointSets, proposals: Proposals, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER,
+    sets: PointSets,
+    proposals: Proposals,
+    *,
+    clutter: float | None = None,
+    seed: int = 0,
+    deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
-) -> SearchResult:  # fmt: skip
+) -> SearchResult:
     """The pose of many points that starts at proposed poses alone, such as those that a network finds likely, lead to.
 
     What `search_poses` does with proposals, without its own starts; the arguments are the same ones.
@@ -116,8 +121,7 @@ def search_proposed(
         return no_pose("no pose fits: too few points, or all on one line")
     settings = settings if clutter is None else settings.expecting(clutter)
     pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
-    pool.batches = 1
-    return from_looks(pool, (), proposals) or beside_best(pool, pool.result())
+    return _until_certain(pool, only_proposed(pool, proposals))
 
 
 def _enumerated(
@@ -125,65 +129,6 @@ def _enumerated(
 ) -> tuple[SearchResult, bool]:
     """The result of few points, and whether every hypothesis was tried."""
     found = search_few(sets, deadline, settings)
-    few = judged(found.candidates, sets, batches=0, exhaustive=True, rule=settings.evidence)
-    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=True), found.exhausted
-
-
-def _from_batches(pool: Pool, around: Prior | None, tell: Callable[[int], None]) -> SearchResult | None:
-    """Batch after batch of starts until a pose is certain: its result; None where more of them would not help."""
-    scene, sets, settings, rule = pool.scene, pool.sets, pool.scene.settings, pool.scene.settings.evidence
-    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, sets.prior))
-    near = isinstance(known, PosePrior) and is_near(scene, known)
-    guesses = 0 if guess is None else settings.around
-    best, searched, bettered = -math.inf, 0.0, 0.0  # starts in full batches: so far, when the best pose was bettered
-    exhausted = False
-    while searched < settings.max_batches and not (exhausted or scene.deadline.passed()):
-        if pool.batches < guesses:
-            found, _ = _batch(scene, pool.batches, guess, pool.candidates)
-            found = replace(found, hits=np.zeros_like(found.hits))
-        else:
-            found, size = _batch(scene, pool.batches - guesses, known, pool.candidates)
-            searched += size
-        if near:
-            found, _ = weighed_leaders(found, scene, sets)
-        pool.merge(found)
-        pool.batches += 1
-        tell(pool.batches)
-        if not len(pool.candidates):
-            continue
-        pool.new = bool(pool.candidates.score[0] >= best + rule.better)
-        bettered = searched if pool.new else bettered
-        best = float(pool.candidates.score[0])
-        if pool.is_settled() and (safe := pool.certain(pool.leaders())) is not None:
-            return safe
-        pool.turned = pool.different([pool.turned, found])
-        exhausted = is_exhausted(pool.candidates, scene, 0.0 if near else searched - bettered)
-        if near and pool.batches >= ROUND * rule.hits and not (pool.candidates.log10_false_alarms < 0).any():
-            # The prior may be wrong: what was found near it would only be in the way.
-            known, near, best, searched, bettered = None, False, -math.inf, 0.0, 0.0
-            pool.candidates = pool.turned = Candidates.none()
-    return None
-
-
-def _batch(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:
-    """One batch of starts, and its share of a full one.
-
-    Every third one does not know the prior, which may be wrong. Of the others those around a rough pose are full, and
-    looked up in a raster or annealed in turn, which finds other poses.
-    """
-    settings, coarse = scene.settings, scene.settings.coarse
-    if prior is not None:
-        number, kind = divmod(number, ROUND)
-        if kind == 2:
-            prior = None
-        elif isinstance(prior, PosePrior) and is_near(scene, prior):
-            if kind == 0:
-                return nearby_batch(scene, prior), 1.0
-            poses = drawn_around(scene, prior, settings.starts)
-            return run_batch(scene, poses, cooled(coarse, prior, scene), best), 1.0
-        else:
-            number = 2 * number + kind
-    recipe = settings.recipes[number % len(settings.recipes)]
-    drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
-    poses = Candidates.unscored(*drawn, hits=1)
-    return run_batch(scene, poses, coarse, best), len(poses) / settings.starts
+    exhaustive = not found.interrupted
+    few = judged(found.candidates, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
+    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted

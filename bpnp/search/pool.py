@@ -5,81 +5,132 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bpnp.search.annealing import finish
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
+from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
-from bpnp.search.verdict import SearchResult, is_certain, is_settled, judged, weighed_leaders, with_false_alarms
+from bpnp.search.settings import Evidence
+from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms
 
 
 class Pool:
-    """Distinct poses of a scene, best first, from all batches of starts and looks of a search.
+    """Distinct poses of a scene, best first, from all turns of a search.
 
-    few: the result of the enumeration of few points, whose poses are the first. candidates: at most `settings.kept`.
-    turned: the likeliest ones of different rotations. batches: so far. new: whether the last batch bettered the best
-    pose, and no look has followed.
+    enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
+    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far. starts: in full batches.
     """
 
-    def __init__(self, scene: Scene, sets: PointSets, few: SearchResult) -> None:
-        self.scene, self.sets, self.few = scene, sets, few
-        self.batches, self.new = 0, False
-        self.candidates = self.turned = Candidates.none()
-        if len(few.candidates):
-            rotation, translation = scene.enter(few.candidates.rotation, few.candidates.translation)
-            self.candidates = replace(few.candidates, rotation=rotation, translation=translation)
+    def __init__(self, scene: Scene, sets: PointSets, enumerated: SearchResult) -> None:
+        self.scene, self.sets, self.enumerated = scene, sets, enumerated
+        self.turns, self.starts = 0, 0.0
+        self._tests = log10_tests(sets)
+        self.forget()
+        if len(enumerated.candidates):
+            rotation, translation = scene.enter(enumerated.candidates.rotation, enumerated.candidates.translation)
+            self.candidates = replace(enumerated.candidates, rotation=rotation, translation=translation)
+
+    def forget(self) -> None:
+        """Drop all poses."""
+        self.candidates = self.rotations = self.surrounded = Candidates.none()
 
     def merge(self, found: Candidates) -> None:
-        """Take up the poses of a batch or a look.
+        """Take up the poses of a turn.
 
         They are weighed where a pose of before exceeds chance, which would else displace a better one beside it.
         """
         if (self.candidates.log10_false_alarms < 0).any():
-            found, _ = weighed_leaders(found, self.scene, self.sets)
-        self.candidates, self.new = merged([self.candidates, found], self.scene), False
+            found = self._weighed(found)
+        self.candidates = self._weighed(merged([self.candidates, found], self.scene), 1)
+        if self.missed() > self.scene.settings.evidence.missed:  # else the others are weighed for the verdict
+            self.candidates = self._weighed(self.candidates)
+            self.candidates = self.candidates[np.argsort(-self.candidates.preference, kind="stable")]
+        self.rotations = self.different([self.rotations, found])
+
+    def _weighed(self, candidates: Candidates, count: int | None = None) -> Candidates:
+        """The candidates, of which the first `count`, by default as many as a verdict needs, have false alarms."""
+        if count is None:
+            count = self.scene.settings.finished if self.sets.prior is None else self.scene.settings.kept
+        places = np.flatnonzero(self._promising(candidates[:count]))
+        first = with_false_alarms(in_user_frame(candidates[places], self.scene), self.sets)
+        alarms, rough = candidates.log10_false_alarms.copy(), candidates.log10_rough.copy()
+        alarms[places], rough[places] = first.log10_false_alarms, first.log10_rough
+        return replace(candidates, log10_false_alarms=alarms, log10_rough=rough)
+
+    def _promising(self, candidates: Candidates) -> NDArray[np.bool_]:
+        """Which poses may exceed chance: those that explain the bearings better than scene points would that are spread
+        evenly over the view, or worse by less than three times the number of tests, in decades."""
+        nats = candidates.score - math.log(2 * math.pi / self.scene.solid_angle)
+        return np.asarray(nats * len(self.sets.bearings) > -3 * math.log(10) * self._tests)
 
     def leaders(self) -> Candidates:
-        """The best candidates as a verdict needs them; what chance says of them is kept."""
-        self.candidates, leaders = weighed_leaders(self.candidates, self.scene, self.sets)
-        return leaders
+        """The candidates that have their false alarms, as a verdict needs them."""
+        known = self.candidates[~np.isnan(self.candidates.log10_false_alarms)]
+        return weighed(in_user_frame(known, self.scene), self.sets, self.scene.settings.evidence)
 
-    def is_settled(self) -> bool:
-        """Whether a verdict could be confident of one of the candidates: only then is there need to weigh them."""
-        each, rule = (self.candidates[k : k + 1] for k in range(len(self.candidates))), self.scene.settings.evidence
-        return any(is_settled(one, self.sets, rule, batches=self.batches) for one in each)
+    @property
+    def alarms(self) -> float:
+        """log10 of the fewest false alarms of a pose."""
+        return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
+
+    @property
+    def leader(self) -> Candidates:
+        """The best pose, in the scene's frame."""
+        leaders = self.leaders()[:1]
+        rotation, translation = self.scene.enter(leaders.rotation, leaders.translation)
+        return replace(leaders, rotation=rotation, translation=translation)
+
+    def looked_around(self, pose: Candidates) -> None:
+        """Note that the surroundings of a pose (1,) were searched in vain."""
+        self.surrounded = Candidates.concatenated([self.surrounded, pose])
+
+    def looks(self, leaders: Candidates) -> int:
+        """How often the surroundings of the first one, in the user's frame, were searched in vain."""
+        if not len(leaders) or not len(self.surrounded):
+            return 0
+        rule, looked = self.scene.settings.evidence, in_user_frame(self.surrounded, self.scene)
+        rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
+        translation = np.concatenate([leaders.translation[:1], looked.translation])
+        return int(self.sets.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
 
     def different(self, parts: list[Candidates]) -> Candidates:
         """The best poses of several sets of them, no two turned by less than `settings.beside_deg`."""
         rule, together = self.scene.settings, Candidates.concatenated(parts)
-        return best_distinct(together, self.scene, rule.beside_poses, degrees=rule.beside_deg, shift=math.inf)
+        return best_distinct(together, self.scene, rule.beside_poses, degrees=rule.beside_deg, shift=np.inf)
 
-    def certain(self, leaders: Candidates) -> SearchResult | None:
-        """The result, if it is confident and holds on all bearings too."""
-        if not is_certain(leaders, self.sets, self.scene.settings.evidence, batches=self.batches, new=self.new):
-            return None
-        result = self._judged(self.candidates, 1, new=False)
-        return result if result.verdict == "confident" else None
+    def missed(self) -> float:
+        """log10 of the probability that a better optimum than the best pose was not met."""
+        leaders = self.leaders()
+        return missed(leaders, self.sets, self.looks(leaders))
 
-    def result(self) -> SearchResult:
-        """The verdict on the best candidates, annealed to the end on all points."""
-        return self._judged(self.candidates, self.scene.settings.finished, new=self.new)
-
-    def _judged(self, poses: Candidates, annealed: int, *, new: bool) -> SearchResult:
+    def result(self, annealed: int | None = None) -> SearchResult:
+        """The verdict on the best candidates, the first `annealed` of which are annealed to the end on all points."""
         scene, sets, rule = self.scene, self.sets, self.scene.settings.evidence
-        ends = finish(scene, poses, annealed) if len(poses) else poses
-        if sets.prior is not None and len(ends):  # of a pose before and after, that which chance explains less
-            ends, _ = weighed_leaders(ends, scene, sets)
-            ends = best_distinct(Candidates.concatenated([ends, poses]), scene, scene.settings.kept)
-        result = judged(in_user_frame(ends, scene), sets, batches=self.batches, new=new, rule=rule)
-        if self.few.log10_false_alarms < result.log10_false_alarms:
-            return replace(self.few, batches=self.batches)
-        return against_repetitions(result, sets, lambda: scene, rule)
+        annealed = scene.settings.finished if annealed is None else annealed
+        ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
+        if len(ends) and sets.prior is not None:  # of a pose before and after, that which chance explains less
+            ends = self._weighed(ends)
+            before = replace(self.candidates, hits=np.zeros_like(self.candidates.hits))
+            ends = best_distinct(Candidates.concatenated([ends, before]), scene, scene.settings.kept)
+        leaders = weighed(in_user_frame(ends, scene), sets, rule)
+        looks = self.looks(leaders)
+        result = judged(leaders, sets, batches=self.turns, looks=looks, rule=rule)
+        if self.enumerated.log10_false_alarms < result.log10_false_alarms:
+            return replace(self.enumerated, batches=self.turns)
+        return against_repetitions(result, sets, lambda: scene, rule, looks=looks)
 
 
 def against_repetitions(
-    result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence, *, exhaustive: bool = False
+    result: SearchResult,
+    sets: PointSets,
+    entered: Callable[[], Scene],
+    rule: Evidence,
+    *,
+    looks: int = 0,
+    exhaustive: bool = False,
 ) -> SearchResult:
     """A confident result once more, beside the poses that a repeated structure would confuse with it; if one of these
     is better, so is that one."""
@@ -98,7 +149,7 @@ def against_repetitions(
     behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    beside = judged(candidates, sets, batches=result.batches, exhaustive=exhaustive, rule=rule)
+    beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside
-    return against_repetitions(beside, sets, entered, rule, exhaustive=exhaustive)
+    return against_repetitions(beside, sets, entered, rule, looks=looks, exhaustive=exhaustive)

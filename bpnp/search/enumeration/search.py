@@ -61,7 +61,7 @@ def search_few(
     def is_safe(poses: EnumeratedPoses) -> bool:
         nonlocal certain
         candidates = weighed(_candidates(poses, annotated, settings, rule), sets, settings.evidence)
-        certain = candidates if is_certain(candidates, sets, settings.evidence, exhaustive=True) else None
+        certain = candidates if is_certain(candidates, sets, settings.evidence) else None
         return certain is not None
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:

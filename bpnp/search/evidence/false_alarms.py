@@ -78,7 +78,7 @@ def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array, sca
 
 def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
     """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None."""
-    tests = _log10_tests(sets)
+    tests = log10_tests(sets)
     none = np.array([max(tests + sets.log10_share(r, t), 0.0) for r, t in zip(rotations, translations, strict=True)])
     result = Alarms(none, none.copy())
     if len(sets.bearings) > FIXING:
@@ -94,7 +94,7 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
     return result
 
 
-def _log10_tests(sets: PointSets) -> float:
+def log10_tests(sets: PointSets) -> float:
     """log10 of 2 (m)_3 (n)_3 / 3!: choices of three pairs with about two poses each; of labels that agree, if given."""
     m, n = len(sets.bearings), len(sets.points3d)
     choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(FIXING))

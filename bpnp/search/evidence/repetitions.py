@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
-from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.kernels.hashed import HashedPoints
 from bpnp.search.point_sets import PointSets
+from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]

@@ -27,7 +27,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.weighted import WeightedPoints
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Nearby, Stages
+from bpnp.search.settings import Nearby
 from bpnp.search.starts import PosePrior, Prior
 
 MOST_VOLUMES = 100.0  # of a prior against the widest that has as many starts as it needs; a map view's has 9
@@ -36,26 +36,27 @@ WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
 
-def nearby_batch(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> Candidates:
+def search_near(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> Candidates:
     """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
 
     rule: None for that of the settings.
     """
     rule = rule or scene.settings.nearby
-    return likeliest(scene, drawn_around(scene, prior, starts_of(scene, prior, rule)), rule)
+    return raster_search(scene, drawn_around(scene, prior, starts_of(scene, prior, rule)), rule)
 
 
-def likeliest(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
+def raster_search(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
     raster = raster_of(scene, rule, rule.first_scale)
     for points, kept in zip(rule.points, rule.kept, strict=True):
-        poses = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
+        poses, _ = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
     return narrowed(scene, poses, rule)
 
 
 def narrowed(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
     """Distinct poses from those that are left at the first scale: step by step to the last one, annealed."""
     again, scale = scene.sides(points=rule.points_again)[1], rule.first_scale
+    origin = np.arange(len(poses))  # the start that each pose is a copy of
     for step in range(1, rule.steps + 1):
         if scene.deadline.passed():
             break
@@ -63,16 +64,20 @@ def narrowed(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
         copies, family, kept = moved(scene, poses, scale, rule.copies), 1, rule.kept[-1]
         if rule.halved:
             family, kept = rule.copies, kept // 2**step
-        poses = looked_up(scene, copies, raster_of(scene, rule, scale), again, kept, family)
+        poses, chosen = looked_up(scene, copies, raster_of(scene, rule, scale), again, kept, family)
+        origin = origin[chosen // rule.copies]
+    poses, origin = poses[: rule.annealed], origin[: rule.annealed]
+    once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
+    poses = replace(poses, hits=np.where(once, poses.hits, 0))
     outliers = max(scene.settings.outliers, rule.outliers)
-    return anneal_on_points(scene, poses[: rule.annealed], scale * scene.spread, outliers=outliers)
+    return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
-def beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
+def search_beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
     """Distinct poses around one, as far as the rule's widest prior reaches; they have no hits."""
     prior = PosePrior(pose.rotation[0], pose.translation[0], rule.wide_deg)
-    sigma = rule.wide_shift * _distance(scene, prior)
-    found = nearby_batch(scene, prior._replace(translation_sigma=sigma), rule)
+    sigma = rule.wide_shift * distance_of(scene, prior)
+    found = search_near(scene, prior._replace(translation_sigma=sigma), rule)
     return replace(found, hits=np.zeros_like(found.hits))
 
 
@@ -89,7 +94,7 @@ def starts_of(scene: Scene, prior: PosePrior, rule: Nearby) -> int:
 
 def _volume(scene: Scene, prior: PosePrior, rule: Nearby) -> float:
     """Of the poses that a prior allows, in that of the rule's wide one."""
-    wide = math.radians(rule.wide_deg), rule.wide_shift * _distance(scene, prior)
+    wide = math.radians(rule.wide_deg), rule.wide_shift * distance_of(scene, prior)
     return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
 
 
@@ -128,8 +133,9 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
 
 def looked_up(
     scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int, family: int = 1
-) -> Candidates:
-    """The `kept` poses under which the points fall best, best first; of `family` in a row the best one only."""
+) -> tuple[Candidates, NDArray[np.int64]]:
+    """The `kept` poses under which the points fall best, best first, and their places; of `family` in a row the best
+    one only."""
     side, score = tuple(points), poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
@@ -138,7 +144,8 @@ def looked_up(
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
-    return poses[best[np.argsort(-score[best], kind="stable")[:kept]]]
+    best = best[np.argsort(-score[best], kind="stable")[:kept]]
+    return poses[best], best
 
 
 def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:
@@ -168,19 +175,7 @@ def _drawn_raster(scene: Scene, rule: Nearby, scale: float) -> Raster:
     return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
 
 
-def cooled(stages: Stages, prior: PosePrior, scene: Scene) -> Stages:
-    """The stages at scales no wider than the prior: from hotter ones the starts leave what is known."""
-    depth = _distance(scene, prior)
-    turned = math.radians(prior.rotation_sigma_deg) * float(np.sqrt(scene.bulk3d.var(0).sum())) / depth
-    width = math.hypot(prior.translation_sigma / depth, turned) / scene.spread
-    most = float(np.clip(width, stages[-1].last_scale, stages[0].first_scale))
-    return tuple(
-        replace(stage, first_scale=min(stage.first_scale, most), last_scale=min(stage.last_scale, most))
-        for stage in stages
-    )
-
-
-def _distance(scene: Scene, prior: PosePrior) -> float:
+def distance_of(scene: Scene, prior: PosePrior) -> float:
     """Of the middle of the points from the camera of the prior."""
     middle = scene.bulk3d.mean(0)
     return max(float(np.linalg.norm(np.asarray(prior.rotation) @ middle + np.asarray(prior.translation))), 1e-6)

@@ -2,7 +2,7 @@
 
 A point with a cone is seen by cameras within it. So a start takes a point, a direction within its cone, a distance and
 a roll: four numbers instead of the six of a pose. The other two say where the camera looks, and all of them are tried
-at once: the score of `bpnp.search.looks.nearby`, as a function of the shift of the points in the image, is a sum of
+at once: the score of `bpnp.search.sources.raster`, as a function of the shift of the points in the image, is a sum of
 copies of the view's raster, each shifted to the place of a point.
 """
 
@@ -18,9 +18,9 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_shifted
 from bpnp.search.kernels.tiles import LANES
 from bpnp.search.kernels.weighted import WeightedPoints
-from bpnp.search.looks.nearby import narrowed, raster_of
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby
+from bpnp.search.sources.raster import narrowed, raster_of
 from bpnp.search.starts import Array
 
 LOG_DEPTH = 0.7  # of the weak-perspective distance: half to twice of it
@@ -28,7 +28,7 @@ AIM_CELLS = 0.5  # of the raster, a scale: with 1 no more poses are found, in tw
 AT_ONCE = 256  # scores of so many poses in memory; for 32 x 32 shifts 1 MB
 
 
-def anywhere(scene: Scene, rule: Nearby) -> Candidates:
+def within_cones(scene: Scene, rule: Nearby) -> Candidates:
     """Distinct poses from starts within the cones of the points, of which there must be some."""
     starts = drawn_in_cones(scene, rule.starts)
     raster = raster_of(scene, replace(rule, cells=AIM_CELLS), rule.first_scale)

@@ -1,0 +1,145 @@
+"""What speaks against a pose: every alternative that was met, and by how many decades the pose is likelier.
+
+Another pose; the same pose at residuals far larger than those of its matches; another focal length or other proportions
+of the scene. The poses that repeated structures confuse with it are made by `bpnp.search.evidence.repetitions` and are
+then other poses like those that were met.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.distinct_poses import turned_by
+from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.false_alarms import directions_of, own_evidence
+from bpnp.search.evidence.uncertainty import Linearised, systematic_misfit
+from bpnp.search.point_sets import PointSets
+from bpnp.search.settings import Evidence
+
+Array = NDArray[np.float64]
+NEAR = 3.0  # scales of the residuals within which an image point has a partner, and two partners are in one place
+FAR = 5.0  # times as far as a different pose: nearer ones slide along the same lines and surfaces
+MOST = 13.0  # nats of evidence of an image point: what 100 scene points leave to one that is met to the finest scale
+OWN = 0.5  # of the points that the first pose alone explains: a pose that explains so many alone is no repetition of it
+SAME = 0.5  # share of a pose's partners in the places of those of another from which both say the same of the scene
+
+
+class Alternative(NamedTuple):
+    """decades: by which the best pose is likelier. what: the alternative in words, as the end of "..., but"."""
+
+    decades: float
+    what: str
+
+
+def other_pose(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alternative | None:
+    """The different pose with the fewest false alarms; None if there is none.
+
+    Different: turned by more than `other_deg`, or the middle of the scene moved by more than `other_shift` of its
+    distance.
+    """
+    same = sets.same_pose(candidates.rotation, candidates.translation, rule.other_deg, rule.other_shift)
+    others = np.flatnonzero(~same)
+    if not len(others):
+        return None
+    k = int(others[np.argmin(candidates.log10_false_alarms[others])])
+    decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
+    what = f"a pose {_degrees(candidates, k):.0f} deg away fits about as well ({number(decades)} times the number)"
+    return Alternative(decades, what)
+
+
+def rougher(candidates: Candidates) -> Alternative:
+    """The best pose at scales far beyond that of its residuals: if the points agree with it better there, what its
+    matches say of it beyond a rough alignment is no more than chance."""
+    decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
+    return Alternative(decades, "the points agree with it better at residuals far larger than those of its matches")
+
+
+def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternative | None:
+    """Another focal length or other proportions of the scene, where these explain the residuals significantly better
+    and with them the pose would be a different one; None otherwise. `count`: of the matches."""
+    off = systematic_misfit(linear, count)
+    if math.degrees(off.turn) <= rule.other_deg and off.shift <= rule.other_shift:
+        return None
+    return Alternative(
+        -math.inf,
+        "with another focal length or other proportions of the scene they fit significantly better, "
+        f"{math.degrees(off.turn):.0f} deg and {100 * off.shift:.0f} % of the distance away",
+    )
+
+
+def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alternative | None:
+    """The far candidate over which the first one leads least, if points that depend on each other are counted once.
+
+    The number of false alarms takes image points as independent. Points on lines or curves are not: a pose that lays
+    one line onto another explains all of its points, and that it explains more of them than another pose does is then
+    chance. With d_i the evidence of image point i for the one pose less that for the other, and either sign of each
+    d_i as likely (Hoeffding 1963)
+
+        P(sum_i d_i >= z sqrt(sum_i d_i^2)) <= exp(-z^2 / 2).
+
+    Where even equal signs of all d_i would be no less likely than the lead asks for, there are too few points to tell.
+
+    A pose that sees half of its partners where the first one sees its own is compared by its false alarms alone: it is
+    that pose, its mirror image, or repeats it in a repeated structure. Not so if it also explains points that the first
+    one does not, half as many as it leaves unexplained: both then slide along a curve.
+
+    Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
+    """
+    poses = candidates.rotation, candidates.translation
+    others = np.flatnonzero(~sets.same_pose(*poses, FAR * rule.other_deg, FAR * rule.other_shift))
+    least = 2 * math.log(10) * rule.lead
+    if not len(others) or len(sets.image.chosen) < least:
+        return None
+    scales = np.maximum(candidates.scale, sets.image.scales[0])
+    # A lead that would be no chance if all gaps were as large as they can be needs no second look.
+    decisive = MOST * math.sqrt(least * len(sets.image.chosen)) / math.log(10)
+    others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
+    if not len(others):
+        return None
+    best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
+    first = _partners(sets, *(x[0] for x in (*poses, scales)))
+    for k in others.tolist():
+        gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
+        squared = float((gap**2).sum())
+        if float(np.abs(gap).sum()) ** 2 < least * squared:
+            continue
+        other = _partners(sets, *(x[k] for x in (*poses, scales)))
+        reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
+        same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
+        alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
+        apart = others_alone >= OWN * alone and alone + others_alone >= least
+        decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
+        if decades < rule.lead and (apart or (same & first.near & other.near).sum() < SAME * other.near.sum()):
+            degrees = _degrees(candidates, k)
+            what = f"a pose {degrees:.0f} deg away explains so many other points that both may be chance"
+            return Alternative(decades, what)
+    return None
+
+
+def number(log10: float) -> str:
+    """10^x in words that can be read at a glance."""
+    return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"
+
+
+def _degrees(candidates: Candidates, k: int) -> float:
+    return math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
+
+
+class _Partners(NamedTuple):
+    """Of k image points: the scene point (k,) that a pose sees nearest, where it is in the camera's frame (k, 3), and
+    whether it is near enough to be the partner."""
+
+    points: NDArray[np.int64]
+    places: Array
+    near: NDArray[np.bool_]
+
+
+def _partners(sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
+    seen = directions_of(sets, rotation, translation)
+    ahead = np.flatnonzero(np.isfinite(seen[:, 0]))
+    chord, nearest = cKDTree(seen[ahead]).query(sets.bearings[sets.image.chosen], distance_upper_bound=NEAR * scale)
+    points = np.r_[ahead, -1][nearest]
+    return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))

@@ -1,0 +1,143 @@
+"""In which order a search draws its poses, until it is certain or its budget is spent.
+
+| the best pose so far            | turn after turn                                                            |
+|---------------------------------|----------------------------------------------------------------------------|
+| near a rough prior              | raster search, annealing of starts, a batch of starts from anywhere        |
+| does not exceed chance          | batches from anywhere; then in turns: raster searches around the likeliest |
+|                                 | poses, within the cones of the points, around a network's proposals, and   |
+|                                 | two batches more                                                           |
+| exceeds chance, and is not sure | batches and raster searches around it, in turns                            |
+
+Every turn draws starts, screens them, anneals the best, and gives distinct poses, which the pool merges.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from itertools import count, islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.unseen import log10_missed
+from bpnp.search.pool import Pool
+from bpnp.search.sources.cones import within_cones
+from bpnp.search.sources.multistart import multistart, multistart_near
+from bpnp.search.sources.raster import admitted, is_near, raster_search, search_beside, search_near
+from bpnp.search.starts import PosePrior, Prior
+
+Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
+
+
+def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
+    """The poses of one turn after the other; the pool has merged those of a turn before the next one begins."""
+    scene, settings = pool.scene, pool.scene.settings
+    guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
+    if guess is not None:
+        for number in range(settings.around):
+            yield without_hits(multistart(scene, number, guess, pool.candidates)[0])
+    if isinstance(known, PosePrior) and is_near(scene, known):
+        yield from islice(_near(pool, known, proposals), settings.near_turns)
+        while pool.alarms < 0:
+            yield from _sure(pool, ((found, 1.0) for found in _near(pool, known, None)))
+        # The prior may be wrong: what was found near it would only be in the way.
+        pool.forget()
+        known = None
+    yield from _anywhere(pool, known, proposals)
+
+
+def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator[Candidates]:
+    scene = pool.scene
+    for number in count():
+        yield search_near(scene, known)
+        yield multistart_near(scene, known, pool.candidates)
+        yield multistart(scene, number, None, pool.candidates)[0]
+        if number == 1 and proposals is not None and pool.alarms > scene.settings.evidence.false_alarms:
+            yield proposed(pool, proposals)
+
+
+def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
+    scene, settings = pool.scene, pool.scene.settings
+    batches = _batches(pool, known)
+    rules = settings.anywhere if pool.sets.cones3d is not None else ()
+    best, since = -math.inf, 0.0
+    while since < settings.patience and pool.alarms > 0:  # full batches that bettered nothing
+        found, share = next(batches)
+        pool.starts += share
+        yield found
+        score = float(pool.candidates.score.max(initial=-np.inf))
+        best, since = (score, 0.0) if score >= best + settings.better else (best, since + share)
+    for number in count():
+        if pool.alarms < 0:
+            yield from _sure(pool, batches)
+            continue
+        yield from _beside(pool, pool.rotations)
+        if rules:
+            yield from _with_surroundings(pool, within_cones(scene, rules[number % len(rules)]))
+        if proposals is not None and number == 0 and pool.alarms > 0:
+            yield from _with_surroundings(pool, proposed(pool, proposals))
+        if pool.alarms > 0:
+            for found, share in islice(batches, settings.between):
+                pool.starts += share
+                yield found
+
+
+def _sure(pool: Pool, batches: Iterator[tuple[Candidates, float]]) -> Iterator[Candidates]:
+    """What is expected to exclude most: another batch of starts, or a raster search around the best pose."""
+    leaders, settings = pool.leaders(), pool.scene.settings
+    # Of a full batch, which costs as much as a raster search.
+    hits = int(leaders.hits[0]) / max(pool.starts, 1 / settings.starts)
+    if pool.looks(leaders) < settings.looks and log10_missed(0, 0.0, 1) < log10_missed(round(hits), 0.0, 0):
+        alarms, leader = pool.alarms, pool.leader
+        yield search_beside(pool.scene, leader, settings.beside)
+        if pool.alarms > alarms - settings.evidence.lead:
+            pool.looked_around(leader)
+        return
+    for found, share in islice(batches, 1):
+        pool.starts += share
+        yield found
+
+
+def _batches(pool: Pool, known: Prior | None) -> Iterator[tuple[Candidates, float]]:
+    """Batches of starts, and their shares of a full one; every third does not know the prior, which may be wrong."""
+    for number in count():
+        prior = None if number % 3 == 2 else known
+        yield multistart(pool.scene, number, prior, pool.candidates)
+
+
+def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:
+    """Poses, and raster searches around the best of different rotations."""
+    yield found
+    yield from _beside(pool, pool.different([found]))
+
+
+def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
+    """Raster searches around each of the poses, until several are in vain or a pose exceeds chance."""
+    settings, since = pool.scene.settings, 0
+    for k in range(len(poses)):
+        if since == settings.beside_patience or pool.alarms < 0:
+            break
+        best = pool.candidates.preference.max(initial=-np.inf)
+        yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
+        since = 0 if pool.candidates.preference.max(initial=-np.inf) > best else since + 1
+
+
+def proposed(pool: Pool, proposals: Proposals) -> Candidates:
+    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits."""
+    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals()), hits=1), pool.sets.prior)
+    return raster_search(pool.scene, poses, pool.scene.settings.proposed)
+
+
+def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
+    """Proposed poses and nothing else, but what is around them."""
+    yield from _with_surroundings(pool, proposed(pool, proposals))
+    while pool.alarms < 0:
+        yield from _sure(pool, iter(()))
+        if pool.looks(pool.leaders()) >= pool.scene.settings.looks:
+            return
+
+
+def without_hits(found: Candidates) -> Candidates:
+    """Poses whose starts were not independent."""
+    return replace(found, hits=np.zeros_like(found.hits))
