@@ -36,9 +36,9 @@ def main() -> None:
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    run("psb", options.data, 1, 0, SearchSettings(max_batches=1))  # compiles
+    run("psb", options.data, 1, 0, SearchSettings(turns=1))  # compiles
     results: dict[str, dict] = {}
-    for name, settings in variants(SearchSettings(max_batches=options.max_batches)).items():
+    for name, settings in variants(SearchSettings(turns=options.max_batches)).items():
         results[name] = {}
         for data in options.sets:
             rows = run(data, options.data, options.limit, 0, settings)

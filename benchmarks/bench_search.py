@@ -134,8 +134,8 @@ def main() -> None:
     parser.add_argument("--pairs", type=Path, help="folder for a CSV of each set's pairs")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    settings = SearchSettings(max_batches=options.max_batches)
-    run("psb", options.data, 1, 0, SearchSettings(max_batches=1))  # compiles
+    settings = SearchSettings(turns=options.max_batches)
+    run("psb", options.data, 1, 0, SearchSettings(turns=1))  # compiles
     results = json.loads(options.output.read_text()) if options.output and options.output.exists() else {}
     for name in options.sets:
         every = name.endswith("-all")

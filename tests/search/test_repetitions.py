@@ -13,11 +13,10 @@ from bpnp import solve
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.evidence.thresholds import Evidence
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import against_repetitions
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
+from bpnp.search.settings import DEFAULT, Evidence
 from bpnp.search.verdict import SearchResult
 
 Array = NDArray[np.float64]

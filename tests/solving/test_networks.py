@@ -159,7 +159,7 @@ def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
     rng = np.random.default_rng(0)
     noise2d, noise3d = rng.uniform(-0.5, 0.5, (150, 2)), rng.normal(size=(150, 3))
     problem = problem_from(noise2d, noise3d, None, prior=prior)
-    brief = replace(DEFAULT, max_batches=2, beside_poses=0)
+    brief = replace(DEFAULT, turns=2)
     alone, helped = (
         solutions_of({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
     )

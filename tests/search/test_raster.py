@@ -14,11 +14,12 @@ from scipy.spatial.transform import Rotation
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
-from bpnp.search.looks.nearby import admitted, cooled, drawn_around, nearby_batch, raster_of
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
+from bpnp.search.sources.multistart import cooled
+from bpnp.search.sources.raster import admitted, drawn_around, raster_of, search_near
 from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]
@@ -161,11 +162,11 @@ def test_a_deadline_that_has_passed_still_gives_poses_and_stops_early() -> None:
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
     prior = scene.enter_prior(PosePrior(rotation, translation, 4.0, 0.2))
     assert isinstance(prior, PosePrior)
-    nearby_batch(scene, prior)  # compiles
+    search_near(scene, prior)  # compiles
     seconds = []
     for scene.deadline in (Deadline(time.monotonic()), Deadline()):
         start = time.process_time()
-        assert len(nearby_batch(scene, prior)) >= 1
+        assert len(search_near(scene, prior)) >= 1
         seconds.append(time.process_time() - start)
     assert seconds[0] < 0.7 * seconds[1]
 
@@ -173,7 +174,7 @@ def test_a_deadline_that_has_passed_still_gives_poses_and_stops_early() -> None:
 def test_a_lost_search_looks_around_its_best_poses() -> None:
     """Among five outliers a true pair the right pose is no optimum on clusters, but some degrees beside one."""
     bearings, points, rotation, translation = cluttered(1, outliers=400)
-    lost = search_poses(PointSets(bearings, points), settings=replace(DEFAULT, beside_poses=0))
+    lost = search_poses(PointSets(bearings, points), settings=replace(DEFAULT))
     assert lost.verdict == "failed"
     found = search_poses(PointSets(bearings, points))
     assert degrees_between(found.best[0], rotation) < 0.3
