@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator
 from functools import cache
-from itertools import islice
 
 import numpy as np
 
@@ -89,7 +88,10 @@ def _until_certain(
     """Turn after turn until the verdict is settled or the budget is spent."""
     settings, finished = pool.scene.settings, 0.0
     thinned = len(pool.sets.bearings) > settings.fine.bearings
-    for found in islice(turns, settings.turns):
+    while pool.turns < settings.turns and not pool.scene.deadline.passed():
+        found = next(turns, None)
+        if found is None:
+            break
         pool.turns += 1
         pool.merge(found)
         tell(pool.turns)
@@ -98,8 +100,6 @@ def _until_certain(
             finished, result = min(finished, pool.alarms), pool.result(1)
             if result.verdict == "confident" or result.settled:
                 return result
-        if pool.scene.deadline.passed():
-            break
     return pool.result()
 
 

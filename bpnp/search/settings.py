@@ -145,7 +145,7 @@ class SearchSettings:
     max_batches: full batches of starts. recipes: of them, in turn. starts: of a full one; 1200 leave no gap of 25 deg.
     first_starts: of the first batch; each next one has twice as many until it is full. Easy pairs need no more. A small
         batch hands on the square root of its share of a full one from stage to stage, and least_kept at least.
-    least_annealed: points of the smaller side; fewer are enumerated only (`search.few`): they have no smooth optimum.
+    least_annealed: points of the smaller side; fewer are enumerated only: they have no smooth optimum.
     outliers: share of the points without a partner that the assignment expects where the caller gives none.
     end_outliers: shares that the best poses are annealed with in the last stage too, and the likelihood chooses.
     least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
@@ -155,7 +155,7 @@ class SearchSettings:
     refined_directly: starts of `refine_poses` that need no clusters. proposed: rule of the starts of `search_proposed`.
     anywhere, beside: rules of the looks after batches without a pose that exceeds chance, since clusters hide the right
         one among many outliers: around the likeliest `beside_poses`, no two turned by less than `beside_deg`, until
-        `beside_patience` are in vain; if there are cones, within these (`search.looks.anywhere`), and around the ends.
+        `beside_patience` are in vain; if there are cones, within these (`search.sources.cones`), and around the ends.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.

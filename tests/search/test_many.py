@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import roma
 import torch
-from planted import degrees_between, directions, plant, view_with_outliers
+from planted import degrees_between, directions, plant
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import bearings
@@ -60,13 +60,13 @@ def test_batches_grow_until_they_are_full():
         assert kept[-1] == stage.kept
 
 
-def test_the_budget_counts_starts_and_an_easy_pair_needs_few(problem):
+def test_the_budget_counts_turns_and_an_easy_problem_needs_few(problem):
     settings = SearchSettings(turns=2, starts=96, first_starts=24)
     rng, seen = np.random.default_rng(0), []
     noise = rng.normal(size=(80, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
     unrelated = PointSets(directions(noise), rng.normal(size=(80, 3)))
     search_poses(unrelated, settings=settings, progress=lambda batches, _: seen.append(batches))
-    assert seen == [1, 2, 3, 4]  # 24 + 48 + 96 starts are less than 2 x 96, and one more batch is not
+    assert seen == [1, 2]
     related = PointSets(problem.bearings[1].double().numpy(), problem.points3d[1].double().numpy())
     easy = search_poses(related)
     assert easy.verdict == "confident"
@@ -109,7 +109,7 @@ def test_what_fixes_no_pose_has_none(problem, case):
     else:
         p = p[:, :1].expand_as(p).contiguous()
     # Points of a line within rounding are on it; in two dimensions a bearing on a line has a plane of its own.
-    rotation, translation, stats = search(f, p)
+    rotation, translation, stats = search(f, p, settings=SearchSettings(turns=4))
     if case != "line2d":
         assert rotation.isnan().all()
         assert translation.isnan().all()
@@ -262,7 +262,7 @@ def test_a_search_in_doubt_looks_beside_its_best_pose(monkeypatch):
 
     def ends(scene, *_):
         pose = Candidates.unscored(*scene.enter(wrong[None], translation[None]), hits=1)
-        return replace(pose, scale=np.full(1, 0.03, np.float32), score=np.full(1, -9, np.float32)), 1.0
+        return replace(pose, scale=np.full(1, 0.03, np.float32), score=np.full(1, 4, np.float32)), 1.0
 
     monkeypatch.setattr(schedule, "multistart", ends)
     monkeypatch.setattr(pool, "finish", lambda scene, poses, annealed=None: poses)
@@ -279,23 +279,3 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
     assert result.verdict == "failed"
     assert result.batches == 0
     assert not len(result.candidates)
-
-
-def test_a_pose_that_was_just_found_is_in_doubt_until_another_batch_has_not_bettered_it():
-    bearings, points, rotation, _ = view_with_outliers(np.random.default_rng(1), 120, 100)
-    batches, settings = [], replace(DEFAULT, first_starts=72)
-
-    class AfterTheFirst(Deadline):
-        def passed(self) -> bool:
-            return bool(batches)
-
-    cut = search_poses(
-        PointSets(bearings, points), settings=settings, deadline=AfterTheFirst(),
-        progress=lambda number, _: batches.append(number),
-    )  # fmt: skip
-    assert cut.batches == 1
-    assert degrees_between(cut.best[0], rotation) < 0.5
-    assert cut.verdict == "ambiguous"
-    assert "too few batches" in cut.reason
-    whole = search_poses(PointSets(bearings, points), settings=settings)
-    assert (whole.verdict, whole.batches) == ("confident", 2)

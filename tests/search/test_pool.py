@@ -28,9 +28,9 @@ def test_a_better_pose_takes_the_place_of_one_beside_it_that_exceeds_chance():
         pose = Candidates.unscored(*scene.enter(rotation[None], moved[None]), hits=1)
         return replace(pose, scale=np.full(1, scale, np.float32), score=np.full(1, score, np.float32))
 
-    pool.merge(found(wrong, 0.02, -1.0))
+    pool.merge(found(wrong, 0.02, 4.0))
     assert pool.leaders().log10_false_alarms[0] < 0
-    pool.merge(found(truth, 1e-3, 0.0))
+    pool.merge(found(truth, 1e-3, 5.0))
     turned, _ = scene.leave(pool.candidates.rotation, pool.candidates.translation)
     assert len(turned) == 1  # closer than `same_deg`
     np.testing.assert_allclose(turned[0], truth, atol=1e-5)

@@ -63,11 +63,9 @@ def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternati
     off = systematic_misfit(linear, count)
     if math.degrees(off.turn) <= rule.other_deg and off.shift <= rule.other_shift:
         return None
-    return Alternative(
-        -math.inf,
-        "with another focal length or other proportions of the scene they fit significantly better, "
-        f"{math.degrees(off.turn):.0f} deg and {100 * off.shift:.0f} % of the distance away",
-    )
+    other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
+    away = f"{math.degrees(off.turn):.0f} deg and {100 * off.shift:.0f} % of the distance away"
+    return Alternative(-math.inf, f"with {other} they fit significantly better, {away}")
 
 
 def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alternative | None:
