@@ -35,10 +35,10 @@ def test_a_pose_that_a_fresh_and_a_shaken_start_reach_counts_as_found(scene: Sce
     assert found.score.tolist() == [2.0, 1.0]
 
 
-def test_two_starts_of_a_batch_are_one_hit_and_those_of_several_batches_add_up(scene: Scene) -> None:
+def test_starts_that_end_at_one_pose_are_its_hits(scene: Scene) -> None:
     batches = [poses([0, 1], [2.0, 1.9], [1, 1]), poses([0.5, 60], [2.1, 1.0], [1, 1]), poses([1], [1.0], [3])]
     found = merged(batches, scene)
-    assert found.hits.tolist() == [5, 1]
+    assert found.hits.tolist() == [6, 1]
     assert found.score.tolist() == [np.float32(2.1), 1.0]
 
 

