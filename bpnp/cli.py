@@ -141,6 +141,11 @@ def _quieten() -> None:
     """Third-party advice that does not apply here."""
     advice = logging.getLogger("lightning.pytorch.utilities.rank_zero")
     advice.addFilter(lambda record: not re.search("Tip:|weights_only", record.getMessage()))
-    for part in ("does not have many workers", "Using `DistributedSampler` with the dataloaders", "LeafSpec",
-                 "logs directory .* exists and is not empty", "smaller than the logging interval"):  # fmt: skip
+    for part in (
+        "does not have many workers",
+        "Using `DistributedSampler` with the dataloaders",
+        "LeafSpec",
+        "logs directory .* exists and is not empty",
+        "smaller than the logging interval",
+    ):
         warnings.filterwarnings("ignore", message=f".*{part}.*")

@@ -26,9 +26,7 @@ def project(points: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 2"]:
     return points[..., :2] / points[..., 2:]
 
 
-def camera_centre(
-    rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]
-) -> Float[Tensor, "*b 3"]:  # fmt: skip
+def camera_centre(rotation: Float[Tensor, "*b 3 3"], translation: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3"]:
     """Centre of the camera in scene coordinates, -R^T t."""
     return -(rotation.mT @ translation.unsqueeze(-1)).squeeze(-1)
 

@@ -170,8 +170,15 @@ class Batch(Tensors):
         matches = None if match3d is None else listed("match3d", match3d, 1)
         focals = [torch.ones(())] if focal is None else listed("focal", focal, 0)
         focals = focals * size if len(focals) == 1 else focals
-        for name, values in (("points3d", sets3d), ("rotation", rotations), ("translation", translations),
-                             ("match3d", matches), ("focal", focals), ("index", index), ("ids", ids)):  # fmt: skip
+        for name, values in (
+            ("points3d", sets3d),
+            ("rotation", rotations),
+            ("translation", translations),
+            ("match3d", matches),
+            ("focal", focals),
+            ("index", index),
+            ("ids", ids),
+        ):
             if values is not None and len(values) != size:
                 raise ValueError(f"expected `{name}` for {size} problems as in `points2d`, got {len(values)}")
         m, n = max(map(len, sets2d)), max(map(len, sets3d))

@@ -40,7 +40,7 @@ MAY_IMPORT = {
     "examples": {"datamodules"},
     "__main__": {"cli"},
     "": {"maps", "models", "search", "solving"},
-}  # fmt: skip
+}
 LIGHTNING = {"training", "datamodules", "cli", "commands"}
 # Files that may import a library: of OpenCV the pose solvers and the detector of keypoints.
 USERS = {"cv2": 2, "poselib": 1, "pycolmap": 2, "trimesh": 1}

@@ -38,9 +38,18 @@ def run_loads(*arguments: str) -> list[str]:
 
 @pytest.mark.parametrize(
     "line",
-    ["--help", "--version", "slove", "fit --help", "solve --help", "solve --bogus", "solve", "prepare --help",
-     *(f"{name} --help" for name in ("localize", "report", "view", "table", "convert-weights", "wandb"))],
-)  # fmt: skip
+    [
+        "--help",
+        "--version",
+        "slove",
+        "fit --help",
+        "solve --help",
+        "solve --bogus",
+        "solve",
+        "prepare --help",
+        *(f"{name} --help" for name in ("localize", "report", "view", "table", "convert-weights", "wandb")),
+    ],
+)
 def test_help_and_mistakes_load_no_torch(line: str) -> None:
     assert run_loads(*line.split()) == []
 

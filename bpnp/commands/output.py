@@ -23,6 +23,11 @@ def progress(*, items: bool = True) -> Progress:
     columns = (BarColumn(), MofNCompleteColumn()) if items else ()
     console = Console(stderr=True)
     return Progress(
-        SpinnerColumn(), TextColumn("{task.description}", markup=False), *columns, TimeElapsedColumn(),
-        console=console, transient=True, disable=not console.is_interactive,
-    )  # fmt: skip
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_interactive,
+    )

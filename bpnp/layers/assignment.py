@@ -151,9 +151,15 @@ class Sinkhorn(nn.Module):
         self, cost: Tensor, mask2d: Tensor | None = None, mask3d: Tensor | None = None
     ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
         return sinkhorn(
-            cost, mu=self.entropy, mask2d=mask2d, mask3d=mask3d, dustbin=self.dustbin, tolerance=self.tolerance,
-            max_iterations=self.max_iterations, backward_stats=self.backward_stats,
-        )  # fmt: skip
+            cost,
+            mu=self.entropy,
+            mask2d=mask2d,
+            mask3d=mask3d,
+            dustbin=self.dustbin,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+            backward_stats=self.backward_stats,
+        )
 
     @property
     def entropy(self) -> float | Tensor:

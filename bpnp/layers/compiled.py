@@ -176,9 +176,22 @@ def _invert(values: Any, result: Any) -> None:
 
 @compiled
 def _solve(
-    start: int, stop: int, limit: int, kernel: Any, alpha: Any, beta: Any, rows: Any, cols: Any, degree: Any, rhs: Any,
-    tolerance: Any, x: Any, mean: Any, solved: Any, scratch: Any,
-) -> None:  # fmt: skip
+    start: int,
+    stop: int,
+    limit: int,
+    kernel: Any,
+    alpha: Any,
+    beta: Any,
+    rows: Any,
+    cols: Any,
+    degree: Any,
+    rhs: Any,
+    tolerance: Any,
+    x: Any,
+    mean: Any,
+    solved: Any,
+    scratch: Any,
+) -> None:
     """Samples start to stop: kernel (b, m, n), alpha, rows (b, m), beta, cols, degree, rhs (b, n), tolerance (b,)
     -> x (b, n), mean (b, m), solved (b,); x and mean are zero at the start. limit: of the iterations.
     scratch: overwritten. In loops, for numpy's expressions of several arrays take seconds to compile."""

@@ -62,9 +62,7 @@ class Derivatives(NamedTuple):
     hessian: Float[Tensor, "b 6 6"]
 
 
-def pose_gradient(
-    q: Columns, points: Columns, rotation: Rotations, translation: Translations
-) -> Float[Tensor, "b 6"]:  # fmt: skip
+def pose_gradient(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Float[Tensor, "b 6"]:
     """Gradient in the step (w, s), differentiable in all arguments: the optimality condition of the layer."""
     rotated = rotation @ points
     _, _, h = _point_gradient(q, rotated + translation.unsqueeze(-1))

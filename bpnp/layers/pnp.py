@@ -104,9 +104,7 @@ def _turned(rotation: Rotations, vector: Translations) -> Translations:
     return (rotation @ vector.unsqueeze(-1)).squeeze(-1)
 
 
-def _normalised(
-    points: Columns, weight: Float[Tensor, "b 1 n"]
-) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:  # fmt: skip
+def _normalised(points: Columns, weight: Float[Tensor, "b 1 n"]) -> tuple[Columns, Translations, Float[Tensor, "b 1"]]:
     """Points p' with weighted mean zero and mean square one, centre and scale in p = scale p' + centre.
 
     The Hessian is well scaled in these coordinates.
@@ -155,6 +153,12 @@ class WeightedPnP(nn.Module):
         self, assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor
     ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
         return weighted_pnp(
-            assignment, bearings, points3d, rotation, translation,
-            method=self.method, tolerance=self.tolerance, max_iterations=self.max_iterations,
-        )  # fmt: skip
+            assignment,
+            bearings,
+            points3d,
+            rotation,
+            translation,
+            method=self.method,
+            tolerance=self.tolerance,
+            max_iterations=self.max_iterations,
+        )

@@ -130,10 +130,22 @@ class RansacPnP(nn.Module):
         self.max_iterations, self.seed = max_iterations, seed
 
     def forward(
-        self, assignment: Tensor, points2d: Tensor, points3d: Tensor, mask2d: Tensor | None = None,
+        self,
+        assignment: Tensor,
+        points2d: Tensor,
+        points3d: Tensor,
+        mask2d: Tensor | None = None,
         mask3d: Tensor | None = None,
-    ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:  # fmt: skip
+    ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
         return ransac_pnp(
-            assignment, points2d, points3d, mask2d=mask2d, mask3d=mask3d, backend=self.backend, seed=self.seed,
-            pairs_factor=self.pairs_factor, threshold=self.threshold, max_iterations=self.max_iterations,
-        )  # fmt: skip
+            assignment,
+            points2d,
+            points3d,
+            mask2d=mask2d,
+            mask3d=mask3d,
+            backend=self.backend,
+            seed=self.seed,
+            pairs_factor=self.pairs_factor,
+            threshold=self.threshold,
+            max_iterations=self.max_iterations,
+        )

@@ -88,9 +88,10 @@ def _solve(
         one = torch.ones_like(some)
         part, part_sums, residual[some], _ = sweep(part, part_sums, *goal, one, tolerance)
         iterations[some] += 1
-        plan = Plan(plan.kernel, *(
-            old.index_copy(0, some, new) for old, new in ((plan.alpha, part.alpha), (plan.beta, part.beta))
-        ))  # fmt: skip
+        plan = Plan(
+            plan.kernel,
+            *(old.index_copy(0, some, new) for old, new in ((plan.alpha, part.alpha), (plan.beta, part.beta))),
+        )
         sums = sums.index_copy(0, some, part_sums)
     kernel.mul_(plan.alpha.unsqueeze(-1)).mul_(plan.beta.unsqueeze(-2))
     return iterations, residual

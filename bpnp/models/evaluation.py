@@ -151,9 +151,13 @@ class Refinement(nn.Module):
         if self.hypotheses:
             assert prediction.assignment is not None
             proposed = pose_hypotheses(
-                prediction.assignment, batch.points2d, batch.points3d, count=self.hypotheses, mask2d=batch.mask2d,
+                prediction.assignment,
+                batch.points2d,
+                batch.points3d,
+                count=self.hypotheses,
+                mask2d=batch.mask2d,
                 mask3d=batch.mask3d,
-            )[:2]  # fmt: skip
+            )[:2]
         proposed = proposed[0].to(rotation), proposed[1].to(translation)
         refined = refine(batch, torch.cat([rotation, proposed[0]], 1), torch.cat([translation, proposed[1]], 1))
         doubtful = log_support(prediction, batch, refined) < 0

@@ -125,9 +125,13 @@ class Matcher(TrainedNet):
         rows, cols = (uniform_marginal(mask, cost.dtype) for mask in (batch.mask2d, batch.mask3d))
         rows, cols = dustbin_marginals(rows, cols, batch.mask2d, batch.mask3d)
         return sinkhorn(
-            cost, mu=self.log_mu.exp(), row_marginal=rows, col_marginal=cols, tolerance=self.tolerance,
+            cost,
+            mu=self.log_mu.exp(),
+            row_marginal=rows,
+            col_marginal=cols,
+            tolerance=self.tolerance,
             backward_stats=self.backward_stats,
-        )  # fmt: skip
+        )
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
         """Features of both sides after the last block, normalised by layer, not to unit length."""

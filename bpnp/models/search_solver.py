@@ -29,9 +29,7 @@ class Search(nn.Module):
 
     estimates = ("search",)
 
-    def __init__(
-        self, *, seed: int = 0, time_limit: float | None = None, settings: SearchSettings = DEFAULT
-    ) -> None:  # fmt: skip
+    def __init__(self, *, seed: int = 0, time_limit: float | None = None, settings: SearchSettings = DEFAULT) -> None:
         super().__init__()
         if time_limit is not None and not time_limit > 0:
             raise ValueError(f"expected a positive `time_limit` in seconds, got {time_limit}")

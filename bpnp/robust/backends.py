@@ -39,9 +39,12 @@ def _each(
 def _poselib(x: Array, p: Array, threshold: float, max_iterations: int, seed: int) -> tuple[Array, int]:
     """LO-RANSAC with progressive sampling."""
     options = {
-        "max_reproj_error": threshold, "max_iterations": max_iterations, "min_iterations": min(FEWEST, max_iterations),
-        "progressive_sampling": True, "seed": seed,
-    }  # fmt: skip
+        "max_reproj_error": threshold,
+        "max_iterations": max_iterations,
+        "min_iterations": min(FEWEST, max_iterations),
+        "progressive_sampling": True,
+        "seed": seed,
+    }
     camera = {"model": "SIMPLE_PINHOLE", "width": 1, "height": 1, "params": [1.0, 0.0, 0.0]}
     pose, info = poselib.estimate_absolute_pose(x, p, camera, options, {})
     return pose.Rt, int(info["iterations"])

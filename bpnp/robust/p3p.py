@@ -76,9 +76,10 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
     rotation, translation = (torch.where(valid, pose, torch.nan) for pose in (rotation, translation))
     dtype = points3d.dtype
     return P3P(
-        rotation.movedim((0, 1, 2), (-2, -1, -3)).to(dtype), translation.movedim((0, 1), (-1, -2)).to(dtype),
+        rotation.movedim((0, 1, 2), (-2, -1, -3)).to(dtype),
+        translation.movedim((0, 1), (-1, -2)).to(dtype),
         valid.movedim(0, -1),
-    )  # fmt: skip
+    )
 
 
 def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b h 3 3"]) -> Float[Tensor, "b s 3 4"]:
@@ -126,10 +127,16 @@ def _ratios(cosines: Tensor, lengths2: Tensor) -> tuple[Tensor, Tensor]:
 
 def _adjugate(symmetric: Tensor) -> Tensor:
     xx, xy, xw, yy, yw, ww = symmetric
-    return torch.stack([
-        yy * ww - yw * yw, xw * yw - xy * ww, xy * yw - xw * yy,
-        xx * ww - xw * xw, xy * xw - xx * yw, xx * yy - xy * xy,
-    ])  # fmt: skip
+    return torch.stack(
+        [
+            yy * ww - yw * yw,
+            xw * yw - xy * ww,
+            xy * yw - xw * yy,
+            xx * ww - xw * xw,
+            xy * xw - xx * yw,
+            xx * yy - xy * xy,
+        ]
+    )
 
 
 def _trace(a: Tensor, b: Tensor) -> Tensor:

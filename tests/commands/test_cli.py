@@ -196,8 +196,14 @@ def test_a_checkpoint_that_is_none_is_named(fails: Callable[..., str], tmp_path:
 
 def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
-    common = [*MESHES, *SMALL_NET, f"--data.root={meshes}", f"--data.cache_dir={tmp_path}/cache",
-              f"--trainer.default_root_dir={tmp_path}/run", "--data.val_fraction=0.3"]  # fmt: skip
+    common = [
+        *MESHES,
+        *SMALL_NET,
+        f"--data.root={meshes}",
+        f"--data.cache_dir={tmp_path}/cache",
+        f"--trainer.default_root_dir={tmp_path}/run",
+        "--data.val_fraction=0.3",
+    ]
     main(["fit", *common, "--trainer.max_epochs=1"])
     assert {p.name for p in (tmp_path / "run" / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
     assert {p.name for p in (tmp_path / "run").iterdir()} == {"checkpoints", "logs"}

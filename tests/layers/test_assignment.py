@@ -181,7 +181,7 @@ def test_the_module_passes_its_options_on() -> None:
     layer = Sinkhorn(mu=0.3, learn_mu=True, dustbin=0.4, tolerance=1e-3, max_iterations=7)
     expected, stats = sinkhorn(
         cost, mu=0.3, dustbin=0.4, mask2d=mask2d, mask3d=mask3d, tolerance=1e-3, max_iterations=7
-    )  # fmt: skip
+    )
     plan, layer_stats = layer(cost, mask2d, mask3d)
     torch.testing.assert_close(plan, expected)
     assert torch.equal(stats.iterations, layer_stats.iterations)

@@ -195,8 +195,19 @@ def degenerate(kind: str, planted: Planted) -> tuple[Tensor, Tensor, Tensor, Ten
 
 
 @pytest.mark.parametrize("method", ["newton", "lbfgs"])
-@pytest.mark.parametrize("kind", ["collinear", "one place", "one point", "two points", "nothing assigned", "no start",
-                                  "start at infinity", "assignment NaN"])  # fmt: skip
+@pytest.mark.parametrize(
+    "kind",
+    [
+        "collinear",
+        "one place",
+        "one point",
+        "two points",
+        "nothing assigned",
+        "no start",
+        "start at infinity",
+        "assignment NaN",
+    ],
+)
 def test_what_has_no_pose_is_flagged_and_spoils_nothing(method: str, kind: str) -> None:
     planted = plant(3, 12, seed=10)
     assignment, points3d, *start = degenerate(kind, planted)

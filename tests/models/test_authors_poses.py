@@ -69,9 +69,7 @@ def released_poses(assignment: Array, points2d: Array, points3d: Array) -> tuple
 
 
 @pytest.mark.parametrize(("ransac", "pnp"), [("opencv", "lbfgs"), ("poselib", "newton")])
-def test_poses_are_those_of_the_released_pipeline(
-    reference: Released, tmp_path: Path, ransac: str, pnp: str
-) -> None:  # fmt: skip
+def test_poses_are_those_of_the_released_pipeline(reference: Released, tmp_path: Path, ransac: str, pnp: str) -> None:
     torch.save(checkpoint(reference), tmp_path / "x.pth.tar")
     out = tmp_path / "out.ckpt"
     main(["convert-weights", str(tmp_path / "x.pth.tar"), str(out), "--ransac", ransac, "--pnp", pnp])

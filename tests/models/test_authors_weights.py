@@ -99,9 +99,7 @@ BIAS = "FeatureExtractor2d.conv_11.conv2.0.bias"
         ({BIAS: torch.full((128,), torch.nan)}, f"'{BIAS}' with NaN"),
     ],
 )
-def test_a_wrong_tensor_is_named(
-    reference: Released, tmp_path: Path, change: dict[str, object], message: str
-) -> None:  # fmt: skip
+def test_a_wrong_tensor_is_named(reference: Released, tmp_path: Path, change: dict[str, object], message: str) -> None:
     state = {k: v for k, v in (reference.state_dict() | change).items() if v is not None}
     torch.save({"state_dict": state}, tmp_path / "x.pth.tar")
     with pytest.raises(ValueError, match=message):

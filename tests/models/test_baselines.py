@@ -34,7 +34,7 @@ def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_
     small, large = plant(1, 12, seed=1), plant(1, 20, seed=2)
     together = Batch.from_arrays(
         [large.points2d[0], small.points2d[0]], [large.points3d[0], small.points3d[0]], index=[5, 9]
-    )  # fmt: skip
+    )
     alone = Batch.from_arrays(small.points2d, small.points3d, index=[9])
     of_two, of_one = QUICK[name](together).poses[name], QUICK[name](alone).poses[name]
     assert QUICK[name].estimates == (name,)

@@ -39,9 +39,15 @@ def consensus(
 ) -> tuple[Tensor, Tensor, SolveStats]:
     """The consensus of pairs (b, k): an assignment of each 2D point to the 3D point of the same index."""
     return ransac_pnp(
-        torch.diag_embed(weights), *pairs[:2], mask2d=pairs.real, mask3d=pairs.real, pairs_factor=1.0, backend=backend,
-        threshold=THRESHOLD, max_iterations=hypotheses,
-    )  # fmt: skip
+        torch.diag_embed(weights),
+        *pairs[:2],
+        mask2d=pairs.real,
+        mask3d=pairs.real,
+        pairs_factor=1.0,
+        backend=backend,
+        threshold=THRESHOLD,
+        max_iterations=hypotheses,
+    )
 
 
 def as_matrix(rotation: Tensor, translation: Tensor) -> Tensor:

@@ -74,8 +74,10 @@ def test_neighbours_and_padding_change_nothing() -> None:
     for i, scene in enumerate(scenes):
         m, n = scene.points2d.shape[1], scene.points3d.shape[1]
         assignment[i, :m, :n], points2d[i, :m], points3d[i, :n] = (
-            blurred(scene, 0.2)[0], scene.points2d[0], scene.points3d[0],
-        )  # fmt: skip
+            blurred(scene, 0.2)[0],
+            scene.points2d[0],
+            scene.points3d[0],
+        )
         mask2d[i, :m], mask3d[i, :n] = True, True
     assignment[:, -1, -1] = 1  # of no point
     together = pose_hypotheses(assignment, points2d, points3d, count=6, mask2d=mask2d, mask3d=mask3d)
@@ -132,7 +134,7 @@ def test_in_axes_near_the_camera_s_fewer_poses_are_drawn_and_more_of_them_are_ne
             blurred(turned, 0.1), turned.points2d, turned.points3d, triples=8000, seed=0, aligned=aligned
         )[..., :3]
         for aligned in (False, True)
-    }  # fmt: skip
+    }
     near = {aligned: int((errors(rotation, turned) < 10).sum()) for aligned, rotation in drawn.items()}
     solved = {aligned: int(rotation.isfinite().all((-2, -1)).sum()) for aligned, rotation in drawn.items()}
     assert solved[True] < 0.51 * solved[False]

@@ -171,9 +171,7 @@ def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> No
     wide = pad(plan, (0, 3, 0, 4)), pad(left2d, (0, 4)), pad(left3d, (0, 3))
     assignment, unmatched2d, unmatched3d = (torch.cat([x, torch.full_like(x, 0.01)]) for x in wide)
     grown = Prediction(assignment, unmatched2d=unmatched2d, unmatched3d=unmatched3d)
-    torch.testing.assert_close(
-        matching_likelihood_loss(grown, both)[:1], matching_likelihood_loss(prediction, batch)
-    )  # fmt: skip
+    torch.testing.assert_close(matching_likelihood_loss(grown, both)[:1], matching_likelihood_loss(prediction, batch))
 
     def loss(p: Tensor, left2d: Tensor, left3d: Tensor) -> Tensor:
         return matching_likelihood_loss(Prediction(p, unmatched2d=left2d, unmatched3d=left3d), batch)

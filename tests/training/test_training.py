@@ -13,8 +13,15 @@ from small_data import SMALL_MESHES, SMALL_NET
 
 from bpnp.report import read_results
 
-ARGUMENTS = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES, *SMALL_NET, "--model.learning_rate=1e-3",
-             "--data.fresh_views=true", "--trainer.accelerator=cpu", "--trainer.log_every_n_steps=1"]  # fmt: skip
+ARGUMENTS = [
+    "--data=bpnp.datamodules.MeshDataModule",
+    *SMALL_MESHES,
+    *SMALL_NET,
+    "--model.learning_rate=1e-3",
+    "--data.fresh_views=true",
+    "--trainer.accelerator=cpu",
+    "--trainer.log_every_n_steps=1",
+]
 WARMUP = ["--trainer.callbacks=bpnp.training.PoseLossWarmup", "--trainer.callbacks.start_epoch=2"]
 
 

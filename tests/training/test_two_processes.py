@@ -24,9 +24,15 @@ def _test(rank: int, folder: Path, port: int) -> None:
     batch = replace(plant(2, 12, seed=rank, dtype=torch.float32).batch(), index=torch.arange(2) + 2 * rank)
     batch = batch if rank == 0 else replace(batch, match3d=None)
     trainer = Trainer(
-        accelerator="cpu", devices=2, strategy=DDPStrategy(timeout=datetime.timedelta(seconds=40)), logger=False,
-        enable_progress_bar=False, enable_model_summary=False, use_distributed_sampler=False, default_root_dir=folder,
-    )  # fmt: skip
+        accelerator="cpu",
+        devices=2,
+        strategy=DDPStrategy(timeout=datetime.timedelta(seconds=40)),
+        logger=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        use_distributed_sampler=False,
+        default_root_dir=folder,
+    )
     task = BlindPnPTask(small_net(refine=False).eval())
     expected = correspondence_loss(task.solver.match(batch).assignment, batch.match3d).mean() if rank == 0 else None
     trainer.test(task, DataLoader([batch], batch_size=None), verbose=False)

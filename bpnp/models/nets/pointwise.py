@@ -220,9 +220,7 @@ class _PointwiseNorm(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None
-    ) -> Tensor:  # fmt: skip
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None) -> Tensor:
         ctx.rectified = skip is not None
         z = pointwise(x, weight, bias)
         if mask is None and z.is_cpu and z.dtype == torch.float32 and any(ctx.needs_input_grad):
