@@ -68,7 +68,7 @@ def _run(arguments: list[str]) -> None:
         command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]
         if isinstance(command, Mapping):
             if not rest or rest[0] in ("-h", "--help"):
-                lines = (_row(f"  {word:<14}", first_line(own)) for word, own in command.items())
+                lines = (_row(f"  {word:<14}", first_line(function)) for word, function in command.items())
                 print("\n".join([f"usage: bpnp {name} WHAT [options]", "", *lines]))
                 return
             word, *rest = rest
@@ -100,11 +100,11 @@ def _known(name: str, names: Sequence[str], what: str) -> str:
 
 def help_text() -> str:
     """What `bpnp --help` shows: every command in a line."""
-    own = {
+    commands = {
         name: "Pack a data set, once: " + ", ".join(command) if isinstance(command, Mapping) else first_line(command)
         for name, command in COMMANDS.items()
     }
-    lines = [_row(f"  {name:<17}", text) for name, text in (own | LIGHTNING).items()]
+    lines = [_row(f"  {name:<17}", text) for name, text in (commands | LIGHTNING).items()]
     return "\n".join(
         [
             "usage: bpnp COMMAND [options]",

@@ -49,8 +49,8 @@ def keep_settings(path: Path, settings: Mapping[str, Any]) -> None:
     if not path.is_file():
         write_text(path, text)
         return
-    wanted, kept = json.loads(text), json.loads(path.read_text(encoding="utf-8"))
-    other = sorted(key for key in wanted.keys() | kept.keys() if wanted.get(key) != kept.get(key))
+    wanted, before = json.loads(text), json.loads(path.read_text(encoding="utf-8"))
+    other = sorted(key for key in wanted.keys() | before.keys() if wanted.get(key) != before.get(key))
     if other:
         raise ValueError(
             f"expected {path.parent} without results of other settings, got other {', '.join(other)}; try another "

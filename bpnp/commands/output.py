@@ -8,9 +8,9 @@ from bpnp.report.terminal import WIDTH
 
 def console() -> Console:
     """Standard output, at least `WIDTH` columns wide."""
-    own = Console()
-    own.width = max(own.width, WIDTH)
-    return own
+    terminal = Console()
+    terminal.width = max(terminal.width, WIDTH)
+    return terminal
 
 
 def say(line: object, *, to: Console | None = None) -> None:

@@ -58,19 +58,19 @@ def parsed_arguments(name: str, command: Callable[..., None], arguments: Sequenc
 
     A hyphen in the name of an option is read as an underscore.
     """
-    given = [re.sub(r"^--[\w-]+", lambda own: f"--{own[0][2:].replace('-', '_')}", text) for text in arguments]
+    words = [re.sub(r"^--[\w-]+", lambda name: f"--{name[0][2:].replace('-', '_')}", text) for text in arguments]
     extra = {}
     if OVERRIDES in inspect.signature(command).parameters:
-        words, given, extra = iter(given), [], {OVERRIDES: list[str]()}
-        for text in words:
+        rest, words, extra = iter(words), [], {OVERRIDES: list[str]()}
+        for text in rest:
             if text.startswith("--data."):
-                extra[OVERRIDES].append(text if "=" in text else f"{text}={next(words, '')}")
+                extra[OVERRIDES].append(text if "=" in text else f"{text}={next(rest, '')}")
             else:
-                given.append(text)
+                words.append(text)
     hints = typing.get_type_hints(command)
     chosen = {
         key: tuple(value) if value and isinstance(_word(hints[key])[1], int) else value
-        for key, value in vars(command_parser(name, command).parse_args(given)).items()
+        for key, value in vars(command_parser(name, command).parse_args(words)).items()
         if key in hints
     }
     return chosen | extra
@@ -107,9 +107,9 @@ def command_parser(name: str, command: Callable[..., None]) -> OneLineParser:
     return parser
 
 
-def at_least(least: int, **given: float | int | None) -> None:
+def at_least(least: int, **options: float | int | None) -> None:
     """Raise ValueError for an option below `least` or not finite; None is none."""
-    for name, value in given.items():
+    for name, value in options.items():
         if value is not None and not least <= value < math.inf:
             raise ValueError(f"expected --{name} of {least:g} or more, got {value}")
 

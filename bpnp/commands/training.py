@@ -78,7 +78,7 @@ class BpnpCLI(LightningCLI):
             self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
         plugins = self._get(self.config_init, "trainer.plugins") or []
-        own = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
+        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
         chosen = self._get(self.config_init, "trainer.logger")
         loggers = chosen if isinstance(chosen, list) else [] if chosen in (None, True, False) else [chosen]
         root = self._get(self.config_init, "trainer.default_root_dir")
@@ -87,7 +87,7 @@ class BpnpCLI(LightningCLI):
                 logger.keep_in(root)
         if chosen is not False and not any(isinstance(logger, CSVLogger) for logger in loggers):
             loggers = [*loggers, CSVLogger(root, name="logs")]
-        return super().instantiate_trainer(**{"plugins": own, "logger": loggers} | kwargs)
+        return super().instantiate_trainer(**{"plugins": plugins, "logger": loggers} | kwargs)
 
     def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
         """Our own tables instead of a list of all metrics, and no assignments kept in memory."""
@@ -119,8 +119,8 @@ class BpnpCLI(LightningCLI):
         if path == "last" and not list(folder.glob("last*.ckpt")):
             raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
         trained = re.search("checkpoint|pretrained", str(self._get(self.config, "model.solver")))
-        given = path or self._get(self.config, "model.weights") or trained
-        if subcommand != "fit" and not given and any(True for _ in self.model.parameters()):
+        weights = path or self._get(self.config, "model.weights") or trained
+        if subcommand != "fit" and not weights and any(True for _ in self.model.parameters()):
             sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
 
 

@@ -53,9 +53,9 @@ def tensor_maps() -> dict[str, TensorMap]:
     points @ T.
     """
     with torch.device("meta"):
-        own = BPnPNet().state_dict()
+        weights = BPnPNet().state_dict()
     maps = {}
-    for ours, value in own.items():
+    for ours, value in weights.items():
         module, _, kind = ours.rpartition(".")
         theirs = next(re.sub(old, new, module) for old, new in _THEIRS.items() if re.fullmatch(old, module))
         convolution = "conv" in theirs and kind == "weight"

@@ -81,8 +81,8 @@ def match_again(
     """
     pose, assignment = prediction.poses["ransac"], None
     for width in widths:
-        given = cost_under_pose(cost, batch, pose, width=width, mu=transport.entropy)  # type: ignore[arg-type]
-        assignment, _ = transport(given, batch.mask2d, batch.mask3d)
+        under_pose = cost_under_pose(cost, batch, pose, width=width, mu=transport.entropy)  # type: ignore[arg-type]
+        assignment, _ = transport(under_pose, batch.mask2d, batch.mask3d)
         pose = pnp_pose(pnp, assignment, batch, pose)
     if assignment is None:
         return prediction
@@ -112,9 +112,9 @@ def log_support(prediction: Prediction, batch: Batch, pose: Pose) -> Float[Tenso
     assignment = prediction.assignment
     assert assignment is not None
     mass = assignment.sum(2) if prediction.unmatched2d is None else assignment.sum(2) + prediction.unmatched2d
-    given = assignment / mass.clamp_min(torch.finfo(assignment.dtype).tiny).unsqueeze(2)
+    conditional = assignment / mass.clamp_min(torch.finfo(assignment.dtype).tiny).unsqueeze(2)
     real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
-    partner = (TRUST * given + (1 - TRUST) / batch.count3d[:, None, None]) * real
+    partner = (TRUST * conditional + (1 - TRUST) / batch.count3d[:, None, None]) * real
     rays = bearings(batch.points2d) * batch.mask2d.unsqueeze(2)
     mean = rays.sum(1) / batch.count2d.unsqueeze(1)
     variance = rays.square().sum((1, 2)) / batch.count2d - mean.square().sum(1)
@@ -170,14 +170,14 @@ class Refinement(nn.Module):
 @contextmanager
 def refinement_enabled(solver: nn.Module, enabled: bool) -> Iterator[None]:
     """Within the block every `Refinement` of a solver is off unless `enabled`; afterwards each is as it was."""
-    found = [module for module in solver.modules() if isinstance(module, Refinement)]
-    before = [module.enabled for module in found]
+    refinements = [module for module in solver.modules() if isinstance(module, Refinement)]
+    before = [module.enabled for module in refinements]
     try:
-        for module in found:
+        for module in refinements:
             module.enabled &= enabled
         yield
     finally:
-        for module, was in zip(found, before, strict=True):
+        for module, was in zip(refinements, before, strict=True):
             module.enabled = was
 
 

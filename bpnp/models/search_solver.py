@@ -63,13 +63,13 @@ def best_poses(results: Iterable[SearchResult], like: Tensor) -> Pose:
     In the stats, iterations are batches of starts, residual is the scale of the residuals in radians, and converged
     says that the verdict is "confident".
     """
-    found = list(results)
-    rotation = torch.tensor(np.array([result.best[0] for result in found]).reshape(-1, 3, 3)).to(like)
-    translation = torch.tensor(np.array([result.best[1] for result in found]).reshape(-1, 3)).to(like)
+    results = list(results)
+    rotation = torch.tensor(np.array([result.best[0] for result in results]).reshape(-1, 3, 3)).to(like)
+    translation = torch.tensor(np.array([result.best[1] for result in results]).reshape(-1, 3)).to(like)
     stats = SolveStats(
-        torch.tensor([result.batches for result in found], device=like.device, dtype=torch.int64),
-        torch.tensor([result.residual for result in found]).to(like),
-        torch.tensor([result.verdict == "confident" for result in found], device=like.device, dtype=torch.bool),
+        torch.tensor([result.batches for result in results], device=like.device, dtype=torch.int64),
+        torch.tensor([result.residual for result in results]).to(like),
+        torch.tensor([result.verdict == "confident" for result in results], device=like.device, dtype=torch.bool),
     )
     return Pose(rotation, translation, stats)
 

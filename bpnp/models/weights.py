@@ -83,17 +83,17 @@ def pretrained_names() -> list[str]:
     return sorted(file.name.removesuffix(".ckpt") for file in WEIGHTS.iterdir() if file.name.endswith(".ckpt"))
 
 
-def checkpoint_path(given: str | Path) -> Path:
+def checkpoint_path(name: str | Path) -> Path:
     """The file of a checkpoint: a path that is a file as it is, or that of packaged weights by their name.
 
     Raises FileNotFoundError for anything else.
     """
-    if Path(given).is_file():
-        return Path(given)
-    if str(given) in pretrained_names():
-        return pretrained_path(str(given))
+    if Path(name).is_file():
+        return Path(name)
+    if str(name) in pretrained_names():
+        return pretrained_path(str(name))
     raise FileNotFoundError(
-        f"expected a checkpoint, got no file at {given}; try runs/<name>/checkpoints/last.ckpt, or packaged weights: "
+        f"expected a checkpoint, got no file at {name}; try runs/<name>/checkpoints/last.ckpt, or packaged weights: "
         f"{', '.join(pretrained_names())}"
     )
 
@@ -139,16 +139,18 @@ def fitting_state(content: Mapping[str, Any], solver: nn.Module, *, grown: bool 
 
     grown: `solver` may have more weights than the checkpoint, if they are zero: parts that add nothing before training.
     """
-    saved, own = content.get("solver", {}), described(solver)
+    saved, wanted = content.get("solver", {}), described(solver)
     state, weights = solver_state(content), solver.state_dict()
-    if saved.get("class") != own["class"]:
-        raise ValueError(f"expected a checkpoint of {own['class']}, got one of {saved.get('class', 'another program')}")
+    if saved.get("class") != wanted["class"]:
+        raise ValueError(
+            f"expected a checkpoint of {wanted['class']}, got one of {saved.get('class', 'another program')}"
+        )
     if grown:
         state |= {key: value for key, value in weights.items() if key not in state and not value.any()}
     shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, weights))
     if shapes != own_shapes:
-        told = ", ".join(differences(saved, own)) or "other weights"
-        raise ValueError(f"expected a checkpoint of the configured {own['class']}, got {told}; try these settings")
+        told = ", ".join(differences(saved, wanted)) or "other weights"
+        raise ValueError(f"expected a checkpoint of the configured {wanted['class']}, got {told}; try these settings")
     return state
 
 
@@ -159,13 +161,13 @@ class AnyModule(Protocol):
     def __call__(self, *arguments: Any, **options: Any) -> Any: ...
 
 
-def chosen(given: AnyModule | None, default: type[nn.Module]) -> nn.Module:
+def chosen(module: AnyModule | None, default: type[nn.Module]) -> nn.Module:
     """The module that was given, or the default class with its default options."""
-    if given is None:
+    if module is None:
         return default()
-    if not isinstance(given, nn.Module):
-        raise ValueError(f"expected a module, got {given!r:.80}; try a subclass of torch.nn.Module")
-    return given
+    if not isinstance(module, nn.Module):
+        raise ValueError(f"expected a module, got {module!r:.80}; try a subclass of torch.nn.Module")
+    return module
 
 
 def described(module: nn.Module) -> dict[str, Any]:

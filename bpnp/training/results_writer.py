@@ -120,7 +120,7 @@ def _check_repeated(rows: Sequence[ProblemRow]) -> None:
 
 def _settings(trainer: Trainer) -> dict[str, Any]:
     """The checkpoint and the seed of its training; of a test from the command line also its data and solver."""
-    saved = next((own.config for own in trainer.callbacks if isinstance(own, SaveConfigCallback)), None)  # type: ignore[attr-defined]
+    saved = next((each.config for each in trainer.callbacks if isinstance(each, SaveConfigCallback)), None)  # type: ignore[attr-defined]
     config = {} if saved is None else saved.as_dict()
     settings = {"checkpoint": str(trainer.ckpt_path) if trainer.ckpt_path else None}
     settings |= {"training_seed": getattr(trainer.lightning_module, "training_seed", None)}
