@@ -4,6 +4,7 @@ checkout."""
 import os
 import subprocess
 import sys
+import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
@@ -69,11 +70,12 @@ def test_an_editable_install_sees_the_configurations_of_the_checkout(built: dict
     script = f"""
 import site, sys
 site.addsitedir({str(tmp_path / "site")!r})
+sys.path.append({sysconfig.get_paths()["purelib"]!r})
 from bpnp.files import config_names, packaged_config
 sys.stdout.write(" ".join([packaged_config("quickstart"), *config_names()]))
 """
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"PYTHONSAFEPATH": "1"}
-    # Without the site-packages' own installation of the package, but with the modules that the files need.
+    # With the libraries of the site-packages, but without their .pth files, and so their installation of the package.
     command = [sys.executable, "-S", "-c", script]
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
     file, *names = done.stdout.split()
