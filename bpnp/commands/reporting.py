@@ -28,7 +28,7 @@ def report(
     """Show results side by side: tables here, and on request a page and recall curves.
 
     Args:
-        runs: folders that `bpnp test` wrote, or their runs.
+        runs: folders that `bpnp test` or `bpnp table` wrote, or their runs.
         paper: the paper's rows beneath, for orientation.
         untrained: results of the untrained weights, to compare.
         html: write a page that needs no network.
