@@ -10,6 +10,7 @@ if TYPE_CHECKING:
     from bpnp.models.bpnpnet import BPnPNet
     from bpnp.models.matcher import Matcher
     from bpnp.search.starts import GravityPrior, PosePrior
+    from bpnp.search.warm_up import warm_up
     from bpnp.solving.solution import Solution
     from bpnp.solving.solve import solve, solve_many
     from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -27,6 +28,7 @@ __all__ = [
     "SolveStats",
     "solve",
     "solve_many",
+    "warm_up",
 ]
 
 __getattr__, __dir__, _ = lazy_loader.attach(
@@ -36,6 +38,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "models.bpnpnet": ["BPnPNet"],
         "models.matcher": ["Matcher"],
         "search.starts": ["GravityPrior", "PosePrior"],
+        "search.warm_up": ["warm_up"],
         "solving.solution": ["Solution"],
         "solving.solve": ["solve", "solve_many"],
         "types": ["Batch", "Pose", "Prediction", "SolveStats"],

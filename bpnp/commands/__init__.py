@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from bpnp.commands.localizing import localize
 from bpnp.commands.preparing import prepare_authors, prepare_megadepth, prepare_modelnet40
 from bpnp.commands.reporting import report, view, wandb_results
-from bpnp.commands.solving import solve
+from bpnp.commands.solving import solve, warm_up
 from bpnp.commands.tables import table
 from bpnp.commands.weights import convert_weights
 
@@ -25,4 +25,5 @@ COMMANDS: Mapping[str, Command | Mapping[str, Command]] = {
         "authors": prepare_authors,
     },
     "convert-weights": convert_weights,
+    "warm-up": warm_up,
 }

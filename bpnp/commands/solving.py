@@ -1,5 +1,6 @@
 """`bpnp solve`: the pose of a camera from a file of image points and a file of scene points."""
 
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -68,7 +69,7 @@ def solve(
         solver: auto, which asks a packaged matcher when the search is in doubt; search; or a
             network, packaged weights by name or a checkpoint.
         inlier_threshold: largest error of a match, pixels with a camera.
-        time_limit: seconds.
+        time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search.
         device: such as cuda; cpu by default.
     """
@@ -168,3 +169,12 @@ def solution_table(solution: "Solution") -> Table:
 
 def _numbers(values: Any) -> str:
     return "  ".join(f"{value:12.6g}" for value in values)
+
+
+def warm_up() -> None:
+    """Compile the loops of the search, once after an installation, so that no later call waits for it."""
+    from bpnp.search.warm_up import warm_up as compile_all
+
+    start = time.perf_counter()
+    compile_all()
+    say(f"compiled in {time.perf_counter() - start:.1f} s")

@@ -23,13 +23,13 @@ class Search(nn.Module):
 
     Args:
         seed: of the starts.
-        time_limit: seconds a problem; none for no limit.
+        time_limit: seconds a problem, of which one that no pose explains may take all; none for no limit.
         settings: of the search.
     """
 
     estimates = ("search",)
 
-    def __init__(self, *, seed: int = 0, time_limit: float | None = None, settings: SearchSettings = DEFAULT) -> None:
+    def __init__(self, *, seed: int = 0, time_limit: float | None = 5.0, settings: SearchSettings = DEFAULT) -> None:
         super().__init__()
         if time_limit is not None and not time_limit > 0:
             raise ValueError(f"expected a positive `time_limit` in seconds, got {time_limit}")
