@@ -51,7 +51,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             dispatcher: Any = numba.njit(function, cache=KNOWN and not part, **options)
             if KNOWN and not part:
                 stats = [os.stat(file) for file in sorted(files)]
-                dispatcher._cache._cache_file._source_stamp = [(stat.st_mtime, stat.st_size) for stat in stats]
+                shortcuts.stamp(dispatcher, [(stat.st_mtime, stat.st_size) for stat in stats])
         except RuntimeError:  # numba finds no folder for its cache
             dispatcher = numba.njit(function, **options)
         _FILES[dispatcher] = files

@@ -75,3 +75,17 @@ def _resolved_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
     if key not in _RESOLVED:
         _RESOLVED[key] = _resolve(function, context, args, kws)
     return _RESOLVED[key]
+
+
+def stamp(dispatcher: Any, source: Any) -> None:
+    """Compile again where `source` is not as it was, or the types that a kept loop takes are gone or elsewhere."""
+    kept = dispatcher._cache._cache_file
+    kept._source_stamp, load = source, kept._load_index
+
+    def loaded() -> Any:
+        try:
+            return load()
+        except (ImportError, AttributeError):
+            return {}
+
+    kept._load_index = loaded

@@ -10,9 +10,16 @@ from scipy.spatial.transform import Rotation
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.kernels.raster import Raster
-from bpnp.search.kernels.sides import FORWARD, blocks_of, kernel_sides, side_of, with_partners
-from bpnp.search.kernels.tiles import Tiles, build_tiles
-from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
+from bpnp.search.kernels.sides import (
+    FORWARD,
+    WeightedBearings,
+    WeightedPoints,
+    blocks_of,
+    kernel_sides,
+    side_of,
+    with_partners,
+)
+from bpnp.search.kernels.sparse import Tiles, build_tiles
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Nearby, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to

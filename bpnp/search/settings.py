@@ -108,7 +108,7 @@ class Nearby:
 
 @dataclass(frozen=True)
 class Facing:
-    """From where a point with a normal is seen (`bpnp.search.kernels.weighted`).
+    """From where a point with a normal is seen (`bpnp.search.kernels.sides`).
 
     softness: cosines from the cone's edge to where a point is seen fully, or hardly; annealed poses are some degrees
     off, and so are normals. unseen: weight of a point that should not be seen. extent: of the scene, that counts as

@@ -101,6 +101,40 @@ def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path,
     assert doubled(package, cache)[1].count("compiling") == 1
 
 
+RECORD = """
+from typing import NamedTuple
+
+
+class Record(NamedTuple):
+    value: int
+"""
+OF_RECORD = """
+from bpnp.loops.compilation import compiler
+from bpnp.record import Record
+
+
+@compiler()
+def value_of(record):
+    return record.value
+
+
+def double(x):
+    return 2 * value_of(Record(x))
+"""
+
+
+def test_a_type_that_has_moved_compiles_again(package: Path, tmp_path: Path) -> None:
+    cache, folder = str(tmp_path / "cache"), package / "bpnp"
+    (folder / "record.py").write_text(RECORD)
+    (folder / "loop.py").write_text(OF_RECORD)
+    assert doubled(package, cache)[0] == "8 10\n"
+    (folder / "record.py").rename(folder / "entry.py")
+    (folder / "loop.py").write_text(OF_RECORD.replace("bpnp.record", "bpnp.entry"))
+    printed, logged = doubled(package, cache)
+    assert printed == "8 10\n", logged
+    assert logged.count("compiling") == 1
+
+
 def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> None:
     for _ in range(2):
         printed, logged = doubled(package, "/dev/null/nowhere")

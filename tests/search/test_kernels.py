@@ -10,10 +10,9 @@ from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
 from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
-from bpnp.search.kernels.sparse import assign_sparse, descend_sparse, sparse_scratch
-from bpnp.search.kernels.tiles import REACH, Tiles, build_tiles
+from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints
+from bpnp.search.kernels.sparse import REACH, Tiles, assign_sparse, build_tiles, descend_sparse, sparse_scratch
 from bpnp.search.kernels.vectors import turn
-from bpnp.search.kernels.weighted import WeightedBearings, WeightedPoints
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 

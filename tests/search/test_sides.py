@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.weighted import visible_weights
+from bpnp.search.kernels.sides import visible_weights
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets, faces
 from bpnp.search.scene import Scene

@@ -6,9 +6,17 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from bpnp.search.kernels.sparse import sparse_scratch
-from bpnp.search.kernels.tiles import REACH, add_moments, add_to_bearings, add_to_points, build_tiles, meet, sort_points
-from bpnp.search.kernels.weighted import WeightedBearings
+from bpnp.search.kernels.sides import WeightedBearings
+from bpnp.search.kernels.sparse import (
+    REACH,
+    add_moments,
+    add_to_bearings,
+    add_to_points,
+    build_tiles,
+    meet,
+    sort_points,
+    sparse_scratch,
+)
 
 
 def offsets(rng: np.random.Generator, count: int, spread: float) -> np.ndarray:

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.evidence.image_statistics import ImageStatistics, label_groups
-from bpnp.search.kernels.near import sums_near
+from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.point_sets import PointSets, faces
 
 Array = NDArray[np.float64]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.kernels.near import sums_near
+from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
-from bpnp.search.kernels.hashed import HashedPoints
+from bpnp.search.kernels.neighbours import HashedPoints
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
 

@@ -1,22 +1,202 @@
 """Annealing of a few poses on all points: at a small scale a point sees only its neighbours, found in tiles.
 
-An iteration costs O(m + n) times the neighbours within three scales, not O(m n). Arrays and offsets are those of
-`bpnp.search.kernels.dense`.
+An iteration costs O(m + n) times the neighbours within three scales, not O(m n). Bearings are sorted into tiles of 16
+that lie near each other, points under a pose into the cells of a grid across the view; a tile meets the points of the
+cells around it. In a view of more than 180 degrees a cell holds directions of both hemispheres. Arrays and offsets are
+those of `bpnp.search.kernels.dense`; the loops over the bearings of a tile have a constant length, for which compilers
+use the widest instructions that there are.
 """
 
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bpnp.search.kernels.dense import directions, move
-from bpnp.search.kernels.tiles import LANES, Near, Tiles, add_moments, add_to_bearings, add_to_points, meet, sort_points
+from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, visible_weights
 from bpnp.search.kernels.vectors import F, compiled, part, sum_of
-from bpnp.search.kernels.weighted import WeightedPoints, visible_weights
 
 SWEEPS = 2
 TILES = 12  # with neighbours, of a point in the mean, before there is place for more
 LEAST_SEEN = 0.25  # of all weights: if fewer points face the camera, they count as so many
+REACH = 3.0  # scales; the kernel is below 0.012 beyond
+LANES = 16  # bearings of a tile
+CELLS = 64  # along the longer side of the grid
+
+
+class Tiles(NamedTuple):
+    """Bearings in c tiles, and a grid across the view.
+
+    f: (c, 3, LANES) offsets. a, odds, label: (c, LANES) as of `WeightedBearings`; the last tile is filled up with
+    bearings of weight 0. box: (c, 4) least x and y of a tile, and largest. low: (2,) corner of the grid. cell: width of
+    its cells. shape: (2,) cells along x and y. Cell (i, j) is number 1 + i * shape[1] + j; number 0 is outside.
+    """
+
+    f: NDArray[np.float32]
+    a: NDArray[np.float32]
+    odds: NDArray[np.float32]
+    label: NDArray[np.int32]
+    box: NDArray[np.float32]
+    low: NDArray[np.float32]
+    cell: np.float32
+    shape: NDArray[np.int32]
+
+    def with_margin(self, scale: float) -> "Tiles":
+        """With a grid over the bearings and as much around them as a kernel of this scale reaches, radians."""
+        margin = F(REACH * scale)
+        low, high = self.box[:, :2].min(0) - margin, self.box[:, 2:].max(0) + margin
+        cell = F((high - low).max() / CELLS)
+        return self._replace(low=low, cell=cell, shape=np.floor((high - low) / cell).astype(np.int32) + 1)
+
+
+class Near(NamedTuple):
+    """Pairs e of a tile and a point near it, in the order of the tiles: those of tile t from end[t] to end[t + 1].
+
+    point: (e,). kernel: (e, LANES), of the tile's bearings and this point. end: (c + 1,).
+    """
+
+    point: NDArray[np.int32]
+    kernel: NDArray[np.float32]
+    end: NDArray[np.int32]
+
+
+def build_tiles(bearings: WeightedBearings) -> Tiles:
+    """Tiles of bearings, cut from stripes across x that are sorted by y, before there is a grid (`with_margin`)."""
+    x, y = bearings.f[:2]
+    m = len(x)
+    stripe = np.empty(m, np.int64)
+    stripe[np.argsort(x, kind="stable")] = np.arange(m) // (LANES * math.ceil(math.sqrt(m / LANES)))
+    order = np.lexsort((y, stripe))
+    order = np.append(order, np.repeat(order[-1:], -m % LANES))
+    a, odds = (values[order].reshape(-1, LANES) for values in (bearings.a, bearings.odds))
+    a.flat[m:] = 0
+    f = np.ascontiguousarray(bearings.f[:, order].reshape(3, -1, LANES).transpose(1, 0, 2))
+    box = np.concatenate([f[:, :2].min(2), f[:, :2].max(2)], 1)
+    return Tiles(f, a, odds, bearings.label[order].reshape(-1, LANES), box, box[0, :2], F(1), np.ones(2, np.int32))
+
+
+@part
+def sort_points(tiles: Any, u: Any, cells: Any, start: Any, order: Any) -> None:
+    """order (n,): the points, seen in directions u (3, n), by their cells; those of cell c end at start[c]."""
+    low, shape = tiles.low, tiles.shape
+    inverse = F(1) / tiles.cell
+    for c in range(len(start)):
+        start[c] = 0
+    for j in range(len(cells)):
+        x, y = (u[0, j] - low[0]) * inverse, (u[1, j] - low[1]) * inverse
+        inside = (x >= 0) & (y >= 0) & (x < shape[0]) & (y < shape[1])
+        cells[j] = 1 + int(x) * shape[1] + int(y) if inside else 0
+    for j in range(len(cells)):
+        start[cells[j]] += 1
+    total = 0
+    for c in range(len(start)):
+        count = start[c]
+        start[c] = total
+        total += count
+    for j in range(len(cells)):
+        order[start[cells[j]]] = j
+        start[cells[j]] += 1
+
+
+@part
+def cells_between(first: Any, last: Any, low: Any, cell: Any, size: Any) -> tuple[int, int]:
+    """First and last of `size` cells along an axis that meet an interval."""
+    i, j = math.floor((first - low) / cell), math.floor((last - low) / cell)
+    return i if i > 0 else 0, j if j < size else size - 1
+
+
+@part
+def meet(tiles: Any, labels: Any, u: Any, scale: Any, start: Any, order: Any, near: Any) -> bool:
+    """Pairs e of a tile t and a point near it, end[t] <= e < end[t + 1]: point[e], and kernel[e, k] for bearing k of t;
+    False if `near`, a `Near`, has no place for all of them.
+
+    The kernel is (1 + y + y^2/2 + y^3/6)^64, y = -|f - u|^2 / 128 s^2, within 1e-4 of exp(64 y), and 0 beyond REACH.
+    """
+    f, label, box, low, cell, shape = tiles.f, tiles.label, tiles.box, tiles.low, tiles.cell, tiles.shape
+    point, kernel, end = near
+    radius = F(REACH) * scale
+    bound, sharp = radius * radius, F(-1 / 128) / (scale * scale)
+    place = end[0]
+    for t in range(len(f)):
+        i0, i1 = cells_between(box[t, 0] - radius, box[t, 2] + radius, low[0], cell, shape[0])
+        j0, j1 = cells_between(box[t, 1] - radius, box[t, 3] + radius, low[1], cell, shape[1])
+        for i in range(i0, i1 + 1):
+            for e in range(start[i * shape[1] + j0], start[1 + i * shape[1] + j1]):
+                if place + 1 >= len(point):
+                    return False
+                j = order[e]
+                x, y, z, wanted, total = u[0, j], u[1, j], u[2, j], labels[j], F(0)
+                for k in range(LANES):
+                    dx, dy, dz = f[t, 0, k] - x, f[t, 1, k] - y, f[t, 2, k] - z
+                    squared = dx * dx + dy * dy + dz * dz
+                    partners = (wanted < 0) | (label[t, k] < 0) | (label[t, k] == wanted)
+                    v = sharp * min(squared, bound)
+                    v = F(1) + v * (F(1) + v * (F(0.5) + v * F(1 / 6)))
+                    v = v * v
+                    v = v * v
+                    v = v * v
+                    v = v * v
+                    v = v * v
+                    v = v * v if (squared < bound) & partners else F(0)
+                    kernel[place, k] = v
+                    total += v
+                # Without a branch: the next pair takes the place of one that does not count.
+                point[place] = j
+                place += total > 0
+        end[t + 1] = place
+    return True
+
+
+@part
+def add_to_bearings(values: Any, near: Any, sums: Any) -> None:
+    """sums (c, LANES): sum_j K_ij values_j."""
+    point, kernel, end = near
+    for t in range(len(sums)):
+        for k in range(LANES):
+            sums[t, k] = 0
+        for e in range(end[t], end[t + 1]):
+            value = values[point[e]]
+            for k in range(LANES):
+                sums[t, k] += kernel[e, k] * value
+
+
+@part
+def add_to_points(values: Any, near: Any, sums: Any) -> None:
+    """sums (n,): sum_i K_ij values_i, of values (c, LANES)."""
+    point, kernel, end = near
+    for j in range(len(sums)):
+        sums[j] = 0
+    for t in range(len(values)):
+        for e in range(end[t], end[t + 1]):
+            total = F(0)
+            for k in range(LANES):
+                total += kernel[e, k] * values[t, k]
+            sums[point[e]] += total
+
+
+@part
+def add_moments(f: Any, u: Any, row: Any, column: Any, near: Any, q: Any) -> None:
+    """q (4, n): sum_i W_ij (f_i - u_j) and sum_i W_ij, W_ij = row_i K_ij column_j."""
+    point, kernel, end = near
+    for j in range(len(column)):
+        q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
+    for t in range(len(f)):
+        for e in range(end[t], end[t + 1]):
+            j = point[e]
+            x, y, z = u[0, j], u[1, j], u[2, j]
+            q0, q1, q2, q3 = F(0), F(0), F(0), F(0)
+            for k in range(LANES):
+                mass = kernel[e, k] * row[t, k]
+                q0 += mass * (f[t, 0, k] - x)
+                q1 += mass * (f[t, 1, k] - y)
+                q2 += mass * (f[t, 2, k] - z)
+                q3 += mass
+            b = column[j]
+            q[0, j] += b * q0
+            q[1, j] += b * q1
+            q[2, j] += b * q2
+            q[3, j] += b * q3
 
 
 class SparseScratch(NamedTuple):

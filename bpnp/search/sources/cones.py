@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 from bpnp.loops.parallel import in_time
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_shifted
-from bpnp.search.kernels.tiles import LANES
-from bpnp.search.kernels.weighted import WeightedPoints
+from bpnp.search.kernels.sides import WeightedPoints
+from bpnp.search.kernels.sparse import LANES
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby
 from bpnp.search.sources.raster import narrowed, raster_of

@@ -25,7 +25,7 @@ from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
-from bpnp.search.kernels.weighted import WeightedPoints
+from bpnp.search.kernels.sides import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Nearby
 from bpnp.search.starts import PosePrior, Prior

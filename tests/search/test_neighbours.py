@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from bpnp.search.kernels.hashed import HashedPoints
-from bpnp.search.kernels.near import sums_near
+from bpnp.search.kernels.neighbours import HashedPoints, sums_near
 
 
 @pytest.mark.parametrize(("width", "count"), [(0.2, 300), (20.0, 300), (0.2, 1)])
