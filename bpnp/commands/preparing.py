@@ -1,13 +1,14 @@
-"""`bpnp prepare`: a data set as it was published, packed once as a memory-mapped store."""
+"""`bpnp prepare`, a data set as it was published, packed once as a memory-mapped store; `bpnp convert-weights`."""
 
 import os
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from bpnp.commands.output import say
 from bpnp.commands.parser import at_least
+from bpnp.files import written_whole
 
 if TYPE_CHECKING:
     from bpnp.datamodules.store import Store
@@ -87,3 +88,40 @@ def _show(store: "Store", counts: Mapping[str, int]) -> None:
         say(f"left out {len(store.skipped)}, all listed in {store.folder / 'manifest.json'}; such as:")
         for name, reason in list(store.skipped.items())[:10]:
             say(f"  {name}: {reason}")
+
+
+def convert_weights(
+    file: Path,
+    out: Path,
+    *,
+    ransac: Literal["poselib", "opencv"] = "poselib",
+    pnp: Literal["newton", "lbfgs"] = "newton",
+) -> None:
+    """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
+
+    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. Raises ValueError or OSError as
+    `load_authors_weights` does, and leaves no file that is half written.
+
+    Args:
+        file: the authors' file, *.pth.tar.
+        out: checkpoint to write, *.ckpt.
+        ransac: backend of the RANSAC step; opencv is the paper's.
+        pnp: solver of the weighted PnP; lbfgs is the paper's.
+    """
+    import lightning
+    import torch
+
+    from bpnp.models.authors import load_authors_weights
+    from bpnp.training.task import BlindPnPTask
+
+    task = BlindPnPTask(load_authors_weights(file, backend=ransac, method=pnp))
+    checkpoint: dict[str, Any] = {
+        "epoch": 0,
+        "global_step": 0,
+        "pytorch-lightning_version": lightning.__version__,
+        "state_dict": task.state_dict(),
+    }
+    task.on_save_checkpoint(checkpoint)
+    with written_whole(out) as temporary:
+        torch.save(checkpoint, temporary)
+    say(f"wrote {out}")
