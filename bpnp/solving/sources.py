@@ -22,8 +22,8 @@ from bpnp.solving.solution import Solution
 
 TOGETHER = 2**26  # cells of the assignments, 2D points x 3D points, that a module solves together on a GPU
 WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
-# Of a time limit, what is left for matching: seconds, and seconds a 2D or 3D point.
-MATCHING, MATCHING_A_POINT = 1.5e-3, 8e-6
+# Seconds, and seconds a 2D or 3D point, that the verdict and matching take after the search; of a limit at most half.
+ENDING, ENDING_A_POINT = 4e-3, 8e-6
 
 
 class Options(NamedTuple):
@@ -46,9 +46,11 @@ class Options(NamedTuple):
     until: Deadline = Deadline()
 
     def deadline(self, problem: Problem) -> Deadline:
-        """When to leave off searching, so that matching ends in time too; of a problem that is begun now."""
+        """When to leave off searching, so that all ends in time; of a problem that is begun now."""
+        begun = Deadline.after(0.0).at
         end = min(self.until.at, Deadline.after(self.time_limit).at)
-        return Deadline(end - MATCHING - MATCHING_A_POINT * (len(problem.image) + len(problem.points3d)))
+        ending = ENDING + ENDING_A_POINT * (len(problem.image) + len(problem.points3d))
+        return Deadline(max(end - ending, (begun + end) / 2))
 
 
 def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int, Solution]:
