@@ -68,10 +68,8 @@ def test_mutual_nearest_is_what_it_says() -> None:
     image, projected = rng.uniform(size=(60, 2)), rng.uniform(size=(80, 2))
     distance = cdist(image, projected)
     expected = {
-        (i, j)
-        for i, j in enumerate(distance.argmin(1))
-        if distance[:, j].argmin() == i and distance[i, j] <= 0.05
-    }  # fmt: skip
+        (i, j) for i, j in enumerate(distance.argmin(1)) if distance[:, j].argmin() == i and distance[i, j] <= 0.05
+    }
     assert {tuple(pair) for pair in mutual_nearest(image, projected, 0.05).tolist()} == expected
 
 

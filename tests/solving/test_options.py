@@ -9,7 +9,9 @@ from numpy.typing import NDArray
 from planted import degrees_between, plant
 from scipy.spatial.transform import Rotation
 
+import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
+from bpnp.cli import main
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(5)
@@ -136,3 +138,11 @@ def test_progress_is_told_of_every_batch() -> None:
     assert [batch for _, batch, _ in calls if batch] == list(range(1, solution.stats.iterations + 1))
     assert {problem for problem, _, _ in calls} == {0}
     assert sorted(seconds for *_, seconds in calls) == [seconds for *_, seconds in calls]
+
+
+def test_what_is_warm_is_compiled_once(capsys: pytest.CaptureFixture[str]) -> None:
+    bpnp.warm_up()
+    main(["warm-up"])
+    word, _, seconds, unit = capsys.readouterr().out.split()
+    assert (word, unit) == ("compiled", "s")
+    assert float(seconds) < 2
