@@ -69,22 +69,38 @@ class Enumeration:
     """
 
     def __init__(
-        self, scene: SceneSide, image: ImageSide, prior: tuple[PosePriorArrays, float], fixing: int, reach: float,
+        self,
+        scene: SceneSide,
+        image: ImageSide,
+        prior: tuple[PosePriorArrays, float],
+        fixing: int,
+        reach: float,
         settings: EnumerationSettings,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.scene, self.image, self.settings, self.reach = scene, image, settings, reach
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
         self.problem = Problem(scene.arrays, image.arrays, prior[0], fixing, image.density, settings.rules)
         self.kept = Kept(
-            np.zeros((kept, 4, 3)), np.full(kept, -math.inf), np.zeros(kept, np.int64), np.full((kept, m), -1),
-            np.zeros((kept, m)), np.zeros(1, np.int64), np.zeros(1),
-        )  # fmt: skip
+            np.zeros((kept, 4, 3)),
+            np.full(kept, -math.inf),
+            np.zeros(kept, np.int64),
+            np.full((kept, m), -1),
+            np.zeros((kept, m)),
+            np.zeros(1, np.int64),
+            np.zeros(1),
+        )
         matches = Matches(np.empty(m, np.int64), np.empty(m))
         self.work = Work(
-            np.empty((4, 3)), np.empty((3, 3)), np.empty((4, 4, 3)), np.empty((4, 3)), matches, np.empty((8, 6)),
-            np.empty((4, 3)), np.empty(m, np.int64),
-        )  # fmt: skip
+            np.empty((4, 3)),
+            np.empty((3, 3)),
+            np.empty((4, 4, 3)),
+            np.empty((4, 3)),
+            matches,
+            np.empty((8, 6)),
+            np.empty((4, 3)),
+            np.empty(m, np.int64),
+        )
         seen = settings.seen_witnesses * n / max(m - fixing, 1)
         near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])

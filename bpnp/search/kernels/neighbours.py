@@ -34,8 +34,9 @@ def sums_near(bearings: Array, directions: Array, axes: Array, radii: Array, sha
 
 
 @compiled
-def _add_up(bearings: Any, start: Any, side: int, directions: Any, place: Any, squares: Any, sharpness: Any,
-            sums: Any) -> None:  # fmt: skip
+def _add_up(
+    bearings: Any, start: Any, side: int, directions: Any, place: Any, squares: Any, sharpness: Any, sums: Any
+) -> None:
     """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. place (n, 2): the cell of each
     direction (n, 3), which may lie beyond the grid. sums (S, k): added to."""
     for j in range(len(directions)):
@@ -90,8 +91,9 @@ def _enter(points: Any, tolerance: float, heads: Any, links: Any) -> None:
 
 
 @compiled
-def _count_on(points: Any, tolerance: float, heads: Any, links: Any, moved: Any, shifts: Any, least: int,
-              counts: Any) -> None:  # fmt: skip
+def _count_on(
+    points: Any, tolerance: float, heads: Any, links: Any, moved: Any, shifts: Any, least: int, counts: Any
+) -> None:
     for s in range(len(shifts)):
         counts[s] = 0
         for k in range(len(moved)):

@@ -33,9 +33,16 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 @compiled
 def add_up(
-    raster: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any,
+    raster: Any,
+    half: Any,
+    per_cell: Any,
+    points: Any,
+    rotation: Any,
+    translation: Any,
+    score: Any,
+    weight: Any,
     cell: Any,
-) -> None:  # fmt: skip
+) -> None:
     """score (S,): the sum of the points' weights times the raster's values where pose k sees them, 0 outside it.
 
     points: a `WeightedPoints`, or the same as a plain tuple, whose labels are ignored.
@@ -59,8 +66,9 @@ def add_up(
 
 
 @compiled
-def add_shifted(scores: Any, padded: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any,
-                weight: Any) -> None:  # fmt: skip
+def add_shifted(
+    scores: Any, padded: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, weight: Any
+) -> None:
     """scores (S, k, k): to [s, r, c] what `add_up` gives pose s if its points move by r - k/2 rows, c - k/2 columns.
 
     padded (g, g + 2 k): the raster, k columns of 0 on each side. half: that of k more cells. The rest as in `add_up`.

@@ -162,10 +162,14 @@ def kernel_sides(bearings: Side, points: Side, facing: Facing) -> tuple[Weighted
             np.ascontiguousarray(bearings.points.T), bearings.weights, _fitting(bearings, points), bearings.labels
         ),
         WeightedPoints(
-            np.ascontiguousarray(points.points.T), points.weights, _fitting(points, bearings), points.labels,
-            np.empty((0, 4), np.uintp), _cones(points, facing),
+            np.ascontiguousarray(points.points.T),
+            points.weights,
+            _fitting(points, bearings),
+            points.labels,
+            np.empty((0, 4), np.uintp),
+            _cones(points, facing),
         ),
-    )  # fmt: skip
+    )
 
 
 def blocks_of(labels2d: NDArray[np.int32], labels3d: NDArray[np.int32]) -> NDArray[np.uintp]:

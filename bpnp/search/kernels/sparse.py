@@ -302,9 +302,16 @@ def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation:
 
 @compiled
 def descend_on_points(
-    tiles: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int, result: Any,
+    tiles: Any,
+    points: Any,
+    rotation: Any,
+    translation: Any,
+    scales: Any,
+    outlier: Any,
+    patience: int,
+    result: Any,
     scratch: Any,
-) -> int:  # fmt: skip
+) -> int:
     """`descend_sparse`, of as many starts as there was place for; the next one is as it was."""
     best, first = scratch.best, scratch.first
     for k in range(len(rotation)):
@@ -335,9 +342,16 @@ def descend_on_points(
 
 
 def descend_sparse(
-    tiles: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, patience: int, result: Any,
+    tiles: Any,
+    points: Any,
+    rotation: Any,
+    translation: Any,
+    scales: Any,
+    outlier: Any,
+    patience: int,
+    result: Any,
     scratch: SparseScratch,
-) -> None:  # fmt: skip
+) -> None:
     """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best.
 
     A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
