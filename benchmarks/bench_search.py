@@ -27,7 +27,7 @@ from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings
 
 EVERYTHING = 1e6
 SCENES = ("castle-P30", "fountain-P11", "sceaux_castle_txt", "south_building", "statue_of_liberty", "walkthrough")
@@ -128,14 +128,14 @@ def main() -> None:
     parser.add_argument("--limit", type=int, help=f"pairs a set (100; {ALL_LIMIT} of a SCENE-all)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--time-limit", type=float, help=f"seconds a pair (none; {ALL_SECONDS:.0f} of a SCENE-all)")
-    parser.add_argument("--max-batches", type=int, default=32)
+    parser.add_argument("--turns", type=int, default=96)
     parser.add_argument("--output", type=Path, help="JSON to add the results to")
     parser.add_argument("--document", type=Path, help="Markdown file whose table is replaced by these results")
     parser.add_argument("--pairs", type=Path, help="folder for a CSV of each set's pairs")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
-    settings = SearchSettings(turns=options.max_batches)
-    run("psb", options.data, 1, 0, SearchSettings(turns=1))  # compiles
+    settings = DEFAULT.limited(options.turns)
+    run("psb", options.data, 1, 0, DEFAULT.limited(1))  # compiles
     results = json.loads(options.output.read_text()) if options.output and options.output.exists() else {}
     for name in options.sets:
         every = name.endswith("-all")
@@ -155,7 +155,7 @@ def main() -> None:
         results[name] = row | {
             "seed": options.seed,
             "time_limit": time_limit,
-            "max_batches": options.max_batches,
+            "turns": options.turns,
             "threads": torch.get_num_threads(),
         }
         if options.output:

@@ -21,8 +21,8 @@ MOST_KEYPOINTS = 2048  # the strongest; of the 2,000 largest SIFT keypoints half
 VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which one sees a third of the other's points
 VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
-BRIEF = replace(DEFAULT, turns=1)  # one raster search
-LONGER = replace(DEFAULT, turns=8)
+BRIEF = DEFAULT.limited(1)  # one raster search
+LONGER = DEFAULT.limited(8)
 PROMISING = 3  # views that are tried longer if none is confident
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 

@@ -40,7 +40,7 @@ def search_poses(
 
     Few points (`bpnp.search.enumeration`) are enumerated first, and annealed only if that leaves a doubt.
 
-    around: a guess from the same points, such as a network's pose: the first `settings.around` batches start there, and
+    around: a guess from the same points, such as a network's pose: the first `Schedule.around` batches start there, and
         that they end alike is no evidence. proposals: gives poses to start from, such as those that a network finds
         likely, and no evidence either; asked where the search ends in doubt, without a prior of many points alone, and
         where no pose exceeds chance. seed: of all that is random.
@@ -88,7 +88,7 @@ def _until_certain(
     """Turn after turn until the verdict is settled or the budget is spent."""
     settings, finished = pool.scene.settings, 0.0
     thinned = len(pool.sets.bearings) > settings.fine.bearings
-    while pool.turns < settings.turns and not pool.scene.deadline.passed():
+    while pool.turns < settings.schedule.turns and not pool.scene.deadline.passed():
         found = next(turns, None)
         if found is None:
             break

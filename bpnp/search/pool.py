@@ -97,14 +97,14 @@ class Pool:
         return int(self.sets.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
 
     def different(self, parts: list[Candidates]) -> Candidates:
-        """The best poses of several sets of them, no two turned by less than `settings.beside_deg`."""
-        rule, together = self.scene.settings, Candidates.concatenated(parts)
-        return best_distinct(together, self.scene, rule.beside_poses, degrees=rule.beside_deg, shift=np.inf)
+        """The best poses of several sets of them, no two turned by less than `schedule.apart_deg`."""
+        rule, together = self.scene.settings.schedule, Candidates.concatenated(parts)
+        return best_distinct(together, self.scene, rule.around_each, degrees=rule.apart_deg, shift=np.inf)
 
     def missed(self) -> float:
         """log10 of the probability that a better optimum than the best pose was not met."""
         leaders = self.leaders()
-        return missed(leaders, self.sets, self.looks(leaders))
+        return missed(leaders, self.sets, self.looks(leaders), self.scene.settings.evidence)
 
     def result(self, annealed: int | None = None) -> SearchResult:
         """The verdict on the best candidates, the first `annealed` of which are annealed to the end on all points."""

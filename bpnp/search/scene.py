@@ -21,7 +21,7 @@ from bpnp.search.kernels.sides import (
 )
 from bpnp.search.kernels.sparse import Tiles, build_tiles
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Nearby, SearchSettings
+from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]
@@ -38,13 +38,13 @@ class Scene:
     spread: of the bearings, radians for a narrow view. shift_weight: (3,) of the axes in which translations are
     compared: along the view a narrow image hardly shows a shift. solid_angle: that they fill, steradians.
     image, seen: both sides with what is known of single points. smallest_scale: of the residuals, radians. rng: of all
-    that is random. settings, deadline: of the search. rasters: of the bearings, those that were asked for (`nearby`).
+    that is random. settings, deadline: of the search. rasters: of the bearings, those that were asked for.
     """
 
     def __init__(self, sets: PointSets, seed: int, settings: SearchSettings, deadline: Deadline = NEVER) -> None:
         bearings, points3d = sets.bearings, sets.points3d
         self.settings, self.deadline = settings, deadline
-        self.rasters: dict[tuple[Nearby, float], Raster] = {}
+        self.rasters: dict[tuple[RasterShape, float], Raster] = {}
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)

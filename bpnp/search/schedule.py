@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.unseen import log10_missed
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
 from bpnp.search.sources.multistart import multistart, multistart_near
@@ -35,10 +34,10 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
     scene, settings = pool.scene, pool.scene.settings
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
     if guess is not None:
-        for number in range(settings.around):
+        for number in range(settings.schedule.around):
             yield without_hits(multistart(scene, number, guess, pool.candidates)[0])
     if isinstance(known, PosePrior) and is_near(scene, known):
-        yield from islice(_near(pool, known, proposals), settings.near_turns)
+        yield from islice(_near(pool, known, proposals), settings.schedule.near)
         while pool.alarms < 0:
             yield from _sure(pool, ((found, 1.0) for found in _near(pool, known, None)))
         # The prior may be wrong: what was found near it would only be in the way.
@@ -60,14 +59,14 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
 def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
     scene, settings = pool.scene, pool.scene.settings
     batches = _batches(pool, known)
-    rules = settings.anywhere if pool.sets.cones3d is not None else ()
+    rules = settings.cones.searches if pool.sets.cones3d is not None else ()
     best, since = -math.inf, 0.0
-    while since < settings.patience and pool.alarms > 0:  # full batches that bettered nothing
+    while since < settings.schedule.patience and pool.alarms > 0:  # full batches that bettered nothing
         found, share = next(batches)
         pool.starts += share
         yield found
         score = float(pool.candidates.score.max(initial=-np.inf))
-        best, since = (score, 0.0) if score >= best + settings.better else (best, since + share)
+        best, since = (score, 0.0) if score >= best + settings.schedule.better else (best, since + share)
     for number in count():
         if pool.alarms < 0:
             yield from _sure(pool, batches)
@@ -78,7 +77,7 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
         if proposals is not None and number == 0 and pool.alarms > 0:
             yield from _with_surroundings(pool, proposed(pool, proposals))
         if pool.alarms > 0:
-            for found, share in islice(batches, settings.between):
+            for found, share in islice(batches, settings.schedule.between):
                 pool.starts += share
                 yield found
 
@@ -88,7 +87,9 @@ def _sure(pool: Pool, batches: Iterator[tuple[Candidates, float]]) -> Iterator[C
     leaders, settings = pool.leaders(), pool.scene.settings
     # Of a full batch, which costs as much as a raster search.
     hits = int(leaders.hits[0]) / max(pool.starts, 1 / settings.starts)
-    if pool.looks(leaders) < settings.looks and log10_missed(0, 0.0, 1) < log10_missed(round(hits), 0.0, 0):
+    if pool.looks(leaders) < settings.schedule.looks and math.log10(settings.evidence.look_fails) < -hits * math.log10(
+        2
+    ):
         alarms, leader = pool.alarms, pool.leader
         yield search_beside(pool.scene, leader, settings.beside)
         if pool.alarms > alarms - settings.evidence.lead:
@@ -116,7 +117,7 @@ def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
     """Raster searches around each of the poses, until several are in vain or a pose exceeds chance."""
     settings, since = pool.scene.settings, 0
     for k in range(len(poses)):
-        if since == settings.beside_patience or pool.alarms < 0:
+        if since == settings.schedule.in_vain or pool.alarms < 0:
             break
         best = pool.candidates.preference.max(initial=-np.inf)
         yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
@@ -134,7 +135,7 @@ def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
     yield from _with_surroundings(pool, proposed(pool, proposals))
     while pool.alarms < 0:
         yield from _sure(pool, iter(()))
-        if pool.looks(pool.leaders()) >= pool.scene.settings.looks:
+        if pool.looks(pool.leaders()) >= pool.scene.settings.schedule.looks:
             return
 
 

@@ -71,39 +71,107 @@ class Shaking:
 
 
 @dataclass(frozen=True)
-class Nearby:
-    """Starts around a rough pose, looked up in a raster of the view (`bpnp.search.sources.raster`).
+class Draws:
+    """How many starts are drawn around a rough pose.
 
-    starts: a batch for a prior of `wide_deg` and `wide_shift` (of the distance) or more; these leave few gaps over the
-    width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
-    points: 3D points that are looked up, first for all starts, then for the best. kept: starts that go on from each.
-    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
-        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
-        factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
-    copies: of a pose at each step. points_again: 3D points that are looked up there. halved: half of the poses go on
-        each time, the best copy of each, so that those of some do not crowd out the others.
-    annealed: on all points from the last scale. outliers: share without a partner, at least. cells: of the raster, a
-        scale; most_cells: a side. background: scales of the density that is chance. starts_a_check: of the clock.
+    starts: around one with a standard deviation of `wide_deg` and `wide_shift` (of the distance), or more; these leave
+    few gaps over the width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
     """
 
     starts: int = 2**17
     wide_deg: float = 12.0
     wide_shift: float = 0.12
     least_starts: int = 2**15
+
+
+@dataclass(frozen=True)
+class Screens:
+    """Which starts go on: `kept` of them each time that so many 3D `points` are looked up in the raster."""
+
     points: tuple[int, ...] = (300, 5000)
     kept: tuple[int, ...] = (2**14, 2**11)
+
+
+@dataclass(frozen=True)
+class Narrowing:
+    """From the scale of the screening to one at which poses are annealed.
+
+    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
+        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
+        factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
+    copies: of a pose at each step. points: 3D points that are looked up there. halved: half of the poses go on each
+        time, the best copy of each, so that those of some do not crowd out the others.
+    """
+
     first_scale: float = 0.06
     last_scale: float = 0.011
     steps: int = 5
     copies: int = 16
-    points_again: int = 1500
+    points: int = 1500
     halved: bool = False
-    annealed: int = 40
+
+
+@dataclass(frozen=True)
+class RasterShape:
+    """A raster of the view. background: scales of the density that is chance. cells: a scale; most_cells: a side.
+    outliers: share of the bearings without a partner, at least. inside: of the largest density of the smoothed
+    bearings; less is outside the view."""
+
     background: float = 8.0
     cells: float = 2.0
     most_cells: int = 1024
     outliers: float = 0.85
-    starts_a_check: int = 4096
+    inside: float = 0.05
+
+
+@dataclass(frozen=True)
+class RasterSearch:
+    """One raster search (`bpnp.search.sources.raster`): draw, screen, narrow, and anneal so many poses."""
+
+    draws: Draws = Draws()
+    screens: Screens = Screens()
+    narrowing: Narrowing = Narrowing()
+    raster: RasterShape = RasterShape()
+    annealed: int = 40
+
+
+@dataclass(frozen=True)
+class Cones:
+    """Raster searches within the cones of the points (`bpnp.search.sources.cones`), one a turn.
+
+    log_depth: starts are exp(u) times the weak-perspective distance away, u uniform in [-log_depth, log_depth].
+    aim_cells: of the raster, a scale, in which a start is aimed; with 1 no more poses are found, in twice the time.
+    """
+
+    searches: tuple[RasterSearch, ...] = (
+        *3 * (RasterSearch(Draws(2**13), Screens((300,), (2**12,)), Narrowing(copies=32, halved=True)),),
+        RasterSearch(Draws(2**14), Screens((300,), (2**12,)), Narrowing(0.09, steps=6, copies=32, halved=True)),
+    )
+    log_depth: float = 0.7
+    aim_cells: float = 0.5
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """In which order starts are drawn, and how many (`bpnp.search.schedule`).
+
+    turns: at most. around: from a guess of the pose before all others. near: with a rough prior before it may be wrong.
+    patience: full batches that do not better the best log-likelihood by `better` nats a bearing before other sources
+        are asked. between: batches between these. around_each: poses that raster searches are made around, no two
+        turned by less than `apart_deg`, until `in_vain` of them better nothing. looks: in vain around a pose that
+        exceeds chance, at most.
+    """
+
+    turns: int = 96
+    around: int = 4
+    near: int = 12
+    patience: float = 4.0
+    better: float = 0.002
+    between: int = 2
+    around_each: int = 6
+    apart_deg: float = 10.0
+    in_vain: int = 3
+    looks: int = 2
 
 
 @dataclass(frozen=True)
@@ -128,7 +196,9 @@ class Evidence:
     above 1 in 999 of 1000 cases, and never came below 0.1.
     lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. other_deg,
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
-    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`).
+    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`), which takes
+        so many matches as `independent`: one a degree of freedom. look_fails: the probability that starts around a
+        wrong pose miss a better one beside it; 12 of 12 met it (Laplace's rule of succession).
     """
 
     false_alarms: float = -2.0
@@ -136,38 +206,36 @@ class Evidence:
     other_deg: float = 2.0
     other_shift: float = 0.05
     missed: float = -3.0
+    independent: int = 6
+    look_fails: float = 1 / 14
 
 
 @dataclass(frozen=True)
 class SearchSettings:
     """All of it; the stages are described in docs/search.md.
 
-    max_batches: full batches of starts. recipes: of them, in turn. starts: of a full one; 1200 leave no gap of 25 deg.
-    first_starts: of the first batch; each next one has twice as many until it is full. Easy pairs need no more. A small
-        batch hands on the square root of its share of a full one from stage to stage, and least_kept at least.
+    schedule: the order of the sources, and the budget. recipes: of batches, in turn. starts: of a full one; 1200 leave
+        no gap of 25 deg. first_starts: of the first batch; each next one has twice as many until it is full. Easy
+        problems need no more. A small batch hands on the square root of its share of a full one from stage to stage,
+        and least_kept at least.
+    near, beside, proposed: raster searches around a prior, around a pose that was met, and from proposed poses.
+    most_volumes: of a prior against the widest that has as many starts as it needs; a map view's has 9. admitted:
+        standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it.
     least_annealed: points of the smaller side; fewer are enumerated only: they have no smooth optimum.
     outliers: share of the points without a partner that the assignment expects where the caller gives none.
     end_outliers: shares that the best poses are annealed with in the last stage too, and the likelihood chooses.
     least_outliers: of the caller's share; without any slack a single outlier would be forced into a match.
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
-    finished: candidates that are weighed after each batch, and annealed on all bearings in the end.
-    around: batches from a guess of the pose before those from anywhere. kept: candidates, from batch to batch.
-    refined_directly: starts of `refine_poses` that need no clusters. proposed: rule of the starts of `search_proposed`.
-    anywhere, beside: rules of the looks after batches without a pose that exceeds chance, since clusters hide the right
-        one among many outliers: around the likeliest `beside_poses`, no two turned by less than `beside_deg`, until
-        `beside_patience` are in vain; if there are cones, within these (`search.sources.cones`), and around the ends.
+    finished: candidates that are weighed after each batch, and annealed on all bearings in the end. kept: candidates,
+        from turn to turn. refined_directly: starts of `refine_poses` that need no clusters.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
-    starts_a_check: starts that are annealed on clusters between two looks at the clock, if time is limited.
+    starts_a_check, lookups_a_check: starts that are annealed on clusters, and looked up in a raster, between two looks
+        at the clock, if time is limited.
     """
 
-    turns: int = 96
-    near_turns: int = 12
-    patience: float = 4.0
-    better: float = 0.002
-    between: int = 2
-    looks: int = 2
+    schedule: Schedule = Schedule()
     starts: int = 1200
     first_starts: int = 48
     least_kept: int = 3
@@ -179,26 +247,24 @@ class SearchSettings:
     )
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
-    nearby: Nearby = Nearby()
-    anywhere: tuple[Nearby, ...] = 2 * (
-        *3 * (Nearby(2**13, points=(300,), kept=(2**12,), copies=32, halved=True),),
-        Nearby(2**14, points=(300,), kept=(2**12,), first_scale=0.09, steps=6, copies=32, halved=True),
+    near: RasterSearch = RasterSearch()
+    beside: RasterSearch = RasterSearch(
+        Draws(2**17, 10.0, 0.1, 2**15),
+        Screens((50, 300), (2**14, 2**9)),
+        Narrowing(0.03, 0.015, steps=2, copies=16, points=600),
+        annealed=12,
     )
-    beside: Nearby = Nearby(
-        2**17, 10.0, 0.1, 2**15, (50, 300), (2**14, 2**9), 0.03, 0.015, 2, 16, points_again=600, annealed=12
-    )
-    beside_poses: int = 6
-    beside_deg: float = 10.0
-    beside_patience: int = 3
+    proposed: RasterSearch = RasterSearch(screens=Screens(kept=(2**13, 2**10)))
+    cones: Cones = Cones()
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
+    most_volumes: float = 100.0
+    admitted: float = 3.5
     least_annealed: int = 12
     outliers: float = 0.3
     end_outliers: tuple[float, ...] = (0.03, 0.6)
     least_outliers: float = 0.02
     finished: int = 3
-    around: int = 4
-    proposed: Nearby = Nearby(kept=(2**13, 2**10))
     refined_directly: int = 8
     end_scale: float = 2.0
     kept: int = 8
@@ -208,15 +274,21 @@ class SearchSettings:
     sampled: int = 8
     lloyd_iterations: int = 5
     starts_a_check: int = 32
+    lookups_a_check: int = 4096
 
     def __post_init__(self) -> None:
-        if min(self.turns, self.starts, self.first_starts) < 1 or not self.recipes:
+        if min(self.schedule.turns, self.starts, self.first_starts) < 1 or not self.recipes:
             raise ValueError(
                 "expected one or more `turns`, `starts`, `first_starts` and `recipes`, got "
-                f"{self.turns}, {self.starts}, {self.first_starts} and {len(self.recipes)}; try SearchSettings()"
+                f"{self.schedule.turns}, {self.starts}, {self.first_starts} and {len(self.recipes)}; "
+                "try SearchSettings()"
             )
         if not all(0 < share < 1 for share in (self.outliers, *self.end_outliers)):
             raise ValueError(f"expected shares of outliers in (0, 1), got {self.outliers} and {self.end_outliers}")
+
+    def limited(self, turns: int) -> "SearchSettings":
+        """These settings with so many turns at most."""
+        return replace(self, schedule=replace(self.schedule, turns=turns))
 
     def expecting(self, clutter: float) -> "SearchSettings":
         """These settings where the share of the points without a partner is known. Raises ValueError outside [0, 1).

@@ -89,7 +89,7 @@ def match_count(candidates: Candidates, sets: PointSets) -> float:
     return float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
 
 
-def missed(candidates: Candidates, sets: PointSets, looks: int, *, independent: bool = True) -> float:
+def missed(candidates: Candidates, sets: PointSets, looks: int, rule: Evidence, *, independent: bool = True) -> float:
     """log10 of the probability that weighed candidates lack a better optimum; 0 where chance explains the first.
 
     looks: in vain around the first one. independent: whether its matches are evidence of each other.
@@ -98,7 +98,7 @@ def missed(candidates: Candidates, sets: PointSets, looks: int, *, independent: 
     if alarms > 0:
         return 0.0
     decades = -alarms / max(match_count(candidates, sets), 1.0) if independent else 0.0
-    return log10_missed(int(candidates.hits[0]), decades, looks)
+    return log10_missed(int(candidates.hits[0]), decades, looks, rule)
 
 
 def judged(
@@ -120,10 +120,10 @@ def judged(
     candidates = weighed(candidates, sets, rule)
     alarms = float(candidates.log10_false_alarms[0])
     chance = f"unrelated points are expected to fit as well under {number(alarms)} of all poses"
-    settled = exhaustive or missed(candidates, sets, looks, independent=False) <= rule.missed
+    settled = exhaustive or missed(candidates, sets, looks, rule, independent=False) <= rule.missed
     if alarms > 0:
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches, settled)
-    unseen = -math.inf if exhaustive else missed(candidates, sets, looks)
+    unseen = -math.inf if exhaustive else missed(candidates, sets, looks, rule)
     # What costs more is asked only where the verdict depends on it.
     against = [other_pose(candidates, sets, rule), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed

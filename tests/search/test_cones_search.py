@@ -13,7 +13,7 @@ from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT
+from bpnp.search.settings import DEFAULT, Schedule
 from bpnp.search.sources.cones import best_shifts, drawn_in_cones, shifted, within_cones
 from bpnp.search.sources.raster import raster_of
 from bpnp.search.verdict import no_pose
@@ -34,7 +34,7 @@ def seen_in_cones(seed: int, true: int, outliers: int) -> tuple[PointSets, Array
 def test_a_pose_among_six_outliers_a_true_pair_is_found_within_the_cones() -> None:
     """Without these starts the best pose of the search is 2 degrees off."""
     sets, rotation, translation = seen_in_cones(0, true=150, outliers=900)
-    found = search_poses(sets, settings=replace(DEFAULT, patience=0.01, turns=40))
+    found = search_poses(sets, settings=replace(DEFAULT, schedule=Schedule(patience=0.01, turns=40)))
     np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
 
@@ -43,8 +43,8 @@ def test_starts_within_the_cones_that_end_at_a_pose_are_counted_once_each() -> N
     """Copies of a start are no evidence of their own: no more hits than starts that were annealed."""
     sets, rotation, _ = seen_in_cones(0, true=300, outliers=100)
     pool = Pool(Scene(sets, 0, DEFAULT), sets, no_pose("no pose was found"))
-    found = within_cones(pool.scene, DEFAULT.anywhere[0])
-    assert 1 <= found.hits.sum() <= DEFAULT.anywhere[0].annealed
+    found = within_cones(pool.scene, DEFAULT.cones.searches[0])
+    assert 1 <= found.hits.sum() <= DEFAULT.cones.searches[0].annealed
     pool.merge(found)
     np.testing.assert_allclose(pool.leaders().rotation[0], rotation, atol=5e-3)
 
@@ -56,7 +56,7 @@ def test_a_camera_that_looks_beside_the_scene_is_aimed_at_it() -> None:
     beside = Rotation.from_rotvec([0.11, -0.17, 0]).as_matrix().astype(np.float32)
     aside = Candidates.unscored((beside @ turn)[None], (beside @ moved)[None])
     scale = 0.06
-    raster = raster_of(scene, replace(DEFAULT.nearby, cells=1.0), scale)
+    raster = raster_of(scene, replace(DEFAULT.near.raster, cells=1.0), scale)
     _, shift = best_shifts(aside, raster, scene.sides()[1])
     aimed = shifted(aside, shift)
     off = Rotation.from_matrix(aimed.rotation[0] @ turn.T).magnitude()
@@ -67,7 +67,7 @@ def test_a_camera_that_looks_beside_the_scene_is_aimed_at_it() -> None:
 def test_the_best_shift_is_that_of_the_largest_sum_of_the_raster_over_all() -> None:
     bearings, points, *pose = view_with_outliers(np.random.default_rng(2), 100, 100)
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
-    raster = raster_of(scene, replace(DEFAULT.nearby, cells=1.0), 0.1)
+    raster = raster_of(scene, replace(DEFAULT.near.raster, cells=1.0), 0.1)
     turn, moved = scene.enter(*pose)
     beside = Rotation.from_euler("xyz", [[0, 0, 0], [0.1, -0.1, 0], [0.3, 0, 1]]).as_matrix().astype(np.float32)
     scores, shifts = best_shifts(Candidates.unscored(beside @ turn, beside @ moved), raster, scene.sides()[1])

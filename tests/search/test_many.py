@@ -18,7 +18,7 @@ from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.types import Batch
 
@@ -61,7 +61,7 @@ def test_batches_grow_until_they_are_full():
 
 
 def test_the_budget_counts_turns_and_an_easy_problem_needs_few(problem):
-    settings = SearchSettings(turns=2, starts=96, first_starts=24)
+    settings = SearchSettings(Schedule(turns=2), starts=96, first_starts=24)
     rng, seen = np.random.default_rng(0), []
     noise = rng.normal(size=(80, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
     unrelated = PointSets(directions(noise), rng.normal(size=(80, 3)))
@@ -109,7 +109,7 @@ def test_what_fixes_no_pose_has_none(problem, case):
     else:
         p = p[:, :1].expand_as(p).contiguous()
     # Points of a line within rounding are on it; in two dimensions a bearing on a line has a plane of its own.
-    rotation, translation, stats = search(f, p, settings=SearchSettings(turns=4))
+    rotation, translation, stats = search(f, p, settings=DEFAULT.limited(4))
     if case != "line2d":
         assert rotation.isnan().all()
         assert translation.isnan().all()
@@ -120,7 +120,7 @@ def test_what_fixes_no_pose_has_none(problem, case):
 def test_a_rough_pose_saves_batches(problem):
     rotation, translation = problem.near(0.05, seed=1)
     prior = PosePrior(rotation[0], translation[0], rotation_sigma_deg=4, translation_sigma=0.1)
-    r, t, stats = search(problem.bearings[:1], problem.points3d[:1], prior=prior, settings=SearchSettings(turns=1))
+    r, t, stats = search(problem.bearings[:1], problem.points3d[:1], prior=prior, settings=DEFAULT.limited(1))
     assert rotation_error(r, problem.rotation[:1]) < 0.5
     assert stats.iterations.item() <= 1
 
@@ -133,7 +133,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
     result = search_poses(sets, around=PosePrior(rotation, translation, 4.0, 0.1))
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
-    assert (result.batches <= DEFAULT.around) == (off < 0.1)
+    assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
 
 
 def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
@@ -143,7 +143,7 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     rotation, translation = planted.rotation[0].double().numpy(), planted.translation[0].double().numpy()
     others = super_fibonacci(200)
     others[77] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix() @ rotation
-    few = SearchSettings(turns=9, starts=1, first_starts=1, patience=0.5, beside_poses=0)
+    few = SearchSettings(Schedule(turns=9, patience=0.5, around_each=0), starts=1, first_starts=1)
 
     def off(result):
         return np.degrees(Rotation.from_matrix(result.best[0] @ rotation.T).magnitude())
@@ -156,7 +156,7 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
 def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):
     sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
     rotation, translation = (values[0].numpy() for values in problem.near(1.0, seed=1))
-    hopeless = replace(DEFAULT, around=6, turns=1, first_starts=1, starts=1)
+    hopeless = replace(DEFAULT, schedule=Schedule(around=6, turns=1), first_starts=1, starts=1)
     result = search_poses(sets, around=PosePrior(rotation, translation, 1.0, 0.01), settings=hopeless)
     assert (result.candidates.hits <= 1).all()
 
@@ -186,7 +186,7 @@ def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
 
 
 def test_search_as_a_solver(problem):
-    prediction = Search(settings=SearchSettings(turns=8))(problem.batch())
+    prediction = Search(settings=DEFAULT.limited(8))(problem.batch())
     assert prediction.assignment is None
     found(prediction.poses["search"].rotation, prediction.poses["search"].translation, problem, 0.5)
 
@@ -205,7 +205,7 @@ def test_a_known_share_of_clutter_is_expected_and_the_only_one_tried():
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"turns": 0}, {"starts": 0}, {"first_starts": 0}, {"recipes": ()}, {"outliers": 1.0}]
+    "wrong", [{"schedule": Schedule(turns=0)}, {"starts": 0}, {"first_starts": 0}, {"recipes": ()}, {"outliers": 1.0}]
 )
 def test_settings_without_a_meaning_are_refused(wrong):
     with pytest.raises(ValueError, match="expected"):
@@ -228,7 +228,7 @@ def test_points_at_the_end_of_the_world_do_not_matter(problem):
     points3d[0, far] *= 1e5
     camera = points3d[0, far] @ problem.rotation[0].T + problem.translation[0]
     rays[0, far] = torch.nn.functional.normalize(camera, dim=-1)
-    rotation, _, stats = search(rays, points3d, settings=SearchSettings(turns=8))
+    rotation, _, stats = search(rays, points3d, settings=DEFAULT.limited(8))
     assert bool(stats.converged[0])
     assert rotation_error(rotation, problem.rotation[:1]).item() < 1
 
@@ -266,7 +266,7 @@ def test_a_search_in_doubt_looks_beside_its_best_pose(monkeypatch):
 
     monkeypatch.setattr(schedule, "multistart", ends)
     monkeypatch.setattr(pool, "finish", lambda scene, poses, annealed=None: poses)
-    result = search_poses(sets, settings=replace(DEFAULT, turns=3))
+    result = search_poses(sets, settings=DEFAULT.limited(3))
     assert result.verdict == "confident"
     assert degrees_between(result.best[0], truth) < 0.5
 

@@ -3,7 +3,6 @@
 import math
 import time
 import weakref
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -98,7 +97,7 @@ def test_what_only_looks_around_poses_from_anywhere_find_is_found_with_a_wrong_p
 def test_a_raster_is_computed_once_and_ends_with_its_scene() -> None:
     bearings, points, *_ = cluttered(0)
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
-    assert raster_of(scene, DEFAULT.nearby, 0.04) is raster_of(scene, DEFAULT.nearby, 0.04)
+    assert raster_of(scene, DEFAULT.near.raster, 0.04) is raster_of(scene, DEFAULT.near.raster, 0.04)
     kept = weakref.ref(scene)
     del scene
     assert kept() is None
@@ -107,7 +106,7 @@ def test_a_raster_is_computed_once_and_ends_with_its_scene() -> None:
 def test_points_that_fall_by_chance_add_nothing_in_the_mean() -> None:
     bearings, points, rotation, translation = cluttered(0, outliers=1500)
     scene = Scene(PointSets(bearings, points), 0, DEFAULT)
-    raster = raster_of(scene, DEFAULT.nearby, 0.04)
+    raster = raster_of(scene, DEFAULT.near.raster, 0.04)
     inside = raster.values != 0
     assert abs(raster.values[inside].mean()) < 0.1 * raster.values[inside].std()
     right = scene.enter(rotation, translation)
@@ -174,7 +173,7 @@ def test_a_deadline_that_has_passed_still_gives_poses_and_stops_early() -> None:
 def test_a_lost_search_looks_around_its_best_poses() -> None:
     """Among five outliers a match the right pose is no optimum on clusters, but some degrees beside one."""
     bearings, points, rotation, translation = cluttered(1, outliers=400)
-    lost = search_poses(PointSets(bearings, points), settings=replace(DEFAULT, turns=8))  # batches of starts
+    lost = search_poses(PointSets(bearings, points), settings=DEFAULT.limited(8))  # batches of starts
     assert lost.verdict == "failed"
     found = search_poses(PointSets(bearings, points))
     assert degrees_between(found.best[0], rotation) < 0.3

@@ -19,17 +19,17 @@ Math. Programming 1987.
 
 import math
 
-INDEPENDENT = 6  # matches that have to be coincidences: one a degree of freedom
-LOOK_FAILS = 1 / 14  # probability that starts around a wrong pose miss a better one beside it
+from bpnp.search.settings import Evidence
 
 
-def log10_missed(hits: int, decades_a_match: float, looks: int) -> float:
+def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) -> float:
     """log10 of the probability that a better optimum was not met.
 
     hits: independent starts that ended at the best pose. decades_a_match: of its evidence, 0 where its matches are no
     evidence of each other, as in repeated structures. looks: how often its surroundings were searched in vain.
 
-    >>> round(log10_missed(10, 0.0, 0), 2), round(log10_missed(0, 0.5, 0), 2), round(log10_missed(6, 0.0, 1), 2)
-    (-3.01, -3.0, -2.95)
+    >>> rule = Evidence()
+    >>> [round(log10_missed(*seen, rule), 2) for seen in ((10, 0.0, 0), (0, 0.5, 0), (6, 0.0, 1))]
+    [-3.01, -3.0, -2.95]
     """
-    return -hits * math.log10(2) - INDEPENDENT * max(decades_a_match, 0.0) + looks * math.log10(LOOK_FAILS)
+    return -hits * math.log10(2) - rule.independent * max(decades_a_match, 0.0) + looks * math.log10(rule.look_fails)

@@ -19,20 +19,18 @@ from bpnp.search.kernels.raster import Raster, add_shifted
 from bpnp.search.kernels.sides import WeightedPoints
 from bpnp.search.kernels.sparse import LANES
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Nearby
+from bpnp.search.settings import RasterSearch
 from bpnp.search.sources.raster import narrowed, raster_of
 from bpnp.search.starts import Array
 
-LOG_DEPTH = 0.7  # of the weak-perspective distance: half to twice of it
-AIM_CELLS = 0.5  # of the raster, a scale: with 1 no more poses are found, in twice the time
 AT_ONCE = 256  # scores of so many poses in memory; for 32 x 32 shifts 1 MB
 
 
-def within_cones(scene: Scene, rule: Nearby) -> Candidates:
+def within_cones(scene: Scene, rule: RasterSearch) -> Candidates:
     """Distinct poses from starts within the cones of the points, of which there must be some."""
-    starts = drawn_in_cones(scene, rule.starts)
-    raster = raster_of(scene, replace(rule, cells=AIM_CELLS), rule.first_scale)
-    points = scene.sides(points=rule.points[0])[1]
+    starts = drawn_in_cones(scene, rule.draws.starts)
+    raster = raster_of(scene, replace(rule.raster, cells=scene.settings.cones.aim_cells), rule.narrowing.first_scale)
+    points = scene.sides(points=rule.screens.points[0])[1]
     score, shift = np.empty(len(starts), np.float32), np.empty((len(starts), 2), np.float32)
 
     def aim(i: int, j: int) -> None:
@@ -40,8 +38,8 @@ def within_cones(scene: Scene, rule: Nearby) -> Candidates:
             part = slice(k, min(k + AT_ONCE, j))
             score[part], shift[part] = best_shifts(starts[part], raster, points)
 
-    done = in_time(aim, len(starts), scene.deadline, scene.settings.nearby.starts_a_check)
-    best = np.argsort(-score[:done], kind="stable")[: rule.kept[0]]
+    done = in_time(aim, len(starts), scene.deadline, scene.settings.lookups_a_check)
+    best = np.argsort(-score[:done], kind="stable")[: rule.screens.kept[0]]
     return narrowed(scene, shifted(starts[best], shift[best]), rule)
 
 
@@ -55,7 +53,7 @@ def drawn_in_cones(scene: Scene, count: int) -> Candidates:
     covariance = np.cov(scene.bulk3d.T, bias=True)
     along = np.einsum("si,ij,sj->s", towards, covariance, towards)
     extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
-    depth = extent / scene.spread * np.exp(LOG_DEPTH * rng.uniform(-1, 1, count))
+    depth = extent / scene.spread * np.exp(scene.settings.cones.log_depth * rng.uniform(-1, 1, count))
     centre = scene.points3d[j] + depth[:, None] * towards
     forward = middle - centre
     forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-12)

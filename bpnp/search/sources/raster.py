@@ -27,74 +27,72 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.sides import WeightedPoints
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Nearby
+from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior
 
-MOST_VOLUMES = 100.0  # of a prior against the widest that has as many starts as it needs; a map view's has 9
-ADMITTED = 3.5  # standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it
 WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
-INSIDE = 0.05  # of the largest density of the smoothed bearings: less is outside the view
 
 
-def search_near(scene: Scene, prior: PosePrior, rule: Nearby | None = None) -> Candidates:
+def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Candidates:
     """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
 
     rule: None for that of the settings.
     """
-    rule = rule or scene.settings.nearby
+    rule = rule or scene.settings.near
     return raster_search(scene, drawn_around(scene, prior, starts_of(scene, prior, rule)), rule)
 
 
-def raster_search(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
+def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
-    raster = raster_of(scene, rule, rule.first_scale)
-    for points, kept in zip(rule.points, rule.kept, strict=True):
+    raster = raster_of(scene, rule.raster, rule.narrowing.first_scale)
+    for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
         poses, _ = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
     return narrowed(scene, poses, rule)
 
 
-def narrowed(scene: Scene, poses: Candidates, rule: Nearby) -> Candidates:
+def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
     """Distinct poses from those that are left at the first scale: step by step to the last one, annealed."""
-    again, scale = scene.sides(points=rule.points_again)[1], rule.first_scale
+    steps, scale = rule.narrowing, rule.narrowing.first_scale
+    again = scene.sides(points=steps.points)[1]
     origin = np.arange(len(poses))  # the start that each pose is a copy of
-    for step in range(1, rule.steps + 1):
+    for step in range(1, steps.steps + 1):
         if scene.deadline.passed():
             break
-        scale = rule.first_scale * (rule.last_scale / rule.first_scale) ** (step / rule.steps)
-        copies, family, kept = moved(scene, poses, scale, rule.copies), 1, rule.kept[-1]
-        if rule.halved:
-            family, kept = rule.copies, kept // 2**step
-        poses, chosen = looked_up(scene, copies, raster_of(scene, rule, scale), again, kept, family)
-        origin = origin[chosen // rule.copies]
+        scale = steps.first_scale * (steps.last_scale / steps.first_scale) ** (step / steps.steps)
+        copies, family, kept = moved(scene, poses, scale, steps.copies), 1, rule.screens.kept[-1]
+        if steps.halved:
+            family, kept = steps.copies, kept // 2**step
+        poses, chosen = looked_up(scene, copies, raster_of(scene, rule.raster, scale), again, kept, family)
+        origin = origin[chosen // steps.copies]
     poses, origin = poses[: rule.annealed], origin[: rule.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
     poses = replace(poses, hits=np.where(once, poses.hits, 0))
-    outliers = max(scene.settings.outliers, rule.outliers)
+    outliers = max(scene.settings.outliers, rule.raster.outliers)
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
 
 
-def search_beside(scene: Scene, pose: Candidates, rule: Nearby) -> Candidates:
+def search_beside(scene: Scene, pose: Candidates, rule: RasterSearch) -> Candidates:
     """Distinct poses around one, as far as the rule's widest prior reaches; they have no hits."""
-    prior = PosePrior(pose.rotation[0], pose.translation[0], rule.wide_deg)
-    sigma = rule.wide_shift * distance_of(scene, prior)
+    prior = PosePrior(pose.rotation[0], pose.translation[0], rule.draws.wide_deg)
+    sigma = rule.draws.wide_shift * distance_of(scene, prior)
     found = search_near(scene, prior._replace(translation_sigma=sigma), rule)
     return replace(found, hits=np.zeros_like(found.hits))
 
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
     """Whether a prior is narrow enough for starts around it to meet the basin of the right pose."""
-    return prior.translation is not None and _volume(scene, prior, scene.settings.nearby) <= MOST_VOLUMES
+    return prior.translation is not None and _volume(scene, prior, scene.settings.near) <= scene.settings.most_volumes
 
 
-def starts_of(scene: Scene, prior: PosePrior, rule: Nearby) -> int:
-    """As many starts as lie as densely around a narrow prior as `Nearby.starts` do around a wide one."""
+def starts_of(scene: Scene, prior: PosePrior, rule: RasterSearch) -> int:
+    """As many starts as lie as densely around a narrow prior as `Draws.starts` do around a wide one."""
     share = min(_volume(scene, prior, rule), 1.0)
-    return int(np.clip(rule.starts * share, rule.least_starts, rule.starts))
+    return int(np.clip(rule.draws.starts * share, rule.draws.least_starts, rule.draws.starts))
 
 
-def _volume(scene: Scene, prior: PosePrior, rule: Nearby) -> float:
+def _volume(scene: Scene, prior: PosePrior, rule: RasterSearch) -> float:
     """Of the poses that a prior allows, in that of the rule's wide one."""
-    wide = math.radians(rule.wide_deg), rule.wide_shift * distance_of(scene, prior)
+    wide = math.radians(rule.draws.wide_deg), rule.draws.wide_shift * distance_of(scene, prior)
     return (math.radians(prior.rotation_sigma_deg) / wide[0]) ** 3 * (prior.translation_sigma / wide[1]) ** 3
 
 
@@ -108,7 +106,7 @@ def drawn_around(scene: Scene, prior: PosePrior, count: int) -> Candidates:
 
 
 def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates:
-    """The poses that a `PosePrior` of the user admits, within `ADMITTED` standard deviations; all without."""
+    """The poses that a `PosePrior` of the user admits, within `settings.admitted` standard deviations; all without."""
     if not isinstance(prior, PosePrior):
         return poses
     mean = scene.enter_prior(prior)
@@ -119,7 +117,7 @@ def admitted(scene: Scene, poses: Candidates, prior: Prior | None) -> Candidates
     if mean.translation is not None:
         shift = poses.rotation @ middle + poses.translation - (rotation @ middle + np.asarray(mean.translation))
         off = off + np.square(shift / mean.translation_sigma).sum(-1)
-    return poses[off <= ADMITTED**2]
+    return poses[off <= scene.settings.admitted**2]
 
 
 def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candidates:
@@ -142,34 +140,34 @@ def looked_up(
         weight, cell = np.empty_like(points.b), np.empty(len(points.b), np.int32)
         add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight, cell)
 
-    done = in_time(look_up, len(poses), scene.deadline, scene.settings.nearby.starts_a_check)
+    done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
     best = best[np.argsort(-score[best], kind="stable")[:kept]]
     return poses[best], best
 
 
-def raster_of(scene: Scene, rule: Nearby, scale: float) -> Raster:
+def raster_of(scene: Scene, shape: RasterShape, scale: float) -> Raster:
     """The raster of a scene's bearings, smoothed by a scale in spreads of them; the scene keeps it."""
-    if (rule, scale) not in scene.rasters:
-        scene.rasters[rule, scale] = _drawn_raster(scene, rule, scale)
-    return scene.rasters[rule, scale]
+    if (shape, scale) not in scene.rasters:
+        scene.rasters[shape, scale] = _drawn_raster(scene, shape, scale)
+    return scene.rasters[shape, scale]
 
 
-def _drawn_raster(scene: Scene, rule: Nearby, scale: float) -> Raster:
+def _drawn_raster(scene: Scene, shape: RasterShape, scale: float) -> Raster:
     d = scene.offsets.astype(np.float64)
     at = 2 * d[:, :2] / (2 + d[:, 2:])
     scale *= scene.spread
     half = float(np.abs(at).max()) + 3 * scale
-    cells = min(math.ceil(2 * half * rule.cells / scale), rule.most_cells)
+    cells = min(math.ceil(2 * half * shape.cells / scale), shape.most_cells)
     per_cell = cells / (2 * half)
     place = np.minimum(((at + half) * per_cell).astype(np.int64), cells - 1)
     place = place[:, 1] * cells + place[:, 0]
     counts = np.bincount(place, scene.image.weights, cells**2).reshape(cells, cells).astype(np.float32)
-    wide = rule.background * scale * per_cell
+    wide = shape.background * scale * per_cell
     near, around = _smoothed(counts, scale * per_cell), _smoothed(counts, wide)
-    inside = around > INSIDE * around.max()
+    inside = around > shape.inside * around.max()
     inside[[0, -1]] = inside[:, [0, -1]] = False
-    gain = np.log(rule.outliers + (1 - rule.outliers) * near / np.where(inside, around, 1))
+    gain = np.log(shape.outliers + (1 - shape.outliers) * near / np.where(inside, around, 1))
     seen = inside.astype(np.float32)
     mean = _smoothed(seen * gain, wide) / np.maximum(_smoothed(seen, wide), 1e-6)
     return Raster(np.where(inside, gain - mean, 0).astype(np.float32), np.float32(half), np.float32(per_cell))
