@@ -21,12 +21,12 @@ class Pool:
     """Distinct poses of a scene, best first, from all turns of a search.
 
     enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
-    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far. starts: in full batches.
+    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far.
     """
 
     def __init__(self, scene: Scene, sets: PointSets, enumerated: SearchResult) -> None:
         self.scene, self.sets, self.enumerated = scene, sets, enumerated
-        self.turns, self.starts = 0, 0.0
+        self.turns = 0
         self._tests = log10_tests(sets)
         self.forget()
         if len(enumerated.candidates):

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.unseen import far, near
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
 from bpnp.search.sources.multistart import multistart, multistart_near
@@ -63,7 +64,6 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
     best, since = -math.inf, 0.0
     while since < settings.schedule.patience and pool.alarms > 0:  # full batches that bettered nothing
         found, share = next(batches)
-        pool.starts += share
         yield found
         score = float(pool.candidates.score.max(initial=-np.inf))
         best, since = (score, 0.0) if score >= best + settings.schedule.better else (best, since + share)
@@ -77,26 +77,21 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
         if proposals is not None and number == 0 and pool.alarms > 0:
             yield from _with_surroundings(pool, proposed(pool, proposals))
         if pool.alarms > 0:
-            for found, share in islice(batches, settings.schedule.between):
-                pool.starts += share
+            for found, _ in islice(batches, settings.schedule.between):
                 yield found
 
 
 def _sure(pool: Pool, batches: Iterator[tuple[Candidates, float]]) -> Iterator[Candidates]:
-    """What is expected to exclude most: another batch of starts, or a raster search around the best pose."""
+    """What excludes the likelier case: a raster search around the best pose, or another batch of starts."""
     leaders, settings = pool.leaders(), pool.scene.settings
-    # Of a full batch, which costs as much as a raster search.
-    hits = int(leaders.hits[0]) / max(pool.starts, 1 / settings.starts)
-    if pool.looks(leaders) < settings.schedule.looks and math.log10(settings.evidence.look_fails) < -hits * math.log10(
-        2
-    ):
+    hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
+    if looks < settings.schedule.looks and near(hits, looks, rule) > far(hits, rule):
         alarms, leader = pool.alarms, pool.leader
         yield search_beside(pool.scene, leader, settings.beside)
-        if pool.alarms > alarms - settings.evidence.lead:
+        if pool.alarms > alarms - rule.lead:
             pool.looked_around(leader)
         return
-    for found, share in islice(batches, 1):
-        pool.starts += share
+    for found, _ in islice(batches, 1):
         yield found
 
 

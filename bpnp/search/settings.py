@@ -171,7 +171,7 @@ class Schedule:
     around_each: int = 6
     apart_deg: float = 10.0
     in_vain: int = 3
-    looks: int = 2
+    looks: int = 3
 
 
 @dataclass(frozen=True)
@@ -196,8 +196,9 @@ class Evidence:
     above 1 in 999 of 1000 cases, and never came below 0.1.
     lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. other_deg,
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
-    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`), which takes
-        so many matches as `independent`: one a degree of freedom. look_fails: the probability that starts around a
+    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`).
+    independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
+        a better optimum though several starts ended at a pose that exceeds chance. look_fails: that starts around a
         wrong pose miss a better one beside it; 12 of 12 met it (Laplace's rule of succession).
     """
 
@@ -206,7 +207,8 @@ class Evidence:
     other_deg: float = 2.0
     other_shift: float = 0.05
     missed: float = -3.0
-    independent: int = 6
+    independent: int = 3
+    another: float = 0.01
     look_fails: float = 1 / 14
 
 

@@ -1,16 +1,19 @@
 """The probability that a better optimum than the best pose exists and was not met.
 
-Three observations speak against one. Each is a factor, and their product is compared with `Evidence.missed`.
+It lies near the best pose or far from it, and what the matches say counts against both:
+
+    P = 10^(-3 e) (max(2^-h, q) F^l + q 2^-h)
 
 - Starts. Let a better optimum attract a start as often as the best pose does, or more often. Of h independent starts
   that ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
-- Matches. A pose with a better one beside it explains a part of the points by coincidence: it aligns a part of the
-  scene, or slides along a surface, and each of its matches is worth little. With e decades of evidence a match a single
-  match is a coincidence with a probability of 10^-e. Matches depend on each other, but a wrong rigid pose has no more
-  than six degrees of freedom to bring about coincidences with, so that beyond what these fit it needs as many more
-  that are independent: 10^-6e.
-- Looks. Starts drawn on purpose around the best pose find a better one within some 15 degrees and 15 % of the distance.
-  They did so in 12 of 12 cases, so that one fails with a probability of 1/14 (Laplace's rule of succession).
+- Near. Starts that share a wide optimum end at whichever narrow one lies in their way: however many they are, a better
+  one lies beside it with the probability q, and each of l looks, starts drawn on purpose around the best pose, fails to
+  meet it with the probability F.
+- Far. A pose that exceeds chance and is far from a better one is a rare repetition or symmetry: q.
+- Matches. A pose with a better one elsewhere explains a part of the points by coincidence: it aligns a part of the
+  scene, or slides along a surface, and each of its matches is worth little. With e decades of evidence a match, a match
+  is a coincidence with a probability of 10^-e. Matches depend on each other; but three fix a pose, and at least as many
+  others have to be independent coincidences: 10^-3e.
 
 The first is what remains of the posterior of unseen optima of Boender and Rinnooy Kan where only two optima matter.
 Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
@@ -29,7 +32,18 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
     evidence of each other, as in repeated structures. looks: how often its surroundings were searched in vain.
 
     >>> rule = Evidence()
-    >>> [round(log10_missed(*seen, rule), 2) for seen in ((10, 0.0, 0), (0, 0.5, 0), (6, 0.0, 1))]
-    [-3.01, -3.0, -2.95]
+    >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
+    [0.0, -2.0, -3.1, -3.3]
     """
-    return -hits * math.log10(2) - rule.independent * max(decades_a_match, 0.0) + looks * math.log10(rule.look_fails)
+    unseen = near(hits, looks, rule) + far(hits, rule)
+    return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
+
+
+def near(hits: int, looks: int, rule: Evidence) -> float:
+    """Probability that a better optimum beside the best pose was not met."""
+    return max(0.5**hits, rule.another) * rule.look_fails**looks
+
+
+def far(hits: int, rule: Evidence) -> float:
+    """Probability that a better optimum far from the best pose was not met."""
+    return rule.another * 0.5**hits
