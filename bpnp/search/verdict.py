@@ -154,7 +154,7 @@ def is_certain(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
     other = other_pose(candidates, sets, rule)
-    return (other is None or other.decades >= rule.lead) and rougher(candidates).decades >= rule.lead
+    return (other is None or other.decades >= rule.lead) and rougher(candidates) is None
 
 
 def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:

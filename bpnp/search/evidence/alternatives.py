@@ -50,10 +50,12 @@ def other_pose(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
     return Alternative(decades, what)
 
 
-def rougher(candidates: Candidates) -> Alternative:
-    """The best pose at scales far beyond that of its residuals: if the points agree with it better there, what its
-    matches say of it beyond a rough alignment is no more than chance."""
+def rougher(candidates: Candidates) -> Alternative | None:
+    """The best pose at scales far beyond that of its residuals, where the points agree with it better there: what its
+    matches say of it beyond a rough alignment is then no more than chance. None otherwise."""
     decades = float(candidates.log10_rough[0] - candidates.log10_false_alarms[0])
+    if decades >= 0:
+        return None
     return Alternative(decades, "the points agree with it better at residuals far larger than those of its matches")
 
 

@@ -2,13 +2,15 @@
 residuals, and residuals that no pose explains, but another focal length or other proportions of the scene would."""
 
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
-from bpnp.search.evidence.partners import across, at_other_focal_length, facing, partners
+from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.partners import Zoomed, across, at_other_focal_length, facing, partners
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -29,6 +31,7 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # numbers that are fitted with every pose
+ZOOMED_LEAD = 3.0  # decades of false alarms by which it has to explain the points better
 ZOOMED_FROM = 24  # matches from which another focal length is looked for; with fewer the linear fit decides
 
 
@@ -223,7 +226,7 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
       a thousand.
     - The same with the log of the focal length.
     - Pose and focal length that explain the points better, with other partners, of `ZOOMED_FROM` matches or more:
-      `at_other_focal_length`.
+      `at_other_focal_length`, if it has a thousandth of the false alarms.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -248,12 +251,10 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
         moved, step = _moved(products, pose, fitted, free)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
-    other = (
-        at_other_focal_length(linear.sets, linear.rotation, linear.middle, linear.scale)
-        if count >= ZOOMED_FROM
-        else None
-    )
-    if other is not None:
+    other = None
+    if count >= ZOOMED_FROM:
+        other = at_other_focal_length(linear.sets, linear.rotation, linear.middle, linear.scale)
+    if other is not None and _decades_ahead(other, linear) >= ZOOMED_LEAD:
         turn = math.acos(min(1.0, (float(np.trace(other.rotation @ linear.rotation.T)) - 1) / 2))
         found.append(Misfit(turn, float(np.linalg.norm(other.middle - linear.middle)) / distance, other.zoom))
     return Misfit(
@@ -261,6 +262,21 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
         max(each.shift for each in found),
         max((each.zoom for each in found), key=lambda zoom: abs(math.log(zoom))),
     )
+
+
+def _decades_ahead(other: Zoomed, linear: Linearised) -> float:
+    """Decades by which a pose with another focal length has fewer false alarms than the one with the given camera."""
+    sets, stretch = linear.sets, np.array([1 / other.zoom, 1 / other.zoom, 1.0])
+    bearings = sets.bearings * stretch
+    zoomed = replace(sets, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
+    alarms = [
+        float(alarms_of(one, pose.rotation[None], (pose.middle - pose.rotation @ sets.middle)[None], scale).own[0])
+        for one, pose, scale in (
+            (sets, linear, np.array([linear.scale])),
+            (zoomed, other, np.array([linear.scale / other.zoom])),
+        )
+    ]
+    return alarms[0] - alarms[1]
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float) -> tuple[Array, Array]:
