@@ -12,7 +12,7 @@ from bpnp.maps.views import Cones, View
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import checked_prior
-from bpnp.solving.problem import problem_from
+from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
@@ -45,16 +45,15 @@ class Region:
         return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
 
 
+def problem_near(region: Region, keypoints: Any, camera: Any, prior: Any) -> Problem:
+    """A photo's keypoints and the points of one region, with their cones."""
+    lens, (axes, cosines) = camera_from(camera), region.cones
+    return problem_from(keypoints, region.points3d, lens, normals3d=axes, cosines3d=cosines, prior=prior)
+
+
 def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options) -> Solution:
     """The best pose of a photo among the points of one region; its matches have their ids in the map."""
-    problem = problem_from(
-        keypoints,
-        region.points3d,
-        camera_from(camera),
-        normals3d=region.cones.axes,
-        cosines3d=region.cones.cosines,
-        prior=checked_prior(region.prior() if prior is None else prior),
-    )
+    problem = problem_near(region, keypoints, camera, checked_prior(region.prior() if prior is None else prior))
     solution = solutions_of({0: problem}, options)[0]
     matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
     return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)

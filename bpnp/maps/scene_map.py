@@ -4,7 +4,7 @@ import math
 import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,10 @@ from torch import nn
 from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape, scaled_camera
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.loops.parallel import Deadline
 from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
 from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size, pixels_from
+from bpnp.maps.twins import Photo, without_twins
 from bpnp.maps.views import Array, Cones, View, covering_order, viewing_cones
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import source_from
@@ -130,7 +132,7 @@ class SceneMap:
         points = np.unique(np.concatenate([view.points for view in named]))
         return (self._region(view, points) for view in named if len(view.points))
 
-    def _region(self, view: View, points: NDArray[np.int32]) -> Region:
+    def _region(self, view: View, points: NDArray[np.integer]) -> Region:
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
         distance = float(np.median(np.linalg.norm(in_camera, axis=-1)))
         cones = Cones(self.cones.axes[points], self.cones.cosines[points])
@@ -164,17 +166,26 @@ class SceneMap:
         time_limit: seconds for all views together, after which no search begins; None for no limit.
 
         Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the
-        pose with the fewest false alarms is returned. `solution.view` is the view near which it was found.
+        pose with the fewest false alarms is returned. A confident pose is compared with those that explain the same
+        image points elsewhere in the map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are
+        the first `candidates`; not if a prior is given. `solution.view` is the view near which it was found.
         `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
         start, pixels, best = time.monotonic(), pixels_from(keypoints, camera), list[tuple[Region, Solution]]()
+        views = None if views is None else list(views)
         if time_limit is not None and not 0 < time_limit < math.inf:
             raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
         module, regions, tries, over = source_from(solver), self.regions(views), 0, False
+        deadline = Deadline(math.inf if time_limit is None else start + time_limit)
+        met = list[Solution]()
+
+        def near(options: Options, tries: int, region: Region, expected: PosePrior | None) -> Solution:
+            return counted(near_view(region, used, camera, expected, options), tries)
+
         for settings in (BRIEF, LONGER):
             for region in regions:
                 remaining = None if time_limit is None else time_limit - (time.monotonic() - start)
@@ -183,10 +194,17 @@ class SceneMap:
                 tries += 1
                 limit = None if remaining is None else max(remaining, 1e-3)
                 asks = solver == "auto" and settings is LONGER  # not of every view of the map
-                options = Options(module, asks, seed=seed, time_limit=limit, settings=settings)
-                solution = counted(near_view(region, used, camera, prior, options), tries)
+                options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
+                solution = near(options, tries, region, prior)
+                if over := solution.verdict == "confident":
+                    if prior is None:  # which would tell twins apart
+                        place = self._region(region.view, np.arange(len(self.points3d))) if views is None else region
+                        photo = Photo(used, camera, place, partial(self.regions, views), seed, deadline)
+                        solution = without_twins(photo, solution, met, partial(near, options, tries))
+                    best = [(region, solution)]
+                    break
+                met.append(solution)
                 best = sorted([*best, (region, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
-                over = solution.verdict == "confident"
             regions = iter([region for region, _ in best])
         if not best:
             raise ValueError("expected a map with views that see 4 or more points, got none")

@@ -1,0 +1,166 @@
+"""Whether a photo's pose is the only one: places of a map that look alike explain the same image points.
+
+The poses that are compared with a confident one: those that were met with the points of other views; those that a
+motion of the map onto itself makes of it (`bpnp.search.evidence.repetitions`); and those that a brief look at views of
+other points finds for the image points that it explains.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.distinct_poses import same_pose, turned_by
+from bpnp.loops.parallel import Deadline, one_blas_thread
+from bpnp.maps.localize import Region, problem_near
+from bpnp.maps.views import Array
+from bpnp.search.annealing import finish
+from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.kernels.raster import Raster
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT, Nearby
+from bpnp.search.sources.raster import search_near
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import with_false_alarms
+from bpnp.solving.matches import count_one_to_one
+from bpnp.solving.problem import Problem
+from bpnp.solving.solution import Candidate, Solution
+
+# Of the image points that a pose explains few are outliers beside a twin: fewer starts, smoothed more, find that of a
+# box with two faces alike as often as the whole search near a view does.
+LOOK = replace(
+    DEFAULT.nearby,
+    starts=2**14,
+    least_starts=2**14,
+    points=(100, 300),
+    kept=(2**10, 2**8),
+    first_scale=0.08,
+    last_scale=0.02,
+    steps=3,
+    copies=8,
+    points_again=300,
+    annealed=6,
+)
+LOOKS = 8  # views at most: about a tenth of the time that a photo takes
+UNSEEN = 0.5  # share of a view's points that the pose does not see
+FEWEST = 12  # such points, and image points that a pose explains
+TWIN_DEGREES, TWIN_SHARE = 4.0, 0.04  # of the prior of a search about a twin
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """What is localised, among which points, and near which views; `deadline` and `seed` are of the search."""
+
+    keypoints: Any
+    camera: Any
+    place: Region
+    regions: Callable[[], Iterable[Region]]
+    seed: int = 0
+    deadline: Deadline = Deadline()
+
+
+@one_blas_thread
+def rivals_of(photo: Photo, solution: Solution, met: Sequence[Solution]) -> list[tuple[float, Candidate]]:
+    """Different poses that explain the image points of a solution, and by how many decades they explain all of them
+    worse, the best one first. met: solutions with the points of other views."""
+    problem, rule = problem_near(photo.place, photo.keypoints, photo.camera, None), DEFAULT.evidence
+    sets, scale = problem.sets, max(solution.stats.residual, problem.sets.image.scales[0])
+    best = solution.rotation, solution.translation + solution.rotation @ problem.origin
+    repeated, _ = repeated_poses(sets, *best, scale, rule)
+    met_poses = [one for other in met for one in other.candidates if one.log10_false_alarms < 0]
+    poses = [(one.rotation, one.translation + one.rotation @ problem.origin) for one in met_poses]
+    poses += [*zip(*repeated, strict=True), *_looks(photo, solution, problem)]
+    matched = solution.points3d[solution.match_places[:, 1]] - problem.origin
+
+    def different(rotations: Array, translations: Array) -> NDArray[np.bool_]:
+        rotations, translations = np.concatenate([best[0][None], rotations]), np.r_[best[1][None], translations]
+        middle = rotations @ np.median(matched, 0) + translations
+        shift = rule.other_shift * float(np.linalg.norm(middle[0]))
+        return np.asarray(~same_pose(rotations, middle, 0, rule.other_deg, shift)[1:])
+
+    rotations, translations = (np.array([pose[k] for pose in poses]).reshape(-1, *x.shape) for k, x in enumerate(best))
+    others = different(rotations, translations)
+    if not others.any():
+        return []
+    scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
+    starts = Candidates.unscored(*scene.enter(rotations[others], translations[others]))
+    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
+    ends = finish(scene, starts)  # none after the deadline
+    ends = in_user_frame(ends if len(ends) else starts, scene)
+    ends = ends[different(ends.rotation, ends.translation)]
+    twins = ends.rotation, ends.translation
+    behind = decades_behind(sets, best, twins, twins, scale)
+    return [
+        (float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k])))
+        for k in np.argsort(behind).tolist()
+    ]
+
+
+def _candidate(problem: Problem, solution: Solution, ends: Candidates, k: int, behind: float) -> Candidate:
+    rotation, translation = ends.rotation[k], ends.translation[k]
+    seen = problem.view(rotation, translation)
+    inliers = count_one_to_one(problem.image, seen, solution.inlier_threshold)
+    alarms = solution.log10_false_alarms + behind
+    return Candidate(rotation, translation - rotation @ problem.origin, float(ends.score[k]), inliers, alarms)
+
+
+def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:
+    """Poses near views, of whose points the solution does not see most, for the image points that it explains."""
+    explained = np.isin(problem.usable, solution.matches[:, 0])
+    seen, looks = _seen(photo, problem, solution), 0
+    rasters: dict[tuple[Nearby, float], Raster] = {}  # all of the same image points
+    for region in photo.regions() if explained.sum() >= FEWEST else ():
+        if looks == LOOKS or photo.deadline.passed():
+            return
+        unseen = ~np.isin(region.point_ids, seen)
+        if unseen.sum() < FEWEST or unseen.mean() < UNSEEN:
+            continue
+        looks += 1
+        near = problem_near(region, photo.keypoints, photo.camera, region.prior())
+        sets = replace(near.sets, bearings=near.sets.bearings[explained])
+        scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
+        scene.rasters, known = rasters, scene.enter_prior(sets.prior or region.prior())
+        assert isinstance(known, PosePrior)
+        found = with_false_alarms(in_user_frame(search_near(scene, known, LOOK)[:1], scene), sets)
+        for k in np.flatnonzero(found.log10_false_alarms < 0):
+            yield found.rotation[k], found.translation[k] + found.rotation[k] @ (problem.origin - near.origin)
+
+
+def without_twins(
+    photo: Photo,
+    solution: Solution,
+    met: Sequence[Solution],
+    search: Callable[[Region, PosePrior], Solution],
+    *,
+    again: bool = True,
+) -> Solution:
+    """A confident solution, or where another pose explains the image points as well, an ambiguous one with both as its
+    first candidates. Where that explains them better, the solution about it that `search` finds is the one."""
+    rivals = rivals_of(photo, solution, met)
+    if not rivals or rivals[0][0] >= DEFAULT.evidence.lead:
+        return solution
+    behind, twin = rivals[0]
+    if again and behind <= -DEFAULT.evidence.lead:
+        seen = _seen(photo, problem_near(photo.place, photo.keypoints, photo.camera, None), twin)
+        region = max(photo.regions(), key=lambda one: int(np.isin(one.point_ids, seen).sum()))
+        distance = float(np.linalg.norm(twin.rotation @ np.median(region.points3d, 0) + twin.translation))
+        better = search(region, PosePrior(twin.rotation, twin.translation, TWIN_DEGREES, TWIN_SHARE * distance))
+        if better.verdict == "confident":
+            return without_twins(photo, better, [*met, solution], search, again=False)
+    off = math.degrees(turned_by(solution.rotation, twin.rotation))
+    reason = f"a pose {off:.0f} deg away, elsewhere in the map, explains the image points about as well"
+    reason += f" ({number(-behind)} times as likely)"
+    candidates = solution.candidates[0], twin, *solution.candidates[1:]
+    return replace(solution, verdict="ambiguous", reason=reason, candidates=candidates)
+
+
+def _seen(photo: Photo, problem: Problem, pose: Solution | Candidate) -> NDArray[np.int64]:
+    """Ids of the points that a pose sees where the image points are."""
+    image = problem.view(pose.rotation, pose.translation + pose.rotation @ problem.origin)
+    inside = (image >= problem.image.min(0)) & (image <= problem.image.max(0))  # not NaN
+    return photo.place.point_ids[inside.all(-1)]

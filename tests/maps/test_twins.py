@@ -1,0 +1,114 @@
+"""A place of the map that looks like another one: a box with two faces printed alike, seen from all around."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap
+from bpnp.cameras import camera_from
+from bpnp.maps.views import View
+
+FOCAL, ALIKE, DIFFERENT = 800.0, 150, 40  # pixels; points of a face
+CAMERA = np.diag([FOCAL, FOCAL, 1.0])
+Array = np.ndarray
+
+
+def about_y(degrees: float) -> Array:
+    return np.asarray(Rotation.from_euler("y", degrees, degrees=True).as_matrix())
+
+
+def box(rng: np.random.Generator, turns: tuple[float, ...], alike: int = ALIKE) -> tuple[Array, Array]:
+    """Points (n, 3) and normals (n, 3) of the four sides of a box with a relief; the sides turned by `turns` degrees
+    from the front have `alike` points in common with it."""
+
+    def print_of(count: int) -> Array:
+        return np.column_stack([rng.uniform(-1, 1, (count, 2)), rng.uniform(-1.1, -1, count)])
+
+    printed, points, normals = print_of(alike), [], []
+    for degrees in (0.0, 90.0, 180.0, 270.0):
+        own = print_of(ALIKE + DIFFERENT)
+        if degrees in turns:
+            own[:alike] = printed
+        points.append(own @ about_y(degrees).T)
+        normals.append(np.tile(about_y(degrees)[:, 2] * -1, (len(own), 1)))
+    return np.concatenate(points), np.concatenate(normals)
+
+
+def pose_at(degrees: float, distance: float, tilt: float = 5.0) -> tuple[Array, Array]:
+    """Of a camera that looks at the middle of the box; at 0 degrees from the front."""
+    rotation = Rotation.from_euler("x", tilt, degrees=True).as_matrix() @ about_y(degrees).T
+    return rotation, np.array([0.0, 0.0, distance])
+
+
+def seen(points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
+    """Places of the points that face the camera."""
+    towards = -rotation.T @ translation - points
+    return np.flatnonzero((towards * normals).sum(-1) > 0.2 * np.linalg.norm(towards, axis=-1))
+
+
+def map_of(points: Array, normals: Array) -> SceneMap:
+    poses = [pose_at(degrees, 5.0) for degrees in range(10, 370, 40)]
+    views = tuple(
+        View(f"{i}.jpg", camera_from(CAMERA), *pose, seen(points, normals, *pose).astype(np.int32))
+        for i, pose in enumerate(poses)
+    )
+    return SceneMap(points, np.arange(len(points)), np.zeros(len(points), np.int32), views).seen_by(2)
+
+
+def photo(rng: np.random.Generator, points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
+    """Pixels of 7 of 10 points that face the camera, half a pixel off, and of as many more that are anywhere."""
+    camera = points[seen(points, normals, rotation, translation)] @ rotation.T + translation
+    pixels = FOCAL * camera[:, :2] / camera[:, 2:]
+    pixels = pixels[rng.random(len(pixels)) < 0.7]
+    clutter = rng.uniform(pixels.min(0), pixels.max(0), pixels.shape)
+    return np.concatenate([pixels + rng.normal(0, 0.5, pixels.shape), clutter])
+
+
+def degrees_off(rotation: Array, truth: Array) -> float:
+    return float(np.degrees(Rotation.from_matrix(rotation @ truth.T).magnitude()))
+
+
+OPPOSITE, ADJACENT = (0.0, 180.0), (0.0, 90.0)
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize("turns", [OPPOSITE, ADJACENT])
+def test_a_face_that_is_printed_like_another_one_is_never_taken_for_it(turns: tuple[float, float], seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = box(rng, turns)
+    front = {OPPOSITE: (4, 184, -16, 174, 200), ADJACENT: (4, 94, -10, 80, -4)}[turns][seed]
+    pose = pose_at(front, 4.2, -3.0)
+    keypoints = photo(rng, points, normals, *pose)
+    solution = map_of(points, normals).localize(keypoints, CAMERA, seed=seed)
+    assert solution.verdict == "confident"  # the 40 points that differ are enough to tell
+    assert degrees_off(solution.rotation, pose[0]) < 1
+
+
+@pytest.mark.parametrize("turns", [OPPOSITE, ADJACENT])
+def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_candidates(
+    turns: tuple[float, float],
+) -> None:
+    rng = np.random.default_rng(0)
+    points, normals = box(rng, turns, alike=ALIKE + DIFFERENT)
+    pose = pose_at(-4.0, 4.2, -3.0)
+    camera = points[: ALIKE + DIFFERENT] @ pose[0].T + pose[1]  # the front alone
+    pixels = FOCAL * camera[:, :2] / camera[:, 2:]
+    clutter = rng.uniform(pixels.min(0), pixels.max(0), (100, 2))
+    keypoints = np.concatenate([pixels + rng.normal(0, 0.5, pixels.shape), clutter])
+    solution = map_of(points, normals).localize(keypoints, CAMERA)
+    assert solution.verdict == "ambiguous"
+    assert "elsewhere in the map, explains the image points about as well" in solution.reason
+    twin = pose[0] @ about_y(turns[1]).T
+    off = [min(degrees_off(one.rotation, truth) for one in solution.candidates[:2]) for truth in (pose[0], twin)]
+    assert max(off) < 1
+    np.testing.assert_array_equal(solution.candidates[0].rotation, solution.rotation)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_box_whose_faces_differ_stays_confident(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = box(rng, ())
+    pose = pose_at(90.0 * seed + 5, 4.2, -3.0)
+    solution = map_of(points, normals).localize(photo(rng, points, normals, *pose), CAMERA, seed=seed)
+    assert solution.verdict == "confident"
+    assert degrees_off(solution.rotation, pose[0]) < 1
