@@ -23,7 +23,7 @@ from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT, Nearby
+from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
 from bpnp.search.sources.raster import search_near
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import with_false_alarms
@@ -33,17 +33,10 @@ from bpnp.solving.solution import Candidate, Solution
 
 # Of the image points that a pose explains few are outliers beside a twin: fewer starts, smoothed more, find that of a
 # box with two faces alike as often as the whole search near a view does.
-LOOK = replace(
-    DEFAULT.nearby,
-    starts=2**14,
-    least_starts=2**14,
-    points=(100, 300),
-    kept=(2**10, 2**8),
-    first_scale=0.08,
-    last_scale=0.02,
-    steps=3,
-    copies=8,
-    points_again=300,
+LOOK = RasterSearch(
+    Draws(2**14, least_starts=2**14),
+    Screens((100, 300), (2**10, 2**8)),
+    Narrowing(0.08, 0.02, steps=3, copies=8, points=300),
     annealed=6,
 )
 LOOKS = 8  # views at most: about a tenth of the time that a photo takes
@@ -113,7 +106,7 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
     """Poses near views, of whose points the solution does not see most, for the image points that it explains."""
     explained = np.isin(problem.usable, solution.matches[:, 0])
     seen, looks = _seen(photo, problem, solution), 0
-    rasters: dict[tuple[Nearby, float], Raster] = {}  # all of the same image points
+    rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
     for region in photo.regions() if explained.sum() >= FEWEST else ():
         if looks == LOOKS or photo.deadline.passed():
             return
