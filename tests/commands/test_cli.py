@@ -82,7 +82,7 @@ def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys
             "expected the folder of a test or the JSON of a solution, got nowhere, which is not there",
         ),
         (["view", __file__], "test_cli.py: expected"),
-        (["view", __file__, "pair"], "expected no pair beside the solution"),
+        (["view", __file__, "3"], "expected no problem beside the solution"),
         (["report", "nowhere", "--paper", "modelnet"], "expected paper as modelnet40 or megadepth, got 'modelnet'"),
     ],
 )
@@ -214,7 +214,7 @@ def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fai
     main(["test", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"])
     assert "━" not in capsys.readouterr().out
     trained = (tmp_path / "run" / "test" / "summary.json").read_bytes()
-    assert "last.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
+    assert "best.ckpt, got none, which would replace them; try --ckpt_path last" in fails("test", *common)
     assert (tmp_path / "run" / "test" / "summary.json").read_bytes() == trained
     main(["test", *common, f"--results.folder={tmp_path}/run/untrained"])
     assert (tmp_path / "run" / "untrained" / "summary.json").is_file()
