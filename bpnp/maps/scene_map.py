@@ -16,6 +16,7 @@ from torch import nn
 from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape, scaled_camera
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Deadline
 from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
 from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size, pixels_from
@@ -120,17 +121,19 @@ class SceneMap:
 
     def regions(self, views: Iterable[str] | None = None) -> Iterator[Region]:
         """What to look near: each of the given views, in their order, with the points that any of them sees, since they
-        show one place; or each view of the map with its own points, those first that together see most of the map.
+        show one place; or each view of the map with its own points, those first that together see most of the map. None
+        with fewer points than fix a pose.
 
         Raises ValueError for unknown names, or if there is none.
         """
         if views is None:
-            return (self._region(view, view.points) for view in covering_order(self.views, self.visibility))
+            order = covering_order(self.views, self.visibility)
+            return (self._region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
         named = self.named(views)
         if not named:
             raise ValueError("expected names of views to try, got none; try views=None for all of the map")
         points = np.unique(np.concatenate([view.points for view in named]))
-        return (self._region(view, points) for view in named if len(view.points))
+        return (self._region(view, points) for view in named if len(view.points) and len(points) >= MIN_POINTS)
 
     def _region(self, view: View, points: NDArray[np.integer]) -> Region:
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation

@@ -103,6 +103,16 @@ def test_each_view_that_was_tried_is_as_many_tests_again(planted: tuple[SceneMap
     assert counted(close, 100).log10_false_alarms == pytest.approx(close.log10_false_alarms + 2)
 
 
+def test_a_view_of_too_few_points_is_passed_over(planted: tuple[SceneMap, Planted]) -> None:
+    scene, _ = planted
+    poor = replace(scene.views[2], points=scene.views[2].points[:3])
+    noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (40, 2))
+    solution = replace(scene, views=(scene.views[0], poor)).localize(noise, CAMERA, solver="search", time_limit=2)
+    assert solution.verdict == "failed"
+    with pytest.raises(ValueError, match="expected a map with views that see 4 or more points, got none"):
+        replace(scene, views=(poor,)).localize(noise, CAMERA)
+
+
 def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, _ = photo_of(truth, 0)
