@@ -24,7 +24,7 @@ from bpnp.search.evidence.unseen import far, near
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
 from bpnp.search.sources.multistart import multistart, multistart_near
-from bpnp.search.sources.raster import admitted, is_near, raster_search, search_beside, search_near
+from bpnp.search.sources.raster import admitted, is_near, raster_search, search_beside, search_everywhere, search_near
 from bpnp.search.starts import PosePrior, Prior
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
@@ -74,6 +74,8 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
         yield from _beside(pool, pool.rotations)
         if rules:
             yield from _with_surroundings(pool, within_cones(scene, rules[number % len(rules)]))
+        else:
+            yield from _with_surroundings(pool, search_everywhere(scene, number, known))
         if proposals is not None and number == 0 and pool.alarms > 0:
             yield from _with_surroundings(pool, proposed(pool, proposals))
         if pool.alarms > 0:

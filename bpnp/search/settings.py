@@ -220,7 +220,8 @@ class SearchSettings:
         no gap of 25 deg. first_starts: of the first batch; each next one has twice as many until it is full. Easy
         problems need no more. A small batch hands on the square root of its share of a full one from stage to stage,
         and least_kept at least.
-    near, beside, proposed: raster searches around a prior, around a pose that was met, and from proposed poses.
+    near, beside, proposed, everywhere: raster searches around a prior, around a pose that was met, from proposed poses,
+        and from poses of all rotations.
     most_volumes: of a prior against the widest that has as many starts as it needs; a map view's has 9. admitted:
         standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it.
     least_annealed: points of the smaller side; fewer are enumerated only: they have no smooth optimum.
@@ -257,6 +258,7 @@ class SearchSettings:
         annealed=12,
     )
     proposed: RasterSearch = RasterSearch(screens=Screens(kept=(2**13, 2**10)))
+    everywhere: RasterSearch = RasterSearch()
     cones: Cones = Cones()
     facing: Facing = Facing()
     evidence: Evidence = Evidence()

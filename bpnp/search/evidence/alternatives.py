@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
+from bpnp.search.evidence.image_statistics import label_groups
 from bpnp.search.evidence.uncertainty import Linearised, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
@@ -138,8 +139,12 @@ class _Partners(NamedTuple):
 
 
 def _partners(sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
-    seen = directions_of(sets, rotation, translation)
-    ahead = np.flatnonzero(np.isfinite(seen[:, 0]))
-    chord, nearest = cKDTree(seen[ahead]).query(sets.bearings[sets.image.chosen], distance_upper_bound=NEAR * scale)
-    points = np.r_[ahead, -1][nearest]
+    seen, chosen = directions_of(sets, rotation, translation), sets.image.chosen
+    chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
+    for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, len(seen)):
+        ahead = columns[np.isfinite(seen[columns, 0])]
+        if len(ahead):
+            bearings = sets.bearings[chosen[rows]]
+            chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=NEAR * scale)
+            points[rows] = np.r_[ahead, -1][nearest]
     return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))

@@ -25,7 +25,8 @@ class ImageStatistics:
     plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
     most 4 pi.
     scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
-    chosen: (k,) places of the image points that are looked at. together: (k, S) how many lie within `TOGETHER` scales.
+    chosen: (k,) places of the image points that are looked at. together: (k, S) how many of them lie within `TOGETHER`
+    scales.
     weights: (k, S, S) of the evidence, see `_weights`.
     """
 
@@ -44,9 +45,10 @@ class ImageStatistics:
         self.scales = np.geomspace(smallest, largest, steps)
         self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
         within = TOGETHER * self.scales
-        together = sums_near(bearings[self.chosen], bearings, self.axes, within, np.zeros(steps))
+        looked_at = bearings[self.chosen]
+        together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
         self.together = together.astype(np.int64)
-        expected = 1 + (m - 1) * math.pi * within**2 / self.solid_angle
+        expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
         self.weights = _weights(self.together, expected)
 
 

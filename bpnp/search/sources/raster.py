@@ -28,7 +28,7 @@ from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.kernels.sides import WeightedPoints
 from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
-from bpnp.search.starts import PosePrior, Prior
+from bpnp.search.starts import PosePrior, Prior, draw_poses
 
 WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 
@@ -69,6 +69,17 @@ def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
     poses = replace(poses, hits=np.where(once, poses.hits, 0))
     outliers = max(scene.settings.outliers, rule.raster.outliers)
     return anneal_on_points(scene, poses, scale * scene.spread, outliers=outliers)
+
+
+def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Candidates:
+    """Distinct poses from as many starts as for a wide prior, but over all rotations, drawn as those of a batch.
+
+    number: of the search, counted from 0. Finds what clusters hide where no cones say from where points are seen.
+    """
+    settings = scene.settings
+    recipe, rule = settings.recipes[number % len(settings.recipes)], settings.everywhere
+    drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, recipe, prior, scene.rng)
+    return raster_search(scene, Candidates.unscored(*drawn, hits=1), rule)
 
 
 def search_beside(scene: Scene, pose: Candidates, rule: RasterSearch) -> Candidates:
