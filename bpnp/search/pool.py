@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.distinct_poses import same_pose
 from bpnp.search.annealing import finish
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
@@ -22,6 +23,7 @@ class Pool:
 
     enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
     `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far.
+    surrounded, searched: poses around which was searched in vain, of those that exceed chance, and of others.
     """
 
     def __init__(self, scene: Scene, sets: PointSets, enumerated: SearchResult) -> None:
@@ -36,15 +38,14 @@ class Pool:
     def forget(self) -> None:
         """Drop all poses."""
         self.candidates = self.rotations = self.surrounded = Candidates.none()
+        self.searched: list[Candidates] = []
 
     def merge(self, found: Candidates) -> None:
         """Take up the poses of a turn.
 
-        They are weighed where a pose of before exceeds chance, which would else displace a better one beside it.
+        They are weighed first: a pose that exceeds chance may lie beside one that does not and is likelier.
         """
-        if (self.candidates.log10_false_alarms < 0).any():
-            found = self._weighed(found)
-        self.candidates = self._weighed(merged([self.candidates, found], self.scene), 1)
+        self.candidates = self._weighed(merged([self.candidates, self._weighed(found)], self.scene), 1)
         if self.missed() > self.scene.settings.evidence.missed:  # else the others are weighed for the verdict
             self.candidates = self._weighed(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.preference, kind="stable")]
@@ -95,6 +96,12 @@ class Pool:
         rotation = np.concatenate([leaders.rotation[:1], looked.rotation])
         translation = np.concatenate([leaders.translation[:1], looked.translation])
         return int(self.sets.same_pose(rotation, translation, rule.other_deg, rule.other_shift).sum()) - 1
+
+    def is_searched(self, pose: Candidates) -> bool:
+        """Whether the surroundings of a pose (1,), or of one much like it, were searched before one exceeded chance."""
+        together, settings = Candidates.concatenated([pose, *self.searched]), self.scene.settings
+        poses = together.rotation, together.translation * self.scene.shift_weight
+        return bool(same_pose(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
 
     def different(self, parts: list[Candidates]) -> Candidates:
         """The best poses of several sets of them, no two turned by less than `schedule.apart_deg`."""

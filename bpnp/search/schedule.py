@@ -111,14 +111,16 @@ def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:
 
 
 def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
-    """Raster searches around each of the poses, until several are in vain or a pose exceeds chance."""
+    """Raster searches around each of the poses, none twice, until several are in vain or a pose exceeds chance."""
     settings, since = pool.scene.settings, 0
     for k in range(len(poses)):
         if since == settings.schedule.in_vain or pool.alarms < 0:
             break
-        best = pool.candidates.preference.max(initial=-np.inf)
-        yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
-        since = 0 if pool.candidates.preference.max(initial=-np.inf) > best else since + 1
+        if not pool.is_searched(poses[k : k + 1]):
+            best = pool.candidates.preference.max(initial=-np.inf)
+            pool.searched.append(poses[k : k + 1])
+            yield search_beside(pool.scene, poses[k : k + 1], settings.beside)
+            since = 0 if pool.candidates.preference.max(initial=-np.inf) > best else since + 1
 
 
 def proposed(pool: Pool, proposals: Proposals) -> Candidates:
