@@ -18,7 +18,7 @@ from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
 from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
+from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.types import Batch
 
@@ -143,7 +143,8 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     rotation, translation = planted.rotation[0].double().numpy(), planted.translation[0].double().numpy()
     others = super_fibonacci(200)
     others[77] = Rotation.from_rotvec([0, np.radians(3), 0]).as_matrix() @ rotation
-    few = SearchSettings(Schedule(turns=9, patience=0.5, around_each=0), starts=1, first_starts=1)
+    once = RasterSearch(Draws(1))
+    few = SearchSettings(Schedule(turns=9, patience=0.5, around_each=0), 1, 1, everywhere=once)
 
     def off(result):
         return np.degrees(Rotation.from_matrix(result.best[0] @ rotation.T).magnitude())

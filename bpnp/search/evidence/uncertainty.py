@@ -48,7 +48,7 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     >>> linear = linearised(sets, np.eye(3), np.array([0.0, 0, 6]), 1e-3)
     >>> bounds = [rotation_bound(sets, linear, count) for count in (4.0, 12.0)]
     >>> [round(math.degrees(bound), 1) for bound in bounds]
-    [5.3, 0.7]
+    [7.8, 0.7]
     """
     covariance = local_covariance(linear)
     return math.inf if covariance is None else _bound(covariance[:3, :3], 2 * count - 2 * sets.pairs_that_fix)
