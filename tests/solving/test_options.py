@@ -1,6 +1,7 @@
 """Every option of `solve` changes the answer in a way that is known beforehand."""
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from scipy.spatial.transform import Rotation
 import bpnp
 from bpnp import GravityPrior, PosePrior, Solution, solve
 from bpnp.cli import main
+from bpnp.search.settings import DEFAULT
+from bpnp.solving.sources import Options
 
 Array = NDArray[np.float64]
 RNG = np.random.default_rng(5)
@@ -79,7 +82,7 @@ def test_normals_say_from_which_side_a_point_is_seen() -> None:
     board = np.column_stack([RNG.uniform(-1, 1, (60, 2)), 0.4 * RNG.uniform(-1, 1, 60)])
     image = seen(board, (np.eye(3), np.array([0.0, 0, 6])))
     assert degrees_between(solve(image, board, normals3d=normals).rotation, np.eye(3)) < 0.1
-    behind = solve(image, board, normals3d=-normals)
+    behind = solve(image, board, normals3d=-normals, time_limit=1.0)
     assert not behind.found or degrees_between(behind.rotation, np.eye(3)) > 5
 
 
@@ -90,7 +93,8 @@ def test_clutter_is_the_share_of_outliers_in_the_likelihood() -> None:
     assert few - many == pytest.approx(math.log(0.9 / 0.4), abs=0.05)
 
 
-def test_the_seed_decides_where_nothing_else_does() -> None:
+def test_the_seed_decides_where_nothing_else_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("bpnp.solving.solve.Options", partial(Options, settings=DEFAULT.limited(4)))
     guesses = [solve(NOISE2D, NOISE3D, solver="search", seed=seed, time_limit=math.inf) for seed in (0, 0, 1)]
     np.testing.assert_array_equal(guesses[0].rotation, guesses[1].rotation)
     assert not np.array_equal(guesses[0].rotation, guesses[2].rotation)
@@ -134,7 +138,7 @@ def test_a_module_computes_on_the_device() -> None:
 
 def test_progress_is_told_of_every_batch() -> None:
     calls: list[tuple[int, int, float]] = []
-    solution = solve(NOISE2D, NOISE3D, solver="search", progress=lambda *call: calls.append(call))
+    solution = solve(NOISE2D, NOISE3D, solver="search", time_limit=1.0, progress=lambda *call: calls.append(call))
     assert [batch for _, batch, _ in calls if batch] == list(range(1, solution.stats.iterations + 1))
     assert {problem for problem, _, _ in calls} == {0}
     assert sorted(seconds for *_, seconds in calls) == [seconds for *_, seconds in calls]
