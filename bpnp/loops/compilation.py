@@ -30,8 +30,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     It is kept beside the source or, where that cannot be written to, in the user's cache folder (`NUMBA_CACHE_DIR`
     names another one); where neither can, each process compiles again. So it is after a change of the function's file,
-    or of this one, or of another with functions that its file calls, which numba does not look at. A function is
-    compiled without the wrappers that a type checker puts around it when it is imported.
+    or of this one, or of another with functions that its file calls or records of constants that it reads, which numba
+    does not look at. A function is compiled without the wrappers that a type checker puts around it on import.
     options: of `numba.njit`. A division by zero is infinite, as in C. No wrapper for function pointers is made: that
     would be a tenth of the time. Counting references is a fifth, which `_nrt=False` leaves out of a function that
     allocates nothing. One that only compiled ones call has no wrapper for Python (`no_cpython_wrapper`; a call from
@@ -44,9 +44,9 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
-        files = {__file__, inspect.getfile(function)}.union(
-            *(_FILES[known] for known in function.__globals__.values() if isinstance(known, Dispatcher))
-        )
+        known = function.__globals__.values()
+        files = {__file__, inspect.getfile(function)}.union(*(_FILES[x] for x in known if isinstance(x, Dispatcher)))
+        files |= {inspect.getfile(type(x)) for x in known if isinstance(x, tuple) and hasattr(x, "_fields")}
         try:
             dispatcher: Any = numba.njit(function, cache=KNOWN and not part, **options)
             if KNOWN and not part:

@@ -101,6 +101,27 @@ def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path,
     assert doubled(package, cache)[1].count("compiling") == 1
 
 
+CONSTANTS = """
+from typing import NamedTuple
+
+
+class Constants(NamedTuple):
+    factor: int = 2
+
+
+CONSTANTS = Constants()
+"""
+
+
+def test_a_change_of_a_record_of_constants_compiles_again(package: Path, tmp_path: Path) -> None:
+    (package / "bpnp" / "factor.py").write_text(CONSTANTS)
+    loop = LOOP.replace("import factor", "import CONSTANTS").replace("factor()", "CONSTANTS.factor")
+    (package / "bpnp" / "loop.py").write_text(loop)
+    assert doubled(package, str(tmp_path / "cache"))[0] == "8 10\n"
+    (package / "bpnp" / "factor.py").write_text(CONSTANTS.replace("2", "30"))
+    assert doubled(package, str(tmp_path / "cache"))[0] == "120 150\n"
+
+
 RECORD = """
 from typing import NamedTuple
 
@@ -202,6 +223,6 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
     done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, check=True)
     warm, used = done.stdout.splitlines()
     names, counts = zip(*(entry.split(":") for entry in warm.split()), strict=True)
-    assert {"descend_on_clusters", "descend_on_points", "add_shifted", "add_up", "sweep", "vary"} <= set(names)
+    assert {"descend_on_clusters", "descend_on_points", "add_shifted", "add_up", "explore"} <= set(names)
     assert set(counts) == {"1"}
     assert used == warm

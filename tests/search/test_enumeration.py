@@ -56,7 +56,7 @@ def compiled_p3p(entry: Any) -> Callable[[Array, Array], list[Array]]:
             return []
         seen, poses = tuple(triangles.triples[0]), np.empty((4, 4, 3))
         chords = entry(chords_between)(rays, *seen)
-        count = entry(p3p)(rays, seen, chords, triangles, 0, np.empty((4, 3)), np.empty((3, 3)), poses)
+        count = entry(p3p)(rays, seen, chords, triangles, 0, poses)
         return [pose.ravel() for pose in poses[:count]]
 
     return solve
@@ -221,9 +221,10 @@ def test_two_matches_and_a_direction_give_the_pose(entry: Any, kind: str) -> Non
         prior = GravityPrior(rotation @ up, up, 1.0) if kind == "gravity" else PosePrior(rotation, None, 1.0)
         sets = PointSets(rays, points, prior=prior)
         scene, image = scene_side(points, None, None), ImageSide(rays, RADIUS, None, 2.0)
-        run = Enumeration(scene, image, prior_arrays(sets, scene, image, DEFAULT), 2, 2.0, DEFAULT)
+        known = prior_arrays(sets, scene, image, DEFAULT)
+        run = Enumeration(scene, image, known, 2, 2.0, DEFAULT)
         poses = np.empty((4, 4, 3))
-        count = entry(p2p)(0, 1, match[0], match[1], run.problem, poses)
+        count = entry(p2p)(0, 1, match[0], match[1], known[1], image.arrays.rays, scene.arrays.points, poses)
         assert 0 < count <= 2
         rotations, translations = run.leave(poses[:count])
         off = np.abs(rotations - rotation).max((1, 2)) + np.abs(translations - translation).max(1)

@@ -4,9 +4,10 @@ import math
 from typing import Any, NamedTuple
 
 from bpnp.loops.compilation import compiler
-from bpnp.search.enumeration.matching import Matches, evidence, fits, match, nearest, sight, step
+from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
 from bpnp.search.enumeration.minimal_solvers import chords_between, p2p, p3p, part
-from bpnp.search.enumeration.points import Array, Places, Triangles
+from bpnp.search.enumeration.points import Array, Heading, Places, Triangles
+from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.vectors import rotated
 
 compiled = compiler(_nrt=False)
@@ -17,7 +18,7 @@ class Block(NamedTuple):
     place of either is the one before it again. Image sets below `old_image` meet triangles from `old_scene` on alone.
 
     size: matches that fix a pose, 3 or 2. orders: (6, 3) or (2, 3) of a set. witnesses: (n, w) near points, of which
-    `need` must be matched within `reach` radii for a pose to be looked at further.
+    `need` must be matched within `reach` radii for a pose to be looked at further. heading: where two fix a pose.
     """
 
     size: int
@@ -29,17 +30,38 @@ class Block(NamedTuple):
     witnesses: Places
     need: int
     reach: float
+    heading: Heading
 
 
 @compiled
+def explore(
+    row: int,
+    first: int,
+    budget: int,
+    stop: float,
+    reach: float,
+    exchanged: bool,
+    block: Any,
+    problem: Any,
+    kept: Any,
+    work: Any,
+) -> Any:
+    """`sweep` with a budget, and `vary` without: one entry, so that what both call is compiled once."""
+    if budget > 0:
+        return sweep(row, first, budget, stop, block, problem, kept, work)
+    vary(reach, exchanged, problem, kept, work)
+    return row, first, 0
+
+
+@part
 def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
     """Solve up to `budget` hypotheses from row `row` on, one of an image set in one order, there from triangle `first`.
 
     Ends after an image set too when the best pose's evidence is `stop` nats. Returns the next row, the next triangle of
     it, and the number of hypotheses that were solved.
     """
-    scene, image, prior = problem.scene, problem.image, problem.prior
-    triangles, orders, rays, best = block.triangles, block.orders, image.rays, kept.best
+    triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
+    labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
     solved, t = 0, first
     while row < len(orders) * len(block.sets) and not (
         t == 0 and row % len(orders) == 0 and kept.evidence[best[0]] >= stop
@@ -60,24 +82,35 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
             if not triangles.orientation[t - 1] & hand:
                 continue
             if not (
-                fits(image.labels[i], scene.labels[a])
-                and fits(image.labels[j], scene.labels[b])
-                and fits(image.labels[k], scene.labels[c])
+                fits(labels2d[i], labels3d[a]) and fits(labels2d[j], labels3d[b]) and fits(labels2d[k], labels3d[c])
             ):
                 continue
             known = kept.point[best[0]]
-            if kept.counts[best[0]] >= problem.rules.skipped and known[i] == a and known[j] == b and known[k] == c:
+            if kept.counts[best[0]] >= RULES.skipped and known[i] == a and known[j] == b and known[k] == c:
                 continue
             solved += 1
             if block.size == 3:
-                count = p3p(rays, (i, j, k), chords, triangles, t - 1, work.depths, work.axes, work.poses)
+                count = p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
             else:
-                count = p2p(i, j, a, b, problem, work.poses)
+                count = p2p(i, j, a, b, block.heading, rays, problem.scene.points, poses)
             for s in range(count):
-                pose = work.poses[s]
-                if not (facing(pose, problem, a, i) and facing(pose, problem, b, j) and facing(pose, problem, c, k)):
+                pose = poses[s]
+                if not (
+                    facing(pose, normals, a, rays, i)
+                    and facing(pose, normals, b, rays, j)
+                    and facing(pose, normals, c, rays, k)
+                ):
                     continue
-                if allowed(pose, prior) and witnessed(pose, (a, b, c), (i, j, k), block, problem):
+                if allowed(pose, problem.prior) and witnessed(
+                    pose,
+                    (a, b, c),
+                    (i, j, k),
+                    block.witnesses,
+                    block.need,
+                    block.reach,
+                    problem.scene,
+                    problem.image.grid,
+                ):
                     consider(pose, block.reach, problem, kept, work)
         row, t = row + 1, 0
     return row, t, solved
@@ -90,20 +123,20 @@ def _determinant(f: Any, g: Any, h: Any) -> float:
 
 
 @part
-def facing(pose: Any, problem: Any, a: int, i: int) -> bool:
+def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
     """Whether point a faces the camera that sees it along ray i."""
-    normals, rays = problem.scene.normals, problem.image.rays
     if not len(normals):
         return True
     x, y, z = rotated(pose, normals[a, 0], normals[a, 1], normals[a, 2])
-    return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2]) > problem.rules.matched_cosine
+    return -(x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2]) > RULES.matched_cosine
 
 
 @part
-def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bool:
+def witnessed(
+    pose: Any, points: Any, seen: Any, witnesses: Any, need: int, reach: float, scene: Any, grid: Any
+) -> bool:
     """Whether enough of the points near the first of a hypothesis, other than its own, are seen near image points other
     than its own."""
-    witnesses, need, reach = block.witnesses, block.need, block.reach
     hits, left = 0, witnesses.shape[1]
     for w in range(witnesses.shape[1]):
         if hits + left < need:
@@ -112,10 +145,10 @@ def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bo
         p = witnesses[points[0], w]
         if p == points[1] or p == points[2]:
             continue
-        u, v, cosine = sight(pose, problem.scene, p)
-        if cosine < problem.rules.matched_cosine:
+        u, v, cosine = sight(pose, scene, p)
+        if cosine < RULES.matched_cosine:
             continue
-        q, _ = nearest(u, v, problem.scene.labels[p], reach * reach, problem.image)
+        q, _ = nearest(u, v, cell_of(u, v, grid), scene.labels[p], reach * reach, grid)
         if q >= 0 and q != seen[0] and q != seen[1] and q != seen[2]:
             hits += 1
             if hits >= need:
@@ -137,17 +170,13 @@ class Kept(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What the loops overwrite: depths (4, 3) and axes (3, 3) of a triangle, poses (4, 4, 3) of a hypothesis, the pose
-    (4, 3) at hand, its matches, the normal equations (8, 6), and another pose with the points (m,) of its matches."""
+    """What the loops overwrite: poses (4, 4, 3) of a hypothesis, matches of the pose at hand, the normal equations
+    (8, 6), and the points (m,) that the best pose matches."""
 
-    depths: Array
-    axes: Array
     poses: Array
-    pose: Array
     matches: Matches
     system: Array
-    other_pose: Array
-    other_point: Places
+    best_point: Places
 
 
 @part
@@ -166,11 +195,10 @@ def copy_pose(pose: Any, to: Any) -> None:
 @part
 def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
     """Refine a pose that matches about as many points as any hypothesis did at this reach."""
-    rules = problem.rules
-    count, _, expected = match(pose, reach, problem, work.matches)
-    value = count - rules.lacking * max(expected - count, 0)
+    count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
+    value = count - RULES.lacking * max(expected - count, 0)
     kept.most[0] = max(kept.most[0], value)
-    if count > problem.fixing and value >= kept.most[0] - rules.behind:
+    if count > problem.fixing and value >= kept.most[0] - RULES.behind:
         settle(pose, reach, problem, kept, work)
 
 
@@ -180,30 +208,30 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
     radius that exceeds chance most, and keep that too. reach: 0 if it is refined already."""
     last = 1.0
     for _ in range(2):
-        if reach > 0 and not tightened(pose, reach, last, problem, work):
+        if reach > 0 and not tightened(pose, reach, last, problem, work.matches, work.system):
             return
-        count, visible, expected = match(pose, 1.0, problem, work.matches)
+        count, visible, expected = match(pose, 1.0, problem.scene, problem.image.grid, work.matches)
         if count <= problem.fixing:
             return
-        value, last = evidence(count, visible, expected, work.matches, problem)
-        keep(pose, value, count, work.matches, kept, problem.rules)
+        value, last = evidence(count, visible, expected, work.matches, problem.fixing, problem.density)
+        keep(pose, value, count, work.matches, kept)
         if last == 1:
             return
         reach = 2 * last
 
 
 @part
-def tightened(pose: Any, reach: float, last: float, problem: Any, work: Any) -> bool:
+def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
     """Gauss-Newton steps, in place, on matches within a radius that shrinks from `reach` to `last`, and two at it."""
-    left, directions = problem.rules.final, len(problem.prior.directions)
+    left, directions = RULES.final, problem.prior.directions
     while left > 0:
-        count, _, _ = match(pose, reach, problem, work.matches)
-        if count < 3 and count + directions < 3:
+        count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
+        if count < 3 and count + len(directions) < 3:
             return False
-        if not step(pose, work.matches.point, problem, work.system):
+        if not step(pose, matches.point, problem.image.rays, problem.scene.points, directions, system):
             return False
         left -= reach <= last
-        reach = max(last, problem.rules.tighter * reach)
+        reach = max(last, RULES.tighter * reach)
     return allowed(pose, problem.prior)
 
 
@@ -224,11 +252,11 @@ def allowed(pose: Any, prior: Any) -> bool:
 
 
 @part
-def keep(pose: Any, value: float, count: int, matches: Any, kept: Any, rules: Any) -> None:
+def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
     """Put a pose among the kept ones: in the place of the same pose, of an empty one, or of the worst."""
     values, best, place = kept.evidence, kept.best, -1
     for c in range(len(values)):
-        if values[c] > -math.inf and _same(pose, kept.poses[c], rules):
+        if values[c] > -math.inf and _same(pose, kept.poses[c]):
             if values[c] >= value:
                 return
             if place >= 0:
@@ -262,24 +290,24 @@ def _trace(pose: Any, other: Any) -> float:
 
 
 @part
-def _same(pose: Any, other: Any, rules: Any) -> bool:
+def _same(pose: Any, other: Any) -> bool:
     shift2 = depth2 = 0.0
     for k in range(3):
         shift2 += (pose[3, k] - other[3, k]) ** 2
         depth2 += other[3, k] ** 2
-    near = shift2 < (rules.same_shift + rules.same_depth * math.sqrt(depth2)) ** 2
-    return near and _trace(pose, other) > rules.same_trace
+    near = shift2 < (RULES.same_shift + RULES.same_depth * math.sqrt(depth2)) ** 2
+    return near and _trace(pose, other) > RULES.same_trace
 
 
-@compiled
+@part
 def vary(reach: float, exchanged: bool, problem: Any, kept: Any, work: Any) -> None:
-    """Refine the pose in `work` from matches within `reach` radii, and keep it.
+    """Refine the first pose in `work` from matches within `reach` radii, and keep it.
 
     exchanged: keep too what follows from the best pose when one of its matches is left out, or goes to the nearest
     other scene point. A single wrong match can turn a pose of few points by some degrees and still lie near its image
     point; no refinement finds the pose without it, since the wrong match holds it.
     """
-    pose, matched, best, points = work.pose, work.matches.point, work.other_pose, work.other_point
+    pose, best, matched, points = work.poses[0], work.poses[1], work.matches.point, work.best_point
     settle(pose, reach, problem, kept, work)
     count = 0
     if exchanged:
@@ -297,34 +325,33 @@ def vary(reach: float, exchanged: bool, problem: Any, kept: Any, work: Any) -> N
                 if turn and points[k] == other:
                     matched[k] = -1
             matched[i] = other
-            if not _stepped(pose, problem, work):
+            if not _stepped(pose, problem, matched, work.system):
                 break
-            other = _nearest_other(pose, i, points[i], problem)
-            if _trace(pose, best) < problem.rules.moved_trace and allowed(pose, problem.prior):
+            other = _nearest_other(pose, i, points[i], problem.scene, problem.image.grid)
+            if _trace(pose, best) < RULES.moved_trace and allowed(pose, problem.prior):
                 settle(pose, 0.0, problem, kept, work)
             if other < 0:
                 break
 
 
 @part
-def _stepped(pose: Any, problem: Any, work: Any) -> bool:
-    """Gauss-Newton steps, in place, on the matches in `work`."""
-    steps = 0
-    while steps < problem.rules.exchanged and step(pose, work.matches.point, problem, work.system):
+def _stepped(pose: Any, problem: Any, matched: Any, system: Any) -> bool:
+    """Gauss-Newton steps, in place, on the matches (m,)."""
+    rays, points, directions, steps = problem.image.rays, problem.scene.points, problem.prior.directions, 0
+    while steps < RULES.exchanged and step(pose, matched, rays, points, directions, system):
         steps += 1
-    return steps == problem.rules.exchanged
+    return steps == RULES.exchanged
 
 
 @part
-def _nearest_other(pose: Any, i: int, matched: int, problem: Any) -> int:
+def _nearest_other(pose: Any, i: int, matched: int, scene: Any, grid: Any) -> int:
     """The scene point nearest to image point i, of those that are not its match and fit its label; -1 for none."""
-    scene, image, rules = problem.scene, problem.image, problem.rules
-    place, least = -1, (rules.farthest / image.gain[i]) ** 2
+    place, least = -1, (RULES.farthest / grid.flat[i, 2]) ** 2
     for j in range(len(scene.points)):
-        if j == matched or not fits(scene.labels[j], image.labels[i]):
+        if j == matched or not fits(scene.labels[j], grid.labels[i]):
             continue
         u, v, cosine = sight(pose, scene, j)
-        d2 = (u - image.flat[i, 0]) ** 2 + (v - image.flat[i, 1]) ** 2
-        if cosine >= rules.matched_cosine and d2 < least:
+        d2 = (u - grid.flat[i, 0]) ** 2 + (v - grid.flat[i, 1]) ** 2
+        if cosine >= RULES.matched_cosine and d2 < least:
             place, least = j, d2
     return place

@@ -1,14 +1,15 @@
 """One-to-one matches of few points under a pose, their evidence, and a step of the pose on them: all compiled.
 
-Poses are (4, 3): R, and t below it. `scene`, `image`, `prior`: `ScenePoints`, `ImagePoints` and `PosePriorArrays`.
+Poses are (4, 3): R, and t below it. A function takes the records it reads and no others: each field is an argument of
+the compiled code, and costs time to compile.
 """
 
 import math
 from typing import Any, NamedTuple
 
 from bpnp.search.enumeration.minimal_solvers import part
-from bpnp.search.enumeration.points import Array, ImagePoints, Places, PosePriorArrays, ScenePoints
-from bpnp.search.enumeration.settings import Rules
+from bpnp.search.enumeration.points import Array, ImagePoints, Places, PriorArrays, ScenePoints
+from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
 from bpnp.search.kernels.vectors import rotated, turn
 
@@ -19,10 +20,9 @@ class Problem(NamedTuple):
 
     scene: ScenePoints
     image: ImagePoints
-    prior: PosePriorArrays
+    prior: PriorArrays
     fixing: int
     density: float
-    rules: Rules
 
 
 class Matches(NamedTuple):
@@ -53,42 +53,42 @@ def fits(label: int, other: int) -> bool:
 
 
 @part
-def nearest(u: float, v: float, label: int, reach2: float, image: Any) -> tuple[int, float]:
+def cell_of(u: float, v: float, grid: Any) -> int:
+    """The cell of the grid with (u, v), -1 outside."""
+    a, b = (u - grid.low_u) * grid.per_cell, (v - grid.low_v) * grid.per_cell
+    return int(a) * RULES.cells + int(b) if a >= 0 and b >= 0 and a < RULES.cells and b < RULES.cells else -1
+
+
+@part
+def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any) -> tuple[int, float]:
     """The image point nearest to (u, v) whose label fits, -1 for none within the root of reach2, and squared radii."""
-    flat, gain, corner, starts = image.flat, image.gain, image.corner, image.starts
-    cells = int(math.sqrt(len(starts) - 1))
-    a, b = (u - corner[0]) * corner[2], (v - corner[1]) * corner[2]
-    place = -1
-    if not (a >= 0 and b >= 0 and a < cells and b < cells):
-        return place, reach2
-    cell = int(a) * cells + int(b)
-    for item in range(starts[cell], starts[cell + 1]):
-        i = image.items[item]
-        if fits(label, image.labels[i]):
-            d2 = gain[i] * gain[i] * ((u - flat[i, 0]) ** 2 + (v - flat[i, 1]) ** 2)
-            if d2 < reach2:
-                place, reach2 = i, d2
+    flat, place = grid.flat, -1
+    if cell >= 0:
+        for item in range(grid.starts[cell], grid.starts[cell + 1]):
+            i = grid.items[item]
+            if fits(label, grid.labels[i]):
+                d2 = flat[i, 2] * flat[i, 2] * ((u - flat[i, 0]) ** 2 + (v - flat[i, 1]) ** 2)
+                if d2 < reach2:
+                    place, reach2 = i, d2
     return place, reach2
 
 
 @part
-def match(pose: Any, reach: float, problem: Any, matches: Any) -> tuple[int, int, int]:
+def match(pose: Any, reach: float, scene: Any, grid: Any, matches: Any) -> tuple[int, int, int]:
     """Fill `matches` with each image point's nearest scene point among those that have it as their nearest, within
     `reach` radii. Returns how many there are, the points that can be seen among the image points, and those expected
     to be seen."""
-    scene, image, rules = problem.scene, problem.image, problem.rules
-    corner, cells = image.corner, math.sqrt(len(image.starts) - 1)
-    matches.point[:] = -1
-    matches.distance2[:] = reach * reach
+    for i in range(len(matches.point)):
+        matches.point[i], matches.distance2[i] = -1, reach * reach
     visible = expected = count = 0
     for j in range(len(scene.points)):
         u, v, cosine = sight(pose, scene, j)
-        if cosine < rules.matched_cosine:
+        if cosine < RULES.matched_cosine:
             continue
-        a, b = (u - corner[0]) * corner[2], (v - corner[1]) * corner[2]
-        visible += a >= 0 and b >= 0 and a < cells and b < cells
-        expected += len(scene.normals) > 0 and cosine > rules.expected_cosine
-        i, d2 = nearest(u, v, scene.labels[j], reach * reach, image)
+        cell = cell_of(u, v, grid)
+        visible += cell >= 0
+        expected += len(scene.normals) > 0 and cosine > RULES.expected_cosine
+        i, d2 = nearest(u, v, cell, scene.labels[j], reach * reach, grid)
         if i >= 0 and d2 < matches.distance2[i]:
             count += matches.point[i] < 0
             matches.point[i], matches.distance2[i] = j, d2
@@ -96,21 +96,20 @@ def match(pose: Any, reach: float, problem: Any, matches: Any) -> tuple[int, int
 
 
 @part
-def evidence(count: int, visible: int, expected: int, matches: Any, problem: Any) -> tuple[float, float]:
+def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int, density: float) -> tuple[float, float]:
     """Nats by which the matches exceed chance, less those of expected points that are missing; and the radius, of the
     ladder, at which they do: -log of C(m - f, k - f) p^(k - f), p the chance of one match, f those that fix a pose."""
-    fixing, rules = problem.fixing, problem.rules
     best, radius, radius2 = -math.inf, 1.0, 1.0
-    for _ in range(rules.ladder):
+    for _ in range(RULES.ladder):
         k = 0
         for i in range(len(matches.point)):
             k += matches.point[i] >= 0 and matches.distance2[i] <= radius2
-        chance = min(0.5, max(visible, 1) * problem.density * radius2)
+        chance = min(0.5, max(visible, 1) * density * radius2)
         value = -(k - fixing) * math.log(chance) - _log_choose(len(matches.point) - fixing, k - fixing)
         if value > best:
             best, radius = value, math.sqrt(radius2)
         radius2 *= 0.25
-    return best - rules.missed * max(expected - count, 0), radius
+    return best - RULES.missed * max(expected - count, 0), radius
 
 
 @part
@@ -119,10 +118,9 @@ def _log_choose(n: int, k: int) -> float:
 
 
 @part
-def step(pose: Any, matched: Any, problem: Any, system: Any) -> bool:
+def step(pose: Any, matched: Any, rays: Any, points: Any, directions: Any, system: Any) -> bool:
     """One Gauss-Newton step, in place, on sum_i w_i^2 |f_i - g(R p + t)|^2 over the matches (m,) and what is known of
     directions; False if it has none. g(y) = y/|y|, w_i one over a radius. The step is y -> y + w x Rp + s."""
-    rays, points, directions = problem.image.rays, problem.scene.points, problem.prior.directions
     for a in range(7):
         for b in range(6):
             system[a, b] = 0.0

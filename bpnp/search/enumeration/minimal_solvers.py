@@ -21,25 +21,34 @@ UPRIGHT = 1e-3  # horizontal part of the way between two points, below which it 
 
 
 @part
-def p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, depths: Any, axes: Any, poses: Any) -> int:
+def p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
     """Fill `poses` (4, 4, 3) with those under which triangle t is seen along three of the rays (m, 4); how many.
 
-    seen: the three places of the rays. chords: of `chords_between` these. depths: (4, 3), axes: (3, 3), overwritten.
+    seen: the three places of the rays. chords: of `chords_between` these.
     """
     i, j, k = seen
     sides, frame, middle = triangles.sides[t], triangles.frames[t], triangles.middles[t]
     count = 0
-    for s in range(p3p_depths(chords, sides[0], sides[1], depths)):
-        pose, d = poses[count], depths[s]
-        d0, d1, d2 = sides[2] * d[0], sides[2] * d[1], sides[2] * d[2]
+    for s in range(p3p_depths(chords, sides[0], sides[1], poses)):
+        pose = poses[count]  # one of those whose depths were read
+        d0, d1, d2 = sides[2] * poses[s, 3, 0], sides[2] * poses[s, 3, 1], sides[2] * poses[s, 3, 2]
         x0, y0, z0 = d0 * rays[i, 0], d0 * rays[i, 1], d0 * rays[i, 2]
         x1, y1, z1 = d1 * rays[j, 0], d1 * rays[j, 1], d1 * rays[j, 2]
         x2, y2, z2 = d2 * rays[k, 0], d2 * rays[k, 1], d2 * rays[k, 2]
-        if not triangle_axes(x0 - x2, y0 - y2, z0 - z2, x1 - x2, y1 - y2, z1 - z2, axes):
+        # Axes fixed to the triangle: a along its longest side, b across it, n its normal.
+        ax, ay, az = x1 - x2, y1 - y2, z1 - z2
+        nx, ny, nz = cross(ax, ay, az, x0 - x2, y0 - y2, z0 - z2)
+        length2, area2 = ax * ax + ay * ay + az * az, nx * nx + ny * ny + nz * nz
+        if not area2 > FLAT * length2 * length2:
             continue
-        for r in range(3):
-            for c in range(3):
-                pose[r, c] = axes[0, r] * frame[0, c] + axes[1, r] * frame[1, c] + axes[2, r] * frame[2, c]
+        scale, across = 1 / math.sqrt(length2), 1 / math.sqrt(area2)
+        ax, ay, az, nx, ny, nz = ax * scale, ay * scale, az * scale, nx * across, ny * across, nz * across
+        bx, by, bz = cross(nx, ny, nz, ax, ay, az)
+        for c in range(3):
+            along, aside, above = frame[0, c], frame[1, c], frame[2, c]
+            pose[0, c] = ax * along + bx * aside + nx * above
+            pose[1, c] = ay * along + by * aside + ny * above
+            pose[2, c] = az * along + bz * aside + nz * above
         x, y, z = rotated(pose, middle[0], middle[1], middle[2])
         pose[3, 0], pose[3, 1], pose[3, 2] = (x0 + x1 + x2) / 3 - x, (y0 + y1 + y2) / 3 - y, (z0 + z1 + z2) / 3 - z
         count += 1
@@ -59,34 +68,13 @@ def _distance2(f: Any, g: Any) -> float:
 
 
 @part
-def triangle_axes(bx: float, by: float, bz: float, ax: float, ay: float, az: float, axes: Any) -> bool:
-    """Orthonormal axes fixed to a triangle 012 with the sides b = 0 - 2 and a = 1 - 2, rows of `axes` (3, 3): along a,
-    its perpendicular, the normal. Returns False if the triangle is flat."""
-    length2 = ax * ax + ay * ay + az * az
-    if not length2 > 0:
-        return False
-    scale = 1 / math.sqrt(length2)
-    ax, ay, az = ax * scale, ay * scale, az * scale
-    nx, ny, nz = cross(ax, ay, az, bx, by, bz)
-    height2 = nx * nx + ny * ny + nz * nz
-    if not height2 > FLAT * length2:
-        return False
-    scale = 1 / math.sqrt(height2)
-    nx, ny, nz = nx * scale, ny * scale, nz * scale
-    axes[0, 0], axes[0, 1], axes[0, 2] = ax, ay, az
-    axes[1, 0], axes[1, 1], axes[1, 2] = cross(nx, ny, nz, ax, ay, az)
-    axes[2, 0], axes[2, 1], axes[2, 2] = nx, ny, nz
-    return True
-
-
-@part
-def p3p_depths(chords: Any, a: float, b: float, depths: Any) -> int:
+def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
     """The depths d_i > 0 of three rays with |d_i f_i - d_j f_j| = |p_i - p_j|; how many solutions there are (0 to 4).
 
     chords: of `chords_between` the rays. a, b: |p_0 - p_1|^2 and |p_2 - p_0|^2 over |p_1 - p_2|^2.
-    depths: (4, 3), written; in units of |p_1 - p_2|. With x = d_0/d_2 and y = d_1/d_2 the law of cosines gives two
-    conics; a root of det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at most
-    two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023).
+    poses: the depths are written to poses[:, 3], in units of |p_1 - p_2|. With x = d_0/d_2 and y = d_1/d_2 the law of
+    cosines gives two conics; a root of det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the
+    conics in at most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023).
     """
     m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
     # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.
@@ -134,7 +122,7 @@ def p3p_depths(chords: Any, a: float, b: float, depths: Any) -> int:
     column = (top[1], middle[1], bottom[1]) if not first_column and centre >= right else column
     count = np.int64(0)  # as a literal, `_meet` would be compiled for it
     for line in (row, column):
-        count = _meet(line, conics, chords, a, b, depths, count)
+        count = _meet(line, conics, chords, a, b, poses, count)
     return int(count)
 
 
@@ -170,7 +158,7 @@ def cubic_root(c0: float, c1: float, c2: float, c3: float) -> float:
 
 
 @part
-def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, depths: Any, count: int) -> int:
+def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, poses: Any, count: int) -> int:
     """Append the depths of the points (x, y) where the line meets both conics."""
     la, lb, lc = line
     steep = abs(la) > abs(lb)
@@ -197,7 +185,7 @@ def _meet(line: Any, conics: Any, chords: Any, a: float, b: float, depths: Any, 
         if not (x > 0 and y > 0 and x < math.inf and y < math.inf):
             continue
         d2 = 1 / math.sqrt((1 - y) * (1 - y) + y * chords[1])
-        if polished(x * d2, y * d2, d2, chords, a, b, depths[count]):
+        if polished(x * d2, y * d2, d2, chords, a, b, poses[count, 3]):
             count += 1
     return count
 
@@ -237,7 +225,7 @@ def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, d
 
 
 @part
-def p2p(i: int, j: int, a: int, b: int, problem: Any, poses: Any) -> int:
+def p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
     """Fill `poses` with those under which points a and b are seen along the rays i and j, a direction being known; how
     many there are, up to two.
 
@@ -245,8 +233,7 @@ def p2p(i: int, j: int, a: int, b: int, problem: Any, poses: Any) -> int:
     component is linear in the depths c and d, and the length of its horizontal part quadratic (Kukelova, Bujnak,
     Pajdla: Closed-form solutions to minimal absolute pose problems with known vertical direction, ACCV 2010).
     """
-    prior, points, rays = problem.prior, problem.scene.points, problem.image.rays
-    f, g, p, q = prior.rays[i], prior.rays[j], prior.points[a], prior.points[b]
+    f, g, p, q = heading.rays[i], heading.rays[j], heading.points[a], heading.points[b]
     if max(abs(f[2]), abs(g[2])) < LEVEL:
         return 0
     rise, along0, along1 = q[2] - p[2], q[0] - p[0], q[1] - p[1]
@@ -256,7 +243,7 @@ def p2p(i: int, j: int, a: int, b: int, problem: Any, poses: Any) -> int:
     # The way R (q - p) lies in the plane of the rays: a turn of the known rotation has to bring it there.
     n0, n1, n2 = cross(f[0], f[1], f[2], g[0], g[1], g[2])
     volume = n0 * along0 + n1 * along1 + n2 * rise
-    if volume * volume > prior.sine2 * (n0 * n0 + n1 * n1 + n2 * n2) * (length2 + rise * rise):
+    if volume * volume > heading.sine2 * (n0 * n0 + n1 * n1 + n2 * n2) * (length2 + rise * rise):
         return 0
     # The depth x of the ray with the smaller z is free; the other depth is shift + slope x.
     swap = abs(f[2]) > abs(g[2])
@@ -281,7 +268,7 @@ def p2p(i: int, j: int, a: int, b: int, problem: Any, poses: Any) -> int:
         way0, way1 = d * g[0] - c * f[0], d * g[1] - c * f[1]
         cosine, sine = (along0 * way0 + along1 * way1) / length2, (along0 * way1 - along1 * way0) / length2
         size = 1 / math.sqrt(cosine * cosine + sine * sine)
-        cosine, sine, turns, pose = cosine * size, sine * size, prior.turns, poses[count]
+        cosine, sine, turns, pose = cosine * size, sine * size, heading.turns, poses[count]
         for r in range(3):
             for s in range(3):
                 pose[r, s] = turns[0, r, s] + cosine * turns[1, r, s] + sine * turns[2, r, s]

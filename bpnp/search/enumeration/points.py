@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.enumeration.settings import EnumerationSettings
+from bpnp.search.enumeration.settings import RULES, EnumerationSettings
 from bpnp.search.enumeration.symmetries import Motion, near_symmetries
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
@@ -18,7 +18,6 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
 OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
-CELLS = 48  # of the grid, a side
 SCENES = 8  # whose tables are remembered
 FLAT = 1e-12  # squared height of a triangle over its squared longest side
 SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
@@ -34,22 +33,33 @@ class ScenePoints(NamedTuple):
     labels: Places
 
 
+class Grid(NamedTuple):
+    """Image points in the cells of a grid, each in all that lie within reach of it.
+
+    flat: (m, 3), coordinates and gain of `ImagePoints`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
+    per_cell: cells a unit. starts: where the items of a cell begin (cells^2 + 1,), those along the second coordinate
+    next to each other. items: image points.
+    """
+
+    flat: Array
+    labels: Places
+    low_u: float
+    low_v: float
+    per_cell: float
+    starts: Places
+    items: Places
+
+
 class ImagePoints(NamedTuple):
     """Bearings in a frame whose z axis is their mean, and in stereographic coordinates (x, y) / (|p| + z) about it.
 
     A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis: `gain` turns differences near
     an image point into units of its radius.
-    rays: (m, 4), unit vectors and one over the radius. flat: (m, 2). gain: (m,). labels: (m,), -1 fits any.
-    corner, starts, items: of `grid_of`.
+    rays: (m, 4), unit vectors and one over the radius.
     """
 
     rays: Array
-    flat: Array
-    gain: Array
-    labels: Places
-    corner: Array
-    starts: Places
-    items: Places
+    grid: Grid
 
 
 class Triangles(NamedTuple):
@@ -67,17 +77,23 @@ class Triangles(NamedTuple):
     orientation: Places
 
 
-class PosePriorArrays(NamedTuple):
+class PriorArrays(NamedTuple):
     """What is known of the pose, in the frames of the points.
 
     directions: (k, 8) rows a, b, weight and largest squared distance of R a from b. place: (4,) the translation and the
-    largest squared distance from it. rays, points: (m, 3) and (n, 3) in frames whose z axis is the known direction,
-    empty if there is none. turns: (3, 3, 3), R is the first one, and the others times the cosine and sine of the angle
-    about this direction; where the rotation is known, at no angle. sine2: squared, of the largest turn from it, or 1.
+    largest squared distance from it.
     """
 
     directions: Array
     place: Array
+
+
+class Heading(NamedTuple):
+    """What P2P reads of a prior. rays, points: (m, 3) and (n, 3) in frames whose z axis is the known direction, empty
+    if there is none. turns: (3, 3, 3), R is the first one, and the others times the cosine and sine of the angle about
+    this direction; where the rotation is known, at no angle. sine2: squared, of the largest turn from it, or 1.
+    """
+
     rays: Array
     points: Array
     turns: Array
@@ -136,11 +152,9 @@ class ImageSide:
         self.turn = turned_to(bearings.mean(0))
         rays = bearings @ self.turn.T
         inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
-        flat = np.ascontiguousarray(rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9))
-        gain = np.ascontiguousarray((1 + rays[:, 2]) * inverse)
+        flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * inverse
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
-        rays = np.ascontiguousarray(np.column_stack([rays, inverse]))
-        self.arrays = ImagePoints(rays, flat, gain, labels, *grid_of(flat, gain, reach))
+        self.arrays = ImagePoints(np.column_stack([rays, inverse]), grid_of(flat, gain, labels, reach))
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
 
     @functools.cached_property
@@ -239,26 +253,23 @@ def sphere(count: int) -> Array:
 DIRECTIONS = sphere(192)
 
 
-def grid_of(flat: Array, gain: Array, reach: float) -> tuple[Array, Places, Places]:
-    """Cells of the plane with the image points (m, 2) that lie within `reach` radii of each.
-
-    Returns the lower corner and cells a unit (3,); where the items of a cell begin (CELLS^2 + 1,), cells along the
-    second coordinate next to each other; and the items.
-    """
-    around = reach / gain[:, None]
+def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
+    """The grid of image points (m, 2), each in the cells within `reach` radii."""
+    cells, around = RULES.cells, reach / gain[:, None]
     low, high = (flat - around).min(0), (flat + around).max(0)
-    per_cell = CELLS / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
+    per_cell = cells / (float((high - low).max()) * (1 + 1e-9) + 1e-12)
     first, last = (
-        np.clip(((flat + side * around - low) * per_cell).astype(np.int64), 0, CELLS - 1) for side in (-1, 1)
+        np.clip(((flat + side * around - low) * per_cell).astype(np.int64), 0, cells - 1) for side in (-1, 1)
     )
     size = last - first + 1
     count = size.prod(1)
     item = np.repeat(np.arange(len(flat)), count)
     nth = np.arange(len(item)) - np.repeat(np.cumsum(count) - count, count)
     row, column = first[item].T + np.stack(np.divmod(nth, size[item, 1]))
-    cell = row * CELLS + column
+    cell = row * cells + column
     order = np.argsort(cell, kind="stable")
-    return np.append(low, per_cell), np.searchsorted(cell[order], np.arange(CELLS**2 + 1)), item[order]
+    starts = np.searchsorted(cell[order], np.arange(cells**2 + 1))
+    return Grid(np.column_stack([flat, gain]), labels, float(low[0]), float(low[1]), per_cell, starts, item[order])
 
 
 def _area(flat: Array, radius: float) -> float:
@@ -277,8 +288,8 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
 
 def prior_arrays(
     sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
-) -> tuple[PosePriorArrays, float]:
-    """The prior in the frames of both sides, and the log of the share of all poses that it allows.
+) -> tuple[PriorArrays, Heading, float]:
+    """The prior in the frames of both sides, what P2P reads of it, and the log of the share of poses that it allows.
 
     Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
     image shows a turn best.
@@ -286,7 +297,7 @@ def prior_arrays(
     prior, place, log_share = sets.prior, np.array([0, 0, 0, math.inf]), 0.0
     none, sine2 = np.empty((0, 3)), 1.0
     if prior is None:
-        return PosePriorArrays(np.empty((0, 8)), place, none, none, np.zeros((3, 3, 3)), sine2), log_share
+        return PriorArrays(np.empty((0, 8)), place), Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share
     if isinstance(prior, GravityPrior):
         camera, up = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (prior.up_camera, prior.up_scene))
         directions = _rows(up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg), settings)
@@ -304,7 +315,8 @@ def prior_arrays(
     about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
     rays = np.ascontiguousarray(image.arrays.rays[:, :3] @ from_camera.T)
     points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
-    return PosePriorArrays(directions, place, rays, points, from_camera.T @ about @ from_scene, sine2), log_share
+    heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
+    return PriorArrays(directions, place), heading, log_share
 
 
 def _rows(scene: Array, camera: Array, sigma: float, settings: EnumerationSettings) -> Array:

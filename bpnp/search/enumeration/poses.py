@@ -12,20 +12,22 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bpnp.search.enumeration.hypotheses import Block, Kept, Work, sweep, vary
+from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import Matches, Problem
 from bpnp.search.enumeration.points import (
     Array,
+    Heading,
     ImageSide,
     Places,
-    PosePriorArrays,
+    PriorArrays,
     SceneSide,
+    pairs,
     predicted_pose,
     prior_arrays,
     scene_side,
     sets_within,
 )
-from bpnp.search.enumeration.settings import DEFAULT, EnumerationSettings, Stage
+from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import PosePrior
 
@@ -72,7 +74,7 @@ class Enumeration:
         self,
         scene: SceneSide,
         image: ImageSide,
-        prior: tuple[PosePriorArrays, float],
+        prior: tuple[PriorArrays, Heading, float],
         fixing: int,
         reach: float,
         settings: EnumerationSettings,
@@ -80,7 +82,7 @@ class Enumeration:
         self.scene, self.image, self.settings, self.reach = scene, image, settings, reach
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
-        self.problem = Problem(scene.arrays, image.arrays, prior[0], fixing, image.density, settings.rules)
+        self.problem = Problem(scene.arrays, image.arrays, prior[0], fixing, image.density)
         self.kept = Kept(
             np.zeros((kept, 4, 3)),
             np.full(kept, -math.inf),
@@ -91,22 +93,15 @@ class Enumeration:
             np.zeros(1),
         )
         matches = Matches(np.empty(m, np.int64), np.empty(m))
-        self.work = Work(
-            np.empty((4, 3)),
-            np.empty((3, 3)),
-            np.empty((4, 4, 3)),
-            np.empty((4, 3)),
-            matches,
-            np.empty((8, 6)),
-            np.empty((4, 3)),
-            np.empty(m, np.int64),
-        )
+        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)), np.empty(m, np.int64))
         seen = settings.seen_witnesses * n / max(m - fixing, 1)
         near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
-        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + prior[1]
-        self.tests = math.log(settings.rules.ladder) + max(problems, 0.0)
+        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + prior[2]
+        self.tests = math.log(RULES.ladder) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
+        none = np.empty((0, fixing), np.int64)
+        self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0, heading=prior[1])
 
     @property
     def best(self) -> float:
@@ -142,8 +137,15 @@ class Enumeration:
         one, two = self.settings.witness_chances
         need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
         need = min(need, m - stage.matches, n - stage.matches)
-        self._block = Block(
-            stage.matches, sets, ORDERS[stage.matches], triangles, *before, self._witnesses, need, stage.reach
+        self._block = self._block._replace(
+            size=stage.matches,
+            sets=sets,
+            orders=ORDERS[stage.matches],
+            triangles=triangles,
+            old_image=before[0],
+            old_scene=before[1],
+            need=need,
+            reach=stage.reach,
         )
         self._row, self._triangle = 0, 0
         self.kept.most[0] = 0.0
@@ -158,8 +160,8 @@ class Enumeration:
         over."""
         start, stop = time.monotonic(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
-        self._row, self._triangle, solved = sweep(
-            self._row, self._triangle, most, stop, self._block, self.problem, self.kept, self.work
+        self._row, self._triangle, solved = explore(
+            self._row, self._triangle, most, stop, 1.0, False, self._block, self.problem, self.kept, self.work
         )
         self.solved += solved
         if solved >= most:
@@ -189,8 +191,8 @@ class Enumeration:
 
         exchanged: and what follows from the best pose with other matches.
         """
-        self.work.pose[:] = pose
-        vary(reach, exchanged, self.problem, self.kept, self.work)
+        self.work.poses[0] = pose
+        explore(0, 0, 0, 0.0, reach, exchanged, self._block, self.problem, self.kept, self.work)
 
     def enter(self, rotation: Array, translation: Array) -> Array:
         """A pose of the given points as (4, 3) in these frames."""

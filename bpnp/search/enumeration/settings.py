@@ -19,8 +19,9 @@ class Stage(NamedTuple):
 
 
 class Rules(NamedTuple):
-    """What the compiled loops read of the settings.
+    """Constants of the compiled loops, which are compiled with them.
 
+    cells: of the grid of the image points, a side.
     matched_cosine: of the angle between a normal and the line of sight; beyond, a point has no match.
     expected_cosine: up to this angle a point is expected to be seen. ladder: radii 1, 1/2, 1/4 ... at which matches are
     counted. missed: nats that an expected but missing point costs: one in five is missed. lacking: matches that it
@@ -33,6 +34,7 @@ class Rules(NamedTuple):
     farthest: radii from an image point within which another partner is looked for.
     """
 
+    cells: int = 48
     matched_cosine: float = math.cos(math.radians(87.0))
     expected_cosine: float = math.cos(math.radians(72.0))
     ladder: int = 5
@@ -95,7 +97,7 @@ class EnumerationSettings:
     witness_chances: tuple[float, float] = (0.05, 0.3)
     sigmas: float = 4.0
     prior_weight: float = 0.1
-    rules: Rules = Rules()
 
 
+RULES = Rules()
 DEFAULT = EnumerationSettings()
