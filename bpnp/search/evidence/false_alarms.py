@@ -14,10 +14,10 @@ at most 1 / b (Markov). From this follow
 
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
 
-T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2). The three largest
-x_i are left out, whatever their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number
-of image points within 2 s of point i: keypoints that lie together are one observation. So is the place of a clump: of
-log x_i, what is gained from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where
+T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2); at a scale s at
+which fewer poses can be told apart, the number of these (`log10_cells`). The three largest x_i are left out, whatever
+their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s
+of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where
 more points lie within 2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of
 (s, w) counts what was looked at. A prior reduces T to the share of the poses that it allows.
 
@@ -78,8 +78,9 @@ def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array, sca
 
 def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
     """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None."""
-    tests = log10_tests(sets)
-    none = np.array([max(tests + sets.log10_share(r, t), 0.0) for r, t in zip(rotations, translations, strict=True)])
+    tests, cells = log10_tests(sets), np.minimum(log10_cells(sets.image), log10_tests(sets))
+    share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
+    none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
     if len(sets.bearings) > FIXING:
         for k in range(len(none)):
@@ -88,7 +89,9 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
                 continue
             ratio = np.ones(len(sets.image.scales)) if scales is None else _ratio(sets.image, float(scales[k]))
             own, rough = _is_own(ratio), ratio >= ROUGH
-            evidence = _log_evidence(sets, seen, int(own.argmax()))
+            # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
+            fewer = np.maximum(cells + share[k], 0.0) - none[k]
+            evidence = _log_evidence(sets, seen, int(own.argmax())) - math.log(10) * fewer
             result.own[k] -= np.logaddexp.reduce(evidence[own]) / math.log(10)
             result.rough[k] -= np.logaddexp.reduce(evidence[rough], initial=-math.inf) / math.log(10)
     return result
@@ -102,6 +105,17 @@ def log10_tests(sets: PointSets) -> float:
         groups = label_groups(np.arange(m), sets.labels2d, sets.labels3d, n)
         choices = min(choices, float(math.comb(sum(len(rows) * len(columns) for rows, columns in groups), FIXING)))
     return math.log10(2 * max(choices, 1.0))
+
+
+def log10_cells(image: ImageStatistics) -> Array:
+    """log10 (S,) of the number of poses that differ at each scale s of an image: of cells of this width.
+
+    8 pi^2 (h / s)^3 of rotations about the middle of the scene, which move points h off it by s; A / s^2 places of the
+    middle in the view; and log(30) h / s distances of it, up to a factor of 30; h the spread of the bearings.
+    """
+    across = image.spread / image.scales
+    cells = 8 * math.pi**2 * across**4 * (image.solid_angle / image.scales**2) * math.log(30)
+    return np.asarray(np.log10(np.maximum(cells, 1.0)))
 
 
 def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array:
