@@ -17,9 +17,10 @@ at most 1 / b (Markov). From this follow
 T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2); at a scale s at
 which fewer poses can be told apart, the number of these (`log10_cells`). The three largest x_i are left out, whatever
 their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s
-of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where
-more points lie within 2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of
-(s, w) counts what was looked at. A prior reduces T to the share of the poses that it allows.
+of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained from
+one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where more points lie within 2 s'
+than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was looked at.
+A prior reduces T to the share of the poses that it allows.
 
 A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
 factor of two of it count; the terms from four times it on say how well a rougher alignment explains the image.
