@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.evidence.false_alarms import alarms_of, log10_false_alarms
+from bpnp.search.evidence.false_alarms import alarms_of, log10_cells, log10_false_alarms
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -66,15 +66,19 @@ def test_clumps_that_meet_are_no_more_evidence_than_their_middles(width: float) 
 
 @pytest.mark.parametrize("count", [5, 20, 200])
 def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
-    """A pose that was not chosen by the points has a product above b in at most one of b cases."""
+    """A pose that was not chosen by the points has a product above b in at most one of b cases.
+
+    The tests are those of three matches, or of the poses that differ at a scale where these are fewer.
+    """
     rng = np.random.default_rng(count)
-    log10_tests = math.log10(2 * math.comb(count, 3) ** 2 * 6)
+    matches = math.log10(2 * math.comb(count, 3) ** 2 * 6)
     products = []
     for _ in range(400):
         seen = scattered(rng, count, 0.4) * rng.uniform(4, 8, (count, 1))
         turn = Rotation.random(random_state=rng).as_matrix()
         sets = PointSets(scattered(rng, count, 0.25), seen @ turn)
-        products.append(log10_tests - log10_false_alarms(sets, turn, np.zeros(3)))
+        tests = np.minimum(log10_cells(sets.image), matches)
+        products.append(-np.log10(np.mean(10.0**-tests)) - log10_false_alarms(sets, turn, np.zeros(3)))
     for bound in (0.5, 1, 2):
         assert np.mean(np.array(products) > bound) <= 10**-bound
 
@@ -133,3 +137,14 @@ def test_a_prior_leaves_less_to_chance_where_the_pose_agrees_with_it() -> None:
 def test_residuals_below_the_floor_count_as_the_floor() -> None:
     rays, points, rotation = planted(np.random.default_rng(5), 6, 0.0)
     assert evidence(rays, points, rotation, 5e-3) > evidence(rays, points, rotation, 1e-4) + 3
+
+
+def test_the_poses_that_differ_at_a_scale_are_counted() -> None:
+    """Of random poses whose points are seen in this view, no more than one in a cell is a scale apart in each of six
+    numbers: at twice the scale there are 2^6 times fewer."""
+    sets = PointSets(scattered(np.random.default_rng(0), 300, 0.2), np.random.default_rng(1).normal(size=(300, 3)))
+    cells = log10_cells(sets.image)
+    np.testing.assert_allclose(np.diff(cells), -6 * np.diff(np.log10(sets.image.scales)))
+    at = np.interp(np.log10(0.01 * sets.image.spread), np.log10(sets.image.scales), cells)
+    view = sets.image.solid_angle / sets.image.spread**2
+    assert at == pytest.approx(math.log10(8 * math.pi**2 * view * math.log(30)) + 12, abs=0.01)
