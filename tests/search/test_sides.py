@@ -70,7 +70,6 @@ def scored(seed: int) -> tuple[PointSets, Array]:
 
 @pytest.mark.parametrize(("known", "seed"), [(wall, 1), (labelled, 0), (scored, 0)])
 def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(known, seed: int) -> None:
-    """In as many turns."""
     """In as many batches of starts, before any other source is asked."""
     sets, rotation = known(seed)
     informed = search_poses(sets, settings=DEFAULT.limited(9))
