@@ -25,8 +25,8 @@ from bpnp.datamodules.loader import ProblemDataset
 from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 
 EVERYTHING = 1e6

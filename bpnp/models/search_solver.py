@@ -10,9 +10,9 @@ from torch import Tensor, nn
 
 from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.refine import refine_poses
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.types import Batch, Pose, Prediction, SolveStats

@@ -124,8 +124,9 @@ def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
 
 
 def proposed(pool: Pool, proposals: Proposals) -> Candidates:
-    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits."""
-    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals()), hits=1), pool.sets.prior)
+    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits; no evidence, since
+    proposals depend on each other."""
+    poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals())), pool.sets.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
 
 

@@ -190,7 +190,7 @@ class Facing:
 
 @dataclass(frozen=True)
 class Evidence:
-    """When a pose is believed (`bpnp.search.evidence.verdict`). Logarithms to base 10.
+    """When a pose is believed (`bpnp.search.verdict`). Logarithms to base 10.
 
     false_alarms: of the number of false alarms, at most. It is a bound; on unrelated points an exhaustive search stayed
     above 1 in 999 of 1000 cases, and never came below 0.1.

@@ -12,7 +12,7 @@ from torch import nn
 
 from bpnp.loops.parallel import Deadline
 from bpnp.search.enumeration.search import is_crowd
-from bpnp.search.many import search_poses, search_proposed
+from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for

@@ -9,10 +9,10 @@ from planted import directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Schedule
 from bpnp.search.sources.cones import best_shifts, drawn_in_cones, shifted, within_cones
 from bpnp.search.sources.raster import raster_of

@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from bpnp.loops.parallel import Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import add_up
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT
 from bpnp.search.sources.multistart import cooled
 from bpnp.search.sources.raster import admitted, drawn_around, raster_of, search_near

@@ -12,9 +12,9 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.annealing import anneal_on_points
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.sides import visible_weights
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets, faces
 from bpnp.search.scene import Scene
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT
 
 Array = NDArray[np.float64]

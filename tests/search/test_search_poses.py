@@ -16,8 +16,8 @@ from bpnp.models import Search
 from bpnp.models.search_solver import best_poses, refine
 from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
-from bpnp.search.many import search_poses
 from bpnp.search.point_sets import PointSets
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.types import Batch
