@@ -124,8 +124,10 @@ def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
 
 
 def proposed(pool: Pool, proposals: Proposals) -> Candidates:
-    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits; no evidence, since
-    proposals depend on each other."""
+    """Distinct poses from those proposed, in the user's coordinates, that a prior of the user admits.
+
+    They have no hits, since proposals depend on each other.
+    """
     poses = admitted(pool.scene, Candidates.unscored(*pool.scene.enter(*proposals())), pool.sets.prior)
     return raster_search(pool.scene, poses, pool.scene.settings.proposed)
 

@@ -17,9 +17,12 @@ from bpnp.models.search_solver import best_poses, refine
 from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
+from bpnp.search.pool import Pool
+from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
+from bpnp.search.verdict import no_pose
 from bpnp.types import Batch
 
 
@@ -152,6 +155,9 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     assert off(search_poses(sets, settings=few)) > 10
     assert off(search_poses(sets, settings=few, proposals=lambda: (others, np.tile(translation, (200, 1))))) < 0.5
     assert search_poses(sets, proposals=pytest.fail).verdict == "confident"
+    empty = Pool(Scene(sets, 0, few), sets, no_pose("none yet"))
+    alike = schedule.proposed(empty, lambda: (np.tile(others[77], (50, 1, 1)), np.tile(translation, (50, 1))))
+    assert alike.hits.sum() == 0  # fifty alike are no evidence
 
 
 def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):

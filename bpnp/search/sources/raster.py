@@ -137,7 +137,8 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
     depth = np.linalg.norm(poses.rotation @ scene.bulk3d.mean(0) + poses.translation, axis=-1)
     shifts *= np.repeat(depth, copies)[:, None] * np.array([scene.spread, scene.spread, 1], np.float32)
     vectors[::copies], shifts[::copies] = 0, 0
-    return turned_about_middle(scene, poses.rotation, poses.translation, vectors, shifts, hits=1)
+    copied = turned_about_middle(scene, poses.rotation, poses.translation, vectors, shifts)
+    return replace(copied, hits=poses.hits.repeat(copies))
 
 
 def looked_up(
