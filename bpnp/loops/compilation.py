@@ -4,12 +4,15 @@ import gc
 import inspect
 import logging
 import os
+import time
 from collections.abc import Callable
 from typing import Any
 
 import numba
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
+
+from bpnp.loops.parallel import Clock
 
 # Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
@@ -63,11 +66,12 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 class _Compilation(event.Listener):
     """Logs one line when the first of this package's functions is compiled, for it takes seconds.
 
-    Meanwhile Python's collector of cycles rests, which would find nothing and take an eighth of the time, and
-    `shortcuts` are taken. numba compiles one function at a time, whatever the thread, and those that it calls within.
+    Meanwhile Python's collector of cycles rests, which would find nothing and take an eighth of the time, `shortcuts`
+    are taken, and the clock of deadlines stands still. numba compiles one function at a time, whatever the thread, and
+    those that it calls within.
     """
 
-    made, depth, collected = False, 0, False
+    made, depth, collected, begun = False, 0, False, 0.0
 
     def on_start(self, event: event.Event) -> None:
         if not _is_ours(event):
@@ -76,6 +80,7 @@ class _Compilation(event.Listener):
             self.made = True
             logging.getLogger(__name__).warning("compiling bpnp's loops, which takes some seconds once an installation")
         if not self.depth:
+            self.begun = time.monotonic()
             self.collected = gc.isenabled()
             gc.disable()
             if KNOWN:
@@ -86,6 +91,7 @@ class _Compilation(event.Listener):
         if _is_ours(event):
             self.depth -= 1
             if not self.depth:
+                Clock.compiling += time.monotonic() - self.begun
                 if KNOWN:
                     shortcuts.resolve_once(False)
                 if self.collected:

@@ -69,19 +69,30 @@ def _blas() -> ThreadpoolController:
 one_blas_thread = _OneBlasThread()
 
 
+class Clock:
+    """Seconds of `time.monotonic`, without those in which loops were compiled: that happens once an installation, and a
+    limit that a user sets is for what comes after. `bpnp.warm_up` compiles before."""
+
+    compiling = 0.0
+
+    @classmethod
+    def now(cls) -> float:
+        return time.monotonic() - cls.compiling
+
+
 @dataclass(frozen=True)
 class Deadline:
-    """When to stop, in seconds of `time.monotonic`. A stage that has begun ends what it is at and drops the rest."""
+    """When to stop, in seconds of `Clock`. A stage that has begun ends what it is at and drops the rest."""
 
     at: float = math.inf
 
     @classmethod
     def after(cls, seconds: float | None) -> "Deadline":
         """So many seconds from now; None: never."""
-        return cls() if seconds is None else cls(time.monotonic() + seconds)
+        return cls() if seconds is None else cls(Clock.now() + seconds)
 
     def passed(self) -> bool:
-        return time.monotonic() >= self.at
+        return Clock.now() >= self.at
 
 
 def in_time(work: Callable[[int, int], None], count: int, deadline: Deadline, at_once: int) -> int:

@@ -1,7 +1,6 @@
 """A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
 import math
-import time
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -17,7 +16,7 @@ from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape,
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
-from bpnp.loops.parallel import Deadline
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
 from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size, pixels_from
 from bpnp.maps.twins import Photo, without_twins
@@ -176,7 +175,7 @@ class SceneMap:
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
-        start, pixels, best = time.monotonic(), pixels_from(keypoints, camera), list[tuple[Region, Solution]]()
+        start, pixels, best = Clock.now(), pixels_from(keypoints, camera), list[tuple[Region, Solution]]()
         views = None if views is None else list(views)
         if time_limit is not None and not 0 < time_limit < math.inf:
             raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
@@ -191,7 +190,7 @@ class SceneMap:
 
         for settings in (BRIEF, LONGER):
             for region in regions:
-                remaining = None if time_limit is None else time_limit - (time.monotonic() - start)
+                remaining = None if time_limit is None else time_limit - (Clock.now() - start)
                 if over := over or (bool(best) and remaining is not None and remaining <= 0):
                     break
                 tries += 1
@@ -212,7 +211,7 @@ class SceneMap:
         if not best:
             raise ValueError("expected a map with views that see 4 or more points, got none")
         solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels, camera)
-        return replace(solution, seconds=time.monotonic() - start)
+        return replace(solution, seconds=Clock.now() - start)
 
     def localize_photo(
         self,

@@ -1,6 +1,5 @@
 """Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
 
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from bpnp.loops.parallel import Deadline
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_few
 from bpnp.solving.arguments import (
     Prior,
@@ -144,7 +143,7 @@ def solve_many(
     >>> [round(float(solution.translation[0]), 3) + 0.0 for solution in solve_many(images, scene)]
     [0.0, 1.0]
     """
-    begun = time.monotonic()
+    begun = Clock.now()
     sets2d = each_set("points2d", points2d, None)
     count = len(sets2d)
     seconds = positive("time_limit", SECONDS_OF_MANY if time_limit is None else time_limit)

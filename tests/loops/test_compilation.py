@@ -226,3 +226,17 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
     assert {"descend_on_clusters", "descend_on_points", "add_shifted", "add_up", "explore"} <= set(names)
     assert set(counts) == {"1"}
     assert used == warm
+
+
+def test_the_time_of_compilation_is_in_no_limit(tmp_path: Path) -> None:
+    """In an empty cache the first search compiles for seconds, and has a second left for itself."""
+    script = (
+        "import numpy as np, bpnp\n"
+        "scene = np.random.default_rng(0).normal(size=(300, 3))\n"
+        "camera = scene + [0, 0, 6]\n"
+        "print(bpnp.solve(camera[:, :2] / camera[:, 2:], scene, time_limit=1).verdict)\n"
+    )
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
+    assert "compiling" in result.stderr
+    assert result.stdout.strip() == "confident"

@@ -6,12 +6,12 @@ grow until the verdict is safe, every triple was tried, or the time is up.
 """
 
 import math
-import time
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 
+from bpnp.loops.parallel import Clock
 from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import Matches, Problem
 from bpnp.search.enumeration.points import (
@@ -158,14 +158,14 @@ class Enumeration:
     def sweep(self, most: int, deadline: float) -> None:
         """Solve `most` hypotheses, or fewer if the best pose becomes better, or half of the time to the deadline is
         over."""
-        start, stop = time.monotonic(), max(self.best + 1e-9, self.tests)
+        start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
         self._row, self._triangle, solved = explore(
             self._row, self._triangle, most, stop, 1.0, False, self._block, self.problem, self.kept, self.work
         )
         self.solved += solved
         if solved >= most:
-            self._pace = (time.monotonic() - start) / solved
+            self._pace = (Clock.now() - start) / solved
 
     def vary_best(self) -> None:
         """Refine the best pose again on wider and on other matches, and its mirror twin: its nearly flat matched points
@@ -216,7 +216,7 @@ def enumerate_poses(
     """Poses under which image points see scene points, one-to-one within `radius`.
 
     radius: radians, one for all or one for each bearing: the largest residual of a match, a few standard deviations of
-    the noise. deadline: of `time.monotonic`. is_safe: asked whether to stop, once the best pose exceeds chance and
+    the noise. deadline: of `Clock`. is_safe: asked whether to stop, once the best pose exceeds chance and
     every other pose; None for always. Where gravity is known, or the rotation to a few degrees, two matches fix a pose;
     where a whole pose is known, it is tried first.
 
@@ -262,7 +262,7 @@ def enumerate_poses(
     for stage in settings.stages:
         if stage.matches < run.fixing:
             continue
-        if run.seconds_to_begin(stage) > deadline - time.monotonic():
+        if run.seconds_to_begin(stage) > deadline - Clock.now():
             vary(late=True)
             return _poses(run, "interrupted")
         run.begin(stage)
@@ -270,7 +270,7 @@ def enumerate_poses(
             run.sweep(settings.look if run.best >= run.tests else settings.chunk, deadline)
             if (poses := enough()) is not None:
                 return poses
-            late = deadline - time.monotonic() < SHORTEST
+            late = deadline - Clock.now() < SHORTEST
             if late or run.solved > settings.most:
                 vary(late=late)
                 return _poses(run, "interrupted" if late else "most")
