@@ -12,7 +12,7 @@ from planted import plant
 from small_data import small_net
 
 from bpnp import solve
-from bpnp.loops.parallel import Deadline
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving import sources
 from bpnp.solving.networks import evaluation_copy
@@ -109,7 +109,7 @@ def test_the_time_limit_of_a_problem_counts_once(
     monkeypatch.setattr(sources, "pose_prior", ask)
     monkeypatch.setattr(sources, "search_poses", search)
     planted = plant(1, 30)
-    begun = time.monotonic()
+    begun = Clock.now()
     solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=limit)
     first, second = deadlines
     assert first is second
