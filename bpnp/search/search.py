@@ -64,6 +64,8 @@ def search_poses(
         return Scene(sets, seed, settings, deadline)
 
     crowd = is_crowd(sets)
+    if not crowd:
+        settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
     if is_few(sets) and not deadline.passed():
         few, exhausted = _enumerated(sets, entered, settings, deadline)
         tell(0)

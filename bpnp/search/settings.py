@@ -155,7 +155,9 @@ class Cones:
 class Schedule:
     """In which order starts are drawn, and how many (`bpnp.search.schedule`).
 
-    turns: at most. around: from a guess of the pose before all others. near: with a rough prior before it may be wrong.
+    turns: at most. enumerated: of points few enough to be enumerated, where that leaves a doubt; clusters hide nothing
+        of them, so that more turns end where these did. around: from a guess of the pose before all others. near: with a
+        rough prior before it may be wrong.
     patience: full batches that do not better the best log-likelihood by `better` nats a bearing before other sources
         are asked. between: batches between these. around_each: poses that raster searches are made around, no two
         turned by less than `apart_deg`, until `in_vain` of them better nothing. looks: in vain around a pose that
@@ -163,6 +165,7 @@ class Schedule:
     """
 
     turns: int = 96
+    enumerated: int = 12
     around: int = 4
     near: int = 12
     patience: float = 4.0

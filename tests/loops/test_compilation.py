@@ -229,14 +229,20 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
 
 
 def test_the_time_of_compilation_is_in_no_limit(tmp_path: Path) -> None:
-    """In an empty cache the first search compiles for seconds, and has a second left for itself."""
+    """The clock of deadlines stands still while a loop is compiled, and only then."""
     script = (
-        "import numpy as np, bpnp\n"
-        "scene = np.random.default_rng(0).normal(size=(300, 3))\n"
-        "camera = scene + [0, 0, 6]\n"
-        "print(bpnp.solve(camera[:, :2] / camera[:, 2:], scene, time_limit=1).verdict)\n"
+        "from bpnp.loops.parallel import Clock\n"
+        "from bpnp.search.kernels.neighbours import HashedPoints\n"
+        "import numpy as np\n"
+        "HashedPoints(np.eye(3), 0.1).count_on(np.eye(3), np.zeros((1, 3)), 1)\n"
+        "print(Clock.compiling)\n"
     )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment)
-    assert "compiling" in result.stderr
-    assert result.stdout.strip() == "confident"
+    seconds = []
+    for _ in range(2):
+        run = subprocess.run(
+            [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
+        )
+        seconds.append(float(run.stdout))
+    assert seconds[0] > 0.01
+    assert seconds[1] == 0
