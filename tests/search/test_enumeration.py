@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.loops.parallel import Clock
 from bpnp.robust.p3p import p3p as batched_p3p
 from bpnp.search.enumeration.minimal_solvers import chords_between, p2p, p3p
 from bpnp.search.enumeration.points import ImageSide, nearest_of, prior_arrays, scene_side, sets_within, triangles_of
@@ -338,7 +339,7 @@ def test_unrelated_points_have_no_margin() -> None:
 def test_the_deadline_ends_the_enumeration() -> None:
     rng = np.random.default_rng(10)
     rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (40, 2)), np.ones(40)]))
-    poses = solved(rays, rng.standard_normal((60, 3)), deadline=time.monotonic())
+    poses = solved(rays, rng.standard_normal((60, 3)), deadline=Clock.now())
     assert poses.ended == "interrupted"
     assert poses.solved < DEFAULT.most / 2
 
@@ -353,8 +354,8 @@ def test_a_short_deadline_is_kept(limit: float, normals: bool, monkeypatch: pyte
         points = directions(rng.standard_normal((count, 3)))
         rays = directions(np.column_stack([rng.uniform(-0.4, 0.4, (count, 2)), np.ones(count)]))
         for _ in range(5):
-            start = time.monotonic()
+            start = Clock.now()
             poses = solved(rays, points, normals3d=points if normals else None, deadline=start + limit)
-            late.append(time.monotonic() - start - limit)
+            late.append(Clock.now() - start - limit)
             assert poses.ended == "interrupted"
     assert np.median(late) < 2e-3  # with the checks of types in tests; 0.5 ms without
