@@ -156,8 +156,8 @@ class Schedule:
     """In which order starts are drawn, and how many (`bpnp.search.schedule`).
 
     turns: at most. enumerated: of points few enough to be enumerated, where that leaves a doubt; clusters hide nothing
-        of them, so that more turns end where these did. around: from a guess of the pose before all others. near: with a
-        rough prior before it may be wrong.
+        of them, so that more turns end where these did. around: from a guess of the pose, before all others. near: with
+        a rough prior before it may be wrong.
     patience: full batches that do not better the best log-likelihood by `better` nats a bearing before other sources
         are asked. between: batches between these. around_each: poses that raster searches are made around, no two
         turned by less than `apart_deg`, until `in_vain` of them better nothing. looks: in vain around a pose that
