@@ -88,13 +88,18 @@ def _sure(pool: Pool, batches: Iterator[tuple[Candidates, float]]) -> Iterator[C
     leaders, settings = pool.leaders(), pool.scene.settings
     hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
     if looks < settings.schedule.looks and near(hits, looks, rule) > far(hits, rule):
-        alarms, leader = pool.alarms, pool.leader
-        yield search_beside(pool.scene, leader, settings.beside)
-        if pool.alarms > alarms - rule.lead:
-            pool.looked_around(leader)
+        yield from _look(pool)
         return
     for found, _ in islice(batches, 1):
         yield found
+
+
+def _look(pool: Pool) -> Iterator[Candidates]:
+    """A raster search around the best pose; it was in vain where it does not make it much less likely by chance."""
+    alarms, leader, settings = pool.alarms, pool.leader, pool.scene.settings
+    yield search_beside(pool.scene, leader, settings.beside)
+    if pool.alarms > alarms - settings.evidence.lead:
+        pool.looked_around(leader)
 
 
 def _batches(pool: Pool, known: Prior | None) -> Iterator[tuple[Candidates, float]]:
@@ -135,10 +140,8 @@ def proposed(pool: Pool, proposals: Proposals) -> Candidates:
 def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
     """Proposed poses and nothing else, but what is around them."""
     yield from _with_surroundings(pool, proposed(pool, proposals))
-    while pool.alarms < 0:
-        yield from _sure(pool, iter(()))
-        if pool.looks(pool.leaders()) >= pool.scene.settings.schedule.looks:
-            return
+    while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:
+        yield from _look(pool)
 
 
 def without_hits(found: Candidates) -> Candidates:

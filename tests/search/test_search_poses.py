@@ -19,7 +19,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
-from bpnp.search.search import search_poses
+from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.search.verdict import no_pose
@@ -137,6 +137,18 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
     assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
+
+
+def test_a_search_of_proposals_alone_ends_where_they_leave_a_doubt():
+    """A pose among repeated points, whose matches are no evidence of each other: after its looks nothing is left."""
+    grid = np.stack(np.meshgrid(*3 * [np.arange(4.0)]), -1).reshape(-1, 3)
+    shift, ended = np.array([-1.5, -1.5, 9.0]), []
+    sets = PointSets(directions(grid + shift), grid)
+    few = DEFAULT.limited(20)
+    for least in (few.evidence.missed, -1000.0):  # the latter is never reached
+        rule = replace(few, evidence=replace(few.evidence, missed=least))
+        ended.append(search_proposed(sets, lambda: (np.eye(3)[None], shift[None]), settings=rule).batches)
+    assert max(ended) < 20
 
 
 def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
