@@ -17,7 +17,7 @@ from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.loops.parallel import Deadline, one_blas_thread
 from bpnp.maps.localize import Region, problem_near
 from bpnp.maps.views import Array
-from bpnp.search.annealing import finish
+from bpnp.search.annealing import polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
@@ -82,10 +82,7 @@ def rivals_of(photo: Photo, solution: Solution, met: Sequence[Solution]) -> list
     if not others.any():
         return []
     scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
-    starts = Candidates.unscored(*scene.enter(rotations[others], translations[others]))
-    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
-    ends = finish(scene, starts)  # none after the deadline
-    ends = in_user_frame(ends if len(ends) else starts, scene)
+    ends = polished(scene, rotations[others], translations[others], scale)
     ends = ends[different(ends.rotation, ends.translation)]
     twins = ends.rotation, ends.translation
     behind = decades_behind(sets, best, twins, twins, scale)

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import in_time
-from bpnp.search.candidates import Candidates, best_distinct
+from bpnp.search.candidates import Candidates, best_distinct, in_user_frame
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene, Sides
@@ -126,5 +127,16 @@ def finish(scene: Scene, poses: Candidates, annealed: int | None = None) -> Cand
             break
         first_scale = settings.end_scale * float(poses.scale[i])
         end = anneal_on_points(scene, poses[i : i + 1], first_scale, outliers=share, every=True)
-        ends.append(end if len(ends) < count else replace(end, hits=np.zeros_like(end.hits)))
+        ends.append(end if len(ends) < count else end.without_hits())
     return best_distinct(Candidates.concatenated([*ends, poses[min(len(ends), count) :]]), scene, settings.kept)
+
+
+def polished(
+    scene: Scene, rotations: NDArray[np.float64], translations: NDArray[np.float64], scale: float
+) -> Candidates:
+    """Poses (c, 3, 3), (c, 3) of the user with residuals of `scale`, radians, annealed to the end on all points, in the
+    user's frame; as they were after the deadline."""
+    starts = Candidates.unscored(*scene.enter(rotations, translations))
+    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
+    ends = finish(scene, starts)  # none after the deadline
+    return in_user_frame(ends if len(ends) else starts, scene)

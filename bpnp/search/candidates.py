@@ -62,6 +62,10 @@ class Candidates:
         exceeds = self.log10_false_alarms < 0  # not NaN
         return np.where(exceeds, EXCEEDS - self.log10_false_alarms, self.score)
 
+    def without_hits(self) -> "Candidates":
+        """These poses, of starts that were not independent."""
+        return replace(self, hits=np.zeros_like(self.hits))
+
     def __len__(self) -> int:
         return len(self.rotation)
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose
-from bpnp.search.annealing import finish
+from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
@@ -120,7 +120,7 @@ class Pool:
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and sets.prior is not None:  # of a pose before and after, that which chance explains less
             ends = self._weighed(ends)
-            before = replace(self.candidates, hits=np.zeros_like(self.candidates.hits))
+            before = self.candidates.without_hits()
             ends = best_distinct(Candidates.concatenated([ends, before]), scene, scene.settings.kept)
         leaders = weighed(in_user_frame(ends, scene), sets, rule)
         looks = self.looks(leaders)
@@ -147,11 +147,7 @@ def against_repetitions(
     repeated, compared = repeated_poses(sets, *best, scale, rule)
     if not len(repeated[0]):
         return result
-    scene = entered()
-    starts = Candidates.unscored(*scene.enter(*repeated))
-    starts = replace(starts, scale=np.full(len(starts), scale, np.float32))
-    ends = finish(scene, starts)  # none after the deadline
-    rivals = with_false_alarms(in_user_frame(ends if len(ends) else starts, scene), sets)
+    rivals = with_false_alarms(polished(entered(), *repeated, scale), sets)
     behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
     behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)

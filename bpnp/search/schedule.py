@@ -13,7 +13,6 @@ Every turn draws starts, screens them, anneals the best, and gives distinct pose
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import replace
 from itertools import count, islice
 
 import numpy as np
@@ -36,11 +35,11 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
     if guess is not None:
         for number in range(settings.schedule.around):
-            yield without_hits(multistart(scene, number, guess, pool.candidates)[0])
+            yield multistart(scene, number, guess, pool.candidates)[0].without_hits()
     if isinstance(known, PosePrior) and is_near(scene, known):
         yield from islice(_near(pool, known, proposals), settings.schedule.near)
         while pool.alarms < 0:
-            yield from _sure(pool, ((found, 1.0) for found in _near(pool, known, None)))
+            yield from _sure(pool, _near(pool, known, None))
         # The prior may be wrong: what was found near it would only be in the way.
         pool.forget()
         known = None
@@ -69,7 +68,7 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
         best, since = (score, 0.0) if score >= best + settings.schedule.better else (best, since + share)
     for number in count():
         if pool.alarms < 0:
-            yield from _sure(pool, batches)
+            yield from _sure(pool, (found for found, _ in batches))
             continue
         yield from _beside(pool, pool.rotations)
         if rules:
@@ -83,15 +82,14 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
                 yield found
 
 
-def _sure(pool: Pool, batches: Iterator[tuple[Candidates, float]]) -> Iterator[Candidates]:
+def _sure(pool: Pool, batches: Iterator[Candidates]) -> Iterator[Candidates]:
     """What excludes the likelier case: a raster search around the best pose, or another batch of starts."""
     leaders, settings = pool.leaders(), pool.scene.settings
     hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
     if looks < settings.schedule.looks and near(hits, looks, rule) > far(hits, rule):
         yield from _look(pool)
-        return
-    for found, _ in islice(batches, 1):
-        yield found
+    else:
+        yield next(batches)
 
 
 def _look(pool: Pool) -> Iterator[Candidates]:
@@ -142,8 +140,3 @@ def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
     yield from _with_surroundings(pool, proposed(pool, proposals))
     while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:
         yield from _look(pool)
-
-
-def without_hits(found: Candidates) -> Candidates:
-    """Poses whose starts were not independent."""
-    return replace(found, hits=np.zeros_like(found.hits))

@@ -86,8 +86,7 @@ def search_beside(scene: Scene, pose: Candidates, rule: RasterSearch) -> Candida
     """Distinct poses around one, as far as the rule's widest prior reaches; they have no hits."""
     prior = PosePrior(pose.rotation[0], pose.translation[0], rule.draws.wide_deg)
     sigma = rule.draws.wide_shift * distance_of(scene, prior)
-    found = search_near(scene, prior._replace(translation_sigma=sigma), rule)
-    return replace(found, hits=np.zeros_like(found.hits))
+    return search_near(scene, prior._replace(translation_sigma=sigma), rule).without_hits()
 
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
