@@ -2,8 +2,10 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 RUN := runs/quickstart
+# Percent of lines and branches that the tests run; compiled loops are not counted.
+FLOOR := 88
 
-.PHONY: quickstart test lint docs wheel install clean
+.PHONY: quickstart check test coverage results lint docs wheel install clean
 
 install: $(VENV)/.installed
 
@@ -24,8 +26,17 @@ lint: install
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 
+check: lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -m "not slow"
+
 test: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -rs
+
+coverage: lint
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 -rs --cov --cov-report=term --cov-fail-under=$(FLOOR)
+
+results: install
+	$(BIN)/python -m benchmarks results --quick --check
 
 docs: install
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'

@@ -1,6 +1,8 @@
-"""The page in headless Chromium. Skipped where selenium (the extra `browser`), chromium or its driver is absent."""
+"""The page in headless Chromium. Skipped where selenium (the extra `browser`), Chromium or its driver is absent,
+unless BPNP_REQUIRE_BROWSER is set."""
 
 import json
+import os
 import re
 import shutil
 from collections.abc import Callable, Iterator
@@ -18,7 +20,9 @@ from bpnp.report.photos import box_of
 from bpnp.report.points import thin, write_points
 from bpnp.report.terminal import number
 
-pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
+REQUIRED = bool(os.environ.get("BPNP_REQUIRE_BROWSER"))
+if not REQUIRED:
+    pytest.importorskip("selenium", reason="needs selenium; try: pip install bpnp[browser]")
 FLAGS = (
     "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
     "--enable-unsafe-swiftshader",
@@ -32,9 +36,11 @@ COUNT = 80
 def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
     from selenium import webdriver
 
-    paths = [shutil.which(name) for name in ("chromium", "chromedriver")]
+    paths = [shutil.which("chromium") or shutil.which("google-chrome"), shutil.which("chromedriver")]
     if None in paths:
-        pytest.skip("needs chromium and chromedriver; on Debian: apt-get install chromium chromium-driver")
+        (pytest.fail if REQUIRED else pytest.skip)(
+            "needs chromium and chromedriver; on Debian: apt-get install chromium chromium-driver"
+        )
     options = webdriver.ChromeOptions()
     options.binary_location = paths[0]
     for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
