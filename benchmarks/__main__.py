@@ -1,42 +1,38 @@
-"""All benchmarks of the layers on a CPU, in one command.
+"""`python -m benchmarks` lists what can be measured; `python -m benchmarks NAME --help` tells the options of one."""
 
-    python benchmarks [--quick]
-    python benchmarks --against REV: this tree beside an older commit (`against.py`)
-
-Prints the tables of the layers against the paper's method, of time and memory by size, and of RANSAC's backends, and
-writes them with their plots to benchmarks/results/<machine kind>.json, scaling-<...>.json and ransac-<...>.json.
-"""
-
-import argparse
+import ast
+import runpy
 import sys
 from pathlib import Path
 
-import against
-import bench_layers
-import bench_ransac
-import bench_scaling
-from timing import machine, restart_with_settings
+FOLDER = Path(__file__).parent
 
-RESULTS = Path(__file__).parent / "results"
+
+def programs() -> dict[str, tuple[Path, str]]:
+    """Name, file and first sentence of every module that has a `main`."""
+    found = {}
+    for file in sorted(FOLDER.glob("*.py")):
+        tree = ast.parse(file.read_text(encoding="utf-8"))
+        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body) and file.stem[0] != "_":
+            sentence = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
+            found[file.stem.removeprefix("bench_")] = file, sentence
+    return found
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small problems, to see that it works")
-    parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the files")
-    options = parser.parse_args()
-    kind, folder = machine()["kind"], options.results
-    layers, scaling, ransac = (folder / f"{name}{kind}.json" for name in ("", "scaling-", "ransac-"))
-    bench_layers.main(["--out", str(layers), *(["--quick"] if options.quick else ["--rounds", "3"])])
-    sizes = ["--sizes", "250", "500"] if options.quick else []
-    bench_scaling.main(["--out", str(scaling), *sizes])
-    problems = ["--problems", "2"] if options.quick else []
-    bench_ransac.main(["--json", str(ransac), *problems])
+    known = programs()
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name not in known:
+        width = max(map(len, known))
+        print("python -m benchmarks NAME [OPTION...]\n")
+        print("\n".join(f"  {key:{width}}  {sentence}" for key, (_, sentence) in known.items()))
+        if name and not name.startswith("-"):
+            raise SystemExit(f"\nexpected a name of this list, got {name!r}")
+        return
+    sys.path.insert(0, str(FOLDER))
+    sys.argv = [f"python -m benchmarks {name}", *sys.argv[2:]]
+    runpy.run_path(str(known[name][0]), run_name="__main__")
 
 
 if __name__ == "__main__":
-    if any(argument.startswith("--against") for argument in sys.argv):
-        against.main()
-    else:
-        restart_with_settings()
-        main()
+    main()

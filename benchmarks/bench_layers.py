@@ -1,86 +1,106 @@
-"""The layers against the paper's method (`paper_layers.py`), on the same inputs in the same run.
+"""The layers and a training step against the paper's method (`paper_layers.py`), on the same inputs in the same run.
 
-    python benchmarks/bench_layers.py [--quick] [--out benchmarks/results/cpu-2core.json]
+    python -m benchmarks layers [--points 200 --rounds 3] [--threads 1]
 
-Prints a table and writes it, with the machine and a plot of the ratios, to benchmarks/results/<machine kind>.json and
-.png. Ours and the paper's take turns; times are medians over the rounds, ratios medians of the rounds' ratios, with
-quartiles. Errors are against float64 (`exact.py`). Inputs (`problems.py`) are told by the kind of the features and the
-share of the assignment on the true pairs.
-
-Where other programs run beside it, compare the ratios of processor times.
+Ours and the paper's take turns; times are medians over the rounds, ratios medians of the rounds' ratios. Compare the
+ratios of processor time where other programs run beside it. Inputs (`problems.py`) are told by the kind of the features
+and the share of the assignment on the true matches.
 """
 
-import argparse
-from collections.abc import Sequence
+from collections.abc import Iterator
+from copy import deepcopy
 from dataclasses import asdict
-from pathlib import Path
+from functools import partial
 
-import matplotlib.pyplot as plt
+import roma
 import torch
-from layer_rows import Row, Size, all_rows
+from paper_layers import SINKHORN_TOLERANCE, pnp_backward, pnp_forward, sinkhorn_backward, sinkhorn_forward
+from problems import Kind, diagonal_mass, planted, planted_network
+from record import parser, write
 from rich.console import Console
 from rich.table import Table
-from timing import Spread, machine, restart_with_settings, write_json
+from steps import training_step
+from timing import Race, race, restart_with_settings
+from torch import Tensor
 
-RESULTS = Path(__file__).parent / "results"
-COLUMNS = ("what", "inputs", "B", "ours ms", "paper's ms", "ratio", "CPU ratio", "target", "error", "paper's error")
+from bpnp.geometry import bearings
+from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 
-
-def show(rows: Sequence[Row], title: str) -> None:
-    table = Table(*COLUMNS, title=title)
-    for row in rows:
-        race = row.race
-        table.add_row(
-            row.what, row.inputs, str(row.batch), _spread(race.ours.wall), _spread(race.baseline.wall),
-            _spread(race.ratio), f"{race.cpu_ratio.median:.3g}", row.target, row.figure, row.paper_figure,
-        )  # fmt: skip
-    Console(width=None if Console().is_terminal else 170).print(table)
-
-
-def _spread(value: Spread) -> str:
-    return f"{value.median:.3g} ({value.low:.3g}-{value.high:.3g})"
+MU, MANY = 0.1, 10_000
+FORWARD: tuple[tuple[Kind, float, float, float, int], ...] = (
+    # kind, level, clutter, mu, iterations of the paper's method (to its tolerance of 1e-9 where they are many)
+    ("independent", 0.7, 0.0, MU, 100),
+    ("smooth", 3, 0.0, MU, 100),
+    ("smooth", 10, 0.0, MU, 100),
+    ("smooth", 3, 0.0, MU, MANY),
+    ("smooth", 10, 0.0, 0.01, 100),
+)
+BACKWARD: tuple[tuple[Kind, float], ...] = (("independent", 0.7), ("smooth", 3), ("smooth", 10))
 
 
-def save_plot(rows: Sequence[Row], path: Path) -> None:
-    """Ratio of every row with its quartiles, on a logarithmic axis."""
-    figure, axes = plt.subplots(figsize=(12, 0.4 * len(rows) + 1), layout="constrained")
-    ratios = [row.race.ratio for row in rows]
-    medians = [ratio.median for ratio in ratios]
-    axes.barh([f"{row.what}, {row.inputs}, B={row.batch}" for row in rows], medians, color="tab:blue")
-    spread = [[r.median - r.low for r in ratios], [r.high - r.median for r in ratios]]
-    axes.errorbar(medians, range(len(rows)), xerr=spread, fmt="none", ecolor="black", capsize=2)
-    axes.axvline(1, color="black", linewidth=0.8)
-    axes.set(xscale="log", xlabel="times faster than the paper's method")
-    axes.invert_yaxis()
-    figure.savefig(path, dpi=80, bbox_inches="tight")
-    plt.close(figure)
+def rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:
+    """What, on which inputs, and its race."""
+    yield from pnp_rows(points, batch, rounds)
+    for kind, level, clutter, mu, iterations in FORWARD:
+        cost = planted(batch, points, kind=kind, level=level, clutter=clutter).cost
+        ours, tolerance = partial(sinkhorn, cost, mu=mu), SINKHORN_TOLERANCE if iterations == MANY else 0
+        papers = partial(sinkhorn_forward, cost, mu=mu, iterations=iterations, tolerance=tolerance)
+        ends = "to its tolerance" if tolerance else f"{iterations} iterations"
+        inputs = f"{kind}, {diagonal_mass(ours()[0]):.0%}"
+        yield f"Sinkhorn forward, mu {mu}, the paper's {ends}", inputs, race(ours, papers, rounds=rounds)
+    for kind, level in BACKWARD:
+        cost = planted(batch, points, kind=kind, level=level).cost.requires_grad_()
+        plan = sinkhorn(cost, mu=MU)[0]
+        by_loss = 1 - 2 * torch.eye(points).expand_as(plan)
+        back = partial(torch.autograd.grad, plan, cost, by_loss, retain_graph=True)
+        papers = partial(sinkhorn_backward, plan.detach(), by_loss, mu=MU)
+        yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", race(back, papers, rounds=rounds)
+    problem = planted(batch, points, kind="smooth", level=10)
+    net = planted_network(problem)
+    for poses, what in ((False, "correspondence loss"), (True, "with pose loss")):
+        steps = [training_step(deepcopy(net), problem.batch, poses=poses, paper=paper) for paper in (False, True)]
+        yield f"training step, {what}", "smooth", race(*steps, rounds=rounds)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="200 points and 3 rounds, to see that it works")
-    parser.add_argument("--out", type=Path, help="JSON file; the plot lies beside it")
-    parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--points", type=int, help="on each side (default 1000)")
-    parser.add_argument("--rounds", type=int, help="timings of each side in a row (default 7)")
-    parser.add_argument("--batches", type=int, nargs=2, help="batch sizes (default 4 16)")
-    options = parser.parse_args(arguments)
-    torch.set_num_threads(options.threads)
-    points, rounds, batches = (200, 3, (2, 4)) if options.quick else (1000, 7, (4, 16))
-    size = Size(options.points or points, options.rounds or rounds, tuple(options.batches or batches))
-    before = machine()
-    rows = []
-    console = Console(stderr=True)
-    for row in all_rows(size):
-        rows.append(row)
-        console.print(f"{row.what}, {row.inputs}, B={row.batch}: {row.race.ratio.median:.3g}x")
-    title = f"{size.points} points, {size.rounds} rounds, {before['cpu']}, {before['threads']} threads"
-    show(rows, title)
-    out = options.out or RESULTS / f"{before['kind']}.json"
-    busy = {"load_average_before": before.pop("load_average"), "load_average_after": machine()["load_average"]}
-    write_json(out, {"machine": before | busy, "size": asdict(size), "rows": [asdict(row) for row in rows]})
-    save_plot(rows, out.with_suffix(".png"))
-    console.print(f"written to {out} and {out.with_suffix('.png')}")
+def pnp_rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:
+    problem = planted(batch, points, kind="smooth", level=10)
+    plan, rays, points3d = sinkhorn(problem.cost)[0], bearings(problem.batch.points2d), problem.batch.points3d
+    start = ransac_pnp(plan, problem.batch.points2d, points3d)[:2]
+    inputs, vector = f"smooth, {diagonal_mass(plan):.0%}", torch.cat([roma.rotmat_to_rotvec(start[0]), start[1]], -1)
+    ours = partial(weighted_pnp, plan, rays, points3d, *start)
+    papers = partial(pnp_forward, *(x.double() for x in (plan, rays, points3d, vector)))
+    yield "PnP forward, from RANSAC", inputs, race(ours, papers, rounds=rounds)
+
+    leaf = plan.clone().requires_grad_()
+    solved = weighted_pnp(leaf, rays, points3d, *start)[:2]
+    incoming = [noise(x.shape, seed) for seed, x in enumerate(solved)]
+    pose = torch.cat([roma.rotmat_to_rotvec(solved[0]), solved[1]], -1).detach().requires_grad_()
+    through = (roma.rotvec_to_rotmat(pose[:, :3]) * incoming[0]).sum() + (pose[:, 3:] * incoming[1]).sum()
+    back = partial(torch.autograd.grad, solved, leaf, incoming, retain_graph=True)
+    papers_back = partial(pnp_backward, pose, plan, rays, points3d, torch.autograd.grad(through, pose)[0])
+    yield "PnP backward", inputs, race(back, papers_back, rounds=rounds)
+
+
+def noise(shape: torch.Size, seed: int) -> Tensor:
+    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--points", type=int, default=1000, help="on each side (default: 1000)")
+    options.add_argument("--rounds", type=int, default=7, help="timings of each side in a row (default: 7)")
+    options.add_argument("--batch", type=int, default=4, help="problems in a batch (default: 4)")
+    options.add_argument("--threads", type=int, default=1)
+    chosen = options.parse_args()
+    torch.set_num_threads(chosen.threads)
+    table, found = Table("what", "inputs", "ours, CPU ms", "paper's, CPU ms", "ratio"), []
+    for what, inputs, result in rows(chosen.points, chosen.batch, chosen.rounds):
+        milliseconds = (f"{side.cpu.median:.3g}" for side in (result.ours, result.baseline))
+        table.add_row(what, inputs, *milliseconds, f"{result.cpu_ratio.median:.3g}")
+        found.append({"what": what, "inputs": inputs, "race": asdict(result)})
+    Console(width=None if Console().is_terminal else 120).print(table)
+    if chosen.output:
+        write(chosen.output, {"points": chosen.points, "batch": chosen.batch, "rows": found})
 
 
 if __name__ == "__main__":

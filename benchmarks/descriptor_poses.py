@@ -2,6 +2,8 @@
 
 from collections.abc import Iterable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import poselib
@@ -30,7 +32,7 @@ class DescribedMap:
             seen = image.point_ids >= 0
             self._views[image.name] = descriptors[seen], image.point_ids[seen]
 
-    def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> tuple[Array, Array, str]:
+    def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
         """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""
         pixels, own = self._features(photo)
         theirs, ids = zip(*(self._views[name] for name in views or self._views), strict=True)
@@ -41,7 +43,7 @@ class DescribedMap:
             {"max_reproj_error": THRESHOLD_PX, "seed": 0}, {},
         )  # fmt: skip
         verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
-        return np.asarray(pose.R), np.asarray(pose.t), verdict
+        return SimpleNamespace(rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict)
 
     def _features(self, photo: str) -> tuple[Array, NDArray[np.float32]]:
         """Keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""

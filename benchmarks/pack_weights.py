@@ -1,4 +1,4 @@
-"""How the weights of the package are made: `python benchmarks/pack_weights.py CHECKPOINT OUT`."""
+"""How the weights of the package are made of a checkpoint: `python -m benchmarks pack_weights CHECKPOINT OUT`."""
 
 import argparse
 from collections.abc import Sequence

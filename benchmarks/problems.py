@@ -66,7 +66,7 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float
 
 def diagonal_mass(assignment: Tensor) -> float:
     """Share of the assignment on the true pairs, the mean over the batch."""
-    return float(assignment.diagonal(dim1=-2, dim2=-1).sum(-1).mean())
+    return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
 
 
 def planted_network(problem: Problem, *, autocast: torch.dtype | None = None) -> BPnPNet:

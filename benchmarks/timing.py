@@ -1,17 +1,12 @@
-"""How the benchmarks measure: candidates take turns in one process, and what was measured is kept with its machine."""
+"""How the layers are timed: candidates take turns in one process."""
 
-import json
 import os
-import platform
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 
 import numpy as np
-import torch
 
 from bpnp.cli import keep_freed_memory
 
@@ -99,31 +94,3 @@ def restart_with_settings() -> None:
     if not settings.keys() <= os.environ.keys():
         os.execve(sys.executable, sys.orig_argv, settings | dict(os.environ))
     keep_freed_memory()
-
-
-def machine() -> dict[str, Any]:
-    """What the figures were measured on, and how busy it was."""
-    return {
-        "kind": f"cpu-{os.cpu_count()}core",
-        "cpu": _cpu_model(),
-        "cores": os.cpu_count(),
-        "threads": torch.get_num_threads(),
-        "wait_policy": os.environ.get("OMP_WAIT_POLICY", "default"),
-        "load_average": [round(x, 2) for x in os.getloadavg()],
-        "torch": torch.__version__,
-        "python": platform.python_version(),
-    }
-
-
-def _cpu_model() -> str:
-    information = Path("/proc/cpuinfo")
-    lines = information.read_text().splitlines() if information.exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return names[0] if names else platform.processor()
-
-
-def write_json(path: Path, record: dict[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_suffix(".partial")
-    temporary.write_text(json.dumps(record, indent=1, allow_nan=False) + "\n")
-    os.replace(temporary, path)

@@ -2,6 +2,7 @@
 
 import importlib
 import json
+import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
@@ -21,21 +22,21 @@ from bpnp.geometry import bearings, project, rotation_angle, transform
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 from bpnp.maps.views import View
 
-FOLDER = Path(__file__).parents[1] / "benchmarks"
+ROOT = Path(__file__).parents[1]
 MODULES = (
-    "bench_constellation", "bench_layers", "bench_scaling", "descriptor_poses", "exact", "gpu", "layer_rows",
-    "paper_layers", "problems", "rebuilt_maps", "steps", "timing",
+    "bench_constellation", "bench_layers", "bench_search", "descriptor_poses", "gpu", "paper_layers", "problems",
+    "rebuilt_maps", "results", "steps", "timing",
 )  # fmt: skip
 
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[SimpleNamespace]:
     """The scripts' modules, which import each other as they do when one of them is run."""
-    sys.path.insert(0, str(FOLDER))
+    sys.path.insert(0, str(ROOT / "benchmarks"))
     threads = torch.get_num_threads()
     yield SimpleNamespace(**{name: importlib.import_module(name) for name in MODULES})
     torch.set_num_threads(threads)
-    sys.path.remove(str(FOLDER))
+    sys.path.remove(str(ROOT / "benchmarks"))
 
 
 @pytest.fixture(scope="module")
@@ -80,11 +81,8 @@ def test_paper_sinkhorn_has_the_optimum_and_its_gradient(bench: SimpleNamespace,
     incoming, direction, step = noise(*plan.shape), noise(*plan.shape, seed=1), 1e-6
     moved = [sinkhorn(problem.cost + sign * step * direction, tolerance=1e-13)[0] for sign in (1, -1)]
     slope = float(((moved[0] - moved[1]) * incoming).sum() / (2 * step))
-    for gradient in (
-        bench.paper_layers.sinkhorn_backward(plan, incoming),
-        bench.exact.plan_gradient(plan, incoming, 0.1),
-    ):
-        assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-6)
+    gradient = bench.paper_layers.sinkhorn_backward(plan, incoming)
+    assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-6)
 
 
 def test_block_inverse_without_a_factor_is_no_number(bench: SimpleNamespace) -> None:
@@ -92,34 +90,25 @@ def test_block_inverse_without_a_factor_is_no_number(bench: SimpleNamespace) -> 
     assert bench.paper_layers.sinkhorn_backward(plan, torch.ones(1, 4, 4)).isnan().any()
 
 
-def test_exact_optimum_is_that_of_the_layer(bench: SimpleNamespace, problem: SimpleNamespace) -> None:
-    optimum = bench.exact.pnp_optimum(problem.plan, problem.rays, problem.batch.points3d, problem.start)
-    rotation, translation, stats = weighted_pnp(
-        problem.plan, problem.rays, problem.batch.points3d, *problem.pose, tolerance=1e-11
-    )
-    assert stats.converged.all()
-    assert rotation_angle(rotation, optimum.rotation).max() < 1e-8
-    assert (translation - optimum.translation).abs().max() < 1e-7
-    pose = bench.paper_layers.pnp_forward(problem.plan, problem.rays, problem.batch.points3d, problem.start)
-    assert (pose - optimum.pose).abs().max() < 1e-5
-
-
-def test_gradients_of_the_pose_agree(bench: SimpleNamespace, problem: SimpleNamespace) -> None:
+def test_the_papers_pose_and_its_gradient_are_those_of_the_layer(
+    bench: SimpleNamespace, problem: SimpleNamespace
+) -> None:
+    """Both by other means: L-BFGS and Lemma 1 with the Hessian from automatic differentiation."""
     points3d, rays = problem.batch.points3d, problem.rays
-    optimum = bench.exact.pnp_optimum(problem.plan, rays, points3d, problem.start)
-    by_rotation, by_translation = noise(2, 3, 3), noise(2, 3, seed=1)
-    exact = bench.exact.pnp_gradient(optimum, problem.plan, rays, points3d, by_rotation, by_translation)
-
     plan = problem.plan.clone().requires_grad_()
-    rotation, translation, _ = weighted_pnp(plan, rays, points3d, *problem.pose)
-    ours = torch.autograd.grad((rotation, translation), plan, (by_rotation, by_translation))[0]
-    assert bench.exact.relative_error(ours, exact) < 1e-7
+    rotation, translation, stats = weighted_pnp(plan, rays, points3d, *problem.pose, tolerance=1e-11)
+    assert stats.converged.all()
+    pose = bench.paper_layers.pnp_forward(problem.plan, rays, points3d, problem.start)
+    assert rotation_angle(rotation, roma.rotvec_to_rotmat(pose[:, :3])).max() < 1e-5
+    assert (translation - pose[:, 3:]).abs().max() < 1e-5
 
-    pose = optimum.pose.clone().requires_grad_()
-    through = (roma.rotvec_to_rotmat(pose[:, :3]) * by_rotation).sum() + (pose[:, 3:] * by_translation).sum()
-    (incoming,) = torch.autograd.grad(through, pose)
-    papers = bench.paper_layers.pnp_backward(pose, problem.plan, rays, points3d, incoming)
-    assert bench.exact.relative_error(papers, exact) < 1e-9
+    by_rotation, by_translation = noise(2, 3, 3), noise(2, 3, seed=1)
+    ours = torch.autograd.grad((rotation, translation), plan, (by_rotation, by_translation))[0]
+    optimum = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1).detach().requires_grad_()
+    through = (roma.rotvec_to_rotmat(optimum[:, :3]) * by_rotation).sum() + (optimum[:, 3:] * by_translation).sum()
+    (incoming,) = torch.autograd.grad(through, optimum)
+    papers = bench.paper_layers.pnp_backward(optimum, problem.plan, rays, points3d, incoming)
+    assert float((ours - papers).norm() / papers.norm()) < 1e-7
 
 
 def test_paper_ransac_finds_the_pose(bench: SimpleNamespace) -> None:
@@ -145,61 +134,29 @@ def test_both_networks_learn_the_same(bench: SimpleNamespace, poses: bool) -> No
     assert (gradients[0] - gradients[1]).norm() < 1e-4 * gradients[0].norm()
 
 
-def test_layers_command_writes_what_it_measured(bench: SimpleNamespace, tmp_path: Path) -> None:
-    out = tmp_path / "new" / "result.json"
-    bench.bench_layers.main(
-        ["--points", "40", "--rounds", "1", "--batches", "2", "3", "--threads", "1", "--out", str(out)]
-    )
-    record = json.loads(out.read_text())
-    assert record["machine"]["threads"] == 1
-    assert record["size"] == {"points": 40, "rounds": 1, "batches": [2, 3]}
-    assert {row["what"].split(" from")[0].split(",")[0] for row in record["rows"]} == {
-        "PnP forward", "PnP backward", "Sinkhorn forward", "Sinkhorn backward", "training step"
-    }  # fmt: skip
-    underflown = [row["paper_figure"] for row in record["rows"] if "clutter" in row["inputs"]]
-    assert underflown == ["100% NaN"]
-    assert 0 < out.with_suffix(".png").stat().st_size < 100_000
-
-
-def test_scaling_command_writes_what_it_measured(
+def test_layers_command_writes_what_it_measured(
     bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    here = bench.bench_scaling
-    monkeypatch.setattr(here, "in_its_own_process", lambda points, *, poses, threads: here.measure(points, poses=poses))
-    here.main(["--sizes", "40", "30", "--threads", "1", "--out", str(tmp_path / "scaling.json")])
-    runs = json.loads((tmp_path / "scaling.json").read_text())["runs"]
-    assert [(run["points"], run["poses"]) for run in runs] == [(30, False), (40, False), (30, True), (40, True)]
-    assert [list(run["seconds"]) for run in runs[::2]] == [
-        ["features, cost", "Sinkhorn", "backward"], list(here.STAGES)
-    ]  # fmt: skip
-    assert (tmp_path / "scaling.png").exists()
-
-
-def test_scaling_measures_in_another_process_and_says_what_failed(bench: SimpleNamespace) -> None:
-    run = bench.bench_scaling.in_its_own_process(20, poses=False, threads=1)
-    assert run.points == 20
-    assert run.highest_gb > 0
-    with pytest.raises(RuntimeError, match="expected a run with 0 points, got"):
-        bench.bench_scaling.in_its_own_process(0, poses=False, threads=1)
-
-
-def test_scaling_leaves_out_what_does_not_fit(bench: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
-    here, messages = bench.bench_scaling, []
-    monkeypatch.setattr(here, "free_gigabytes", lambda: 10.0)
+    out = tmp_path / "new" / "result.json"
     monkeypatch.setattr(
-        here, "in_its_own_process", lambda points, *, poses, threads: here.Run(points, poses, peak_gb={"backward": 3.0})
-    )
-    runs = here.all_runs([100, 150, 400, 500], 1, SimpleNamespace(print=messages.append))
-    assert [run.points for run in runs] == [100, 150, 100, 150]
-    assert sum("left out" in message for message in messages) == 4
+        "sys.argv", ["layers", "--points", "40", "--rounds", "1", "--batch", "2", "--output", str(out)]
+    )  # fmt: skip
+    bench.bench_layers.main()
+    record = json.loads(out.read_text())
+    assert record["points"] == 40
+    assert record["machine"]["threads"] == 1
+    assert {row["what"].split(",")[0] for row in record["rows"]} == {
+        "PnP forward", "PnP backward", "Sinkhorn forward", "Sinkhorn backward", "training step"
+    }  # fmt: skip
 
 
 def test_gpu_command_needs_a_gpu(
     bench: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    monkeypatch.setattr("sys.argv", ["gpu"])
     with pytest.raises(SystemExit) as stopped:
-        bench.gpu.main([])
+        bench.gpu.main()
     assert stopped.value.code == 2
     assert len(capsys.readouterr().err.splitlines()) == 1
 
@@ -219,15 +176,102 @@ def test_spread_is_median_and_quartiles(bench: SimpleNamespace) -> None:
     assert bench.timing.Spread.of([5.0, 1.0, 3.0, 2.0, 4.0]) == bench.timing.Spread(median=3.0, low=2.0, high=4.0)
 
 
-def test_constellation_command_writes_what_it_measured(bench: SimpleNamespace, tmp_path: Path) -> None:
+def test_constellation_command_writes_what_it_measured(
+    bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "constellation.json"
-    only = ["--frames", "2", "--peers", "1", "--only", "headset, 3 lights", "Ransac: marker", "craters", "6 x 6"]
-    bench.bench_constellation.main([*only, "--out", str(out)])
+    only = ["--only", "headset, 3 lights", "Ransac: marker", "6 x 6", "--peers", "--limit", "2"]
+    monkeypatch.setattr("sys.argv", ["constellation", *only, "--output", str(out)])
+    bench.bench_constellation.main()
     rows = json.loads(out.read_text())["rows"]
-    names = {"headset, 3 lights", "craters", "noise 6 x 6", "RandomRansac: marker, all seen"}
-    assert names <= {row["name"] for row in rows}
-    assert all(row["wrong"] == 0 for row in rows if not row["name"].startswith("RandomRansac"))
-    assert 0 < out.with_suffix(".png").stat().st_size < 200_000
+    assert {"headset, 3 lights", "noise 6 x 6", "RandomRansac: marker, all seen"} <= rows.keys()
+    assert rows["headset, 3 lights"]["right"] == 1
+    assert rows["noise 6 x 6"]["right"] == 0
+    assert all(row["confident_and_wrong"] == 0 for name, row in rows.items() if not name.startswith("RandomRansac"))
+
+
+def test_shapes_are_seen_where_the_pose_puts_them(bench: SimpleNamespace) -> None:
+    """Without outliers each image point lies within noise of a projected scene point."""
+    for _, points2d, points3d, rotation, translation in bench.bench_search.shapes(0.0, 3, 9):
+        camera = points3d @ rotation.T + translation
+        seen = camera[:, :2] / camera[:, 2:]
+        nearest = np.linalg.norm(points2d[:, None] - seen, axis=-1).min(1)
+        assert nearest.max() < 6 * bench.bench_search.NOISE
+    (_, points2d, points3d, *_), *_ = bench.bench_search.shapes(0.5, 1, 9)
+    assert len(points2d) == len(points3d) == 600
+
+
+def test_the_list_has_every_benchmark_and_a_sentence_for_each() -> None:
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        command = [sys.executable, "-m", "benchmarks", *arguments]
+        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+
+    listed = run()
+    assert listed.returncode == 0
+    lines = dict(line.strip().split(maxsplit=1) for line in listed.stdout.splitlines()[2:])
+    assert {"results", "search", "views", "constellation", "layers", "verdict", "left_out", "gpu"} <= lines.keys()
+    assert all(sentence.endswith((".", ":")) or "`" in sentence for sentence in lines.values())
+    unknown = run("serch")
+    assert unknown.returncode == 1
+    assert "'serch'" in unknown.stderr
+
+
+FIGURES = {
+    "problems": 20, "seed": 9, "rotation_q_deg": [0.1, 0.2, 0.4], "right": 0.95, "confident": 0.5,
+    "confident_and_wrong": 0, "cpu_seconds": 1.0,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "differs"),
+    [
+        ({}, False),
+        ({"cpu_seconds": 9.0}, False),
+        ({"right": 0.9}, False),
+        ({"right": 0.85}, True),
+        ({"confident": 0.6}, True),
+        ({"rotation_q_deg": [0.1, 0.25, 0.9]}, False),
+        ({"rotation_q_deg": [0.1, 0.35, 0.4]}, True),
+        ({"confident_and_wrong": 1}, True),
+        ({"seed": 8}, True),
+    ],
+)
+def test_results_differ_beyond_the_tolerance(bench: SimpleNamespace, change: dict[str, object], differs: bool) -> None:
+    assert bool(bench.results.differences(FIGURES | change, FIGURES)) == differs
+
+
+def test_tables_are_filled_and_checked(bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    here, guide, file = bench.results, tmp_path / "guide.md", tmp_path / "results.json"
+    rows = [here.Row("leds", "two rings", lambda *_: [bench.outcome] * 2, (2, 1), 3.0)]
+    bench.outcome = bench.bench_search.Outcome("", 0.25, 0.0, "confident", 0.5)
+    monkeypatch.setattr(here, "ROWS", rows)
+    monkeypatch.setattr(here, "DOCUMENTS", (guide,))
+    monkeypatch.setattr(here, "warm_up", lambda: None)
+
+    def run(*arguments: str) -> None:
+        monkeypatch.setattr("sys.argv", ["results", "--file", str(file), *arguments])
+        here.main()
+
+    guide.write_text("before\n<!-- results: leds -->\nold\n<!-- end of results -->\nafter\n")
+    run()
+    text = guide.read_text()
+    assert "| two rings | 2 | 0.25 / 0.25 / 0.25 | 100.0% (3 deg) | 100.0% | 0 | 0.5 |" in text
+    assert text.startswith("before\n")
+    assert text.endswith("after\n")
+    assert "old" not in text
+    record = json.loads(file.read_text())
+    assert record["full"]["leds: two rings"]["seed"] == 9
+    assert record["commit"]
+    run("--check")
+    guide.write_text(text.replace("0.25 /", "0.24 /"))
+    with pytest.raises(SystemExit, match=r"guide\.md: a table is not that of results\.json"):
+        run("--check")
+    guide.write_text(text)
+    bench.outcome = bench.bench_search.Outcome("", 8.0, 0.0, "confident", 0.5)
+    with pytest.raises(SystemExit, match="leds: two rings: 2 confident and wrong, not 0"):
+        run("--check")
+    with pytest.raises(SystemExit, match="leds: two rings: never measured"):
+        run("--quick", "--check")
 
 
 def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:

@@ -1,0 +1,138 @@
+"""What all benchmarks share: their options, the outcome of a problem, the summary of many, and the file of a record."""
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp import Solution
+from bpnp.files import written_whole
+
+ROOT = Path(__file__).parents[1]
+DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
+TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also on a busy machine
+NO_POSE_DEG = 180.0
+
+Array = NDArray[np.float64]
+
+
+def parser(doc: str | None) -> argparse.ArgumentParser:
+    """The options that every benchmark has: data, seed, number of problems, and a file for the record."""
+    result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    result.add_argument("--data", type=Path, default=DATA, help="folder with colmap, photos and psb")
+    result.add_argument("--seed", type=int, default=9, help="of the problems and of the search (default: %(default)s)")
+    result.add_argument("--limit", type=int, default=12, help="problems a row (default: %(default)s)")
+    result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
+    return result
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Of one problem: error of the rotation, and of the translation in units of the distance or of the scene.
+
+    verdict: "" of a method that has none.
+    """
+
+    problem: str
+    rotation_deg: float
+    shift: float
+    verdict: str
+    cpu_seconds: float
+
+
+def solved(
+    problem: str, rotation: Any, translation: Any, solve: Callable[[], Solution], *, distance: float = 1.0
+) -> Outcome:
+    """Solve, and compare with the true pose. distance: unit of the error of the camera's centre."""
+    start = time.process_time()
+    found = solve()
+    seconds = time.process_time() - start
+    shift = np.linalg.norm(found.rotation.T @ found.translation - rotation.T @ translation) / distance
+    return Outcome(problem, degrees(found.rotation, rotation), float(shift), found.verdict, seconds)
+
+
+def degrees(one: Any, other: Any) -> float:
+    """Angle between two rotations (3, 3), 180 where one is not there."""
+    if not (np.isfinite(one).all() and np.isfinite(other).all()):
+        return NO_POSE_DEG
+    return float(np.degrees(Rotation.from_matrix(one @ other.T).magnitude()))
+
+
+def summary(outcomes: Sequence[Outcome], right_deg: float, right_shift: float = np.inf) -> dict[str, Any]:
+    """Quartiles of the rotation's error, shares right and confident, how many are confident and wrong, CPU seconds."""
+    turn, shift = (np.array([getattr(o, name) for o in outcomes]) for name in ("rotation_deg", "shift"))
+    right = (turn < right_deg) & ((shift < right_shift) | np.isinf(right_shift))
+    sure = np.array([o.verdict == "confident" for o in outcomes])
+    return {
+        "problems": len(outcomes),
+        "rotation_q_deg": [round(float(q), 4) for q in np.percentile(turn, (25, 50, 75))],
+        "right": round(float(right.mean()), 4),
+        "confident": round(float(sure.mean()), 4) if any(o.verdict for o in outcomes) else None,
+        "confident_and_wrong": int((sure & ~right).sum()),
+        "cpu_seconds": round(float(np.mean([o.cpu_seconds for o in outcomes])), 4),
+    }
+
+
+def line(row: dict[str, Any]) -> str:
+    """A summary on one line."""
+    quartiles = " / ".join(f"{q:.3g}" for q in row["rotation_q_deg"])
+    confident = "-" if row["confident"] is None else f"{row['confident']:.0%}"
+    return (
+        f"{row['problems']} problems, rotation {quartiles} deg, right {row['right']:.0%}, confident {confident}, "
+        f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s"
+    )
+
+
+def measured(
+    rows: Iterable[tuple[str, Sequence[Outcome]]], options: argparse.Namespace, right_deg: float
+) -> dict[str, dict[str, Any]]:
+    """Print a line for each row as it comes, and write all with their outcomes to `--output`."""
+    found: dict[str, dict[str, Any]] = {}
+    for name, outcomes in rows:
+        if not outcomes:
+            print(f"{name}: no problems", flush=True)
+            continue
+        found[name] = summary(outcomes, right_deg)
+        print(f"{name}: {line(found[name])}", flush=True)
+        if options.output:
+            found[name]["outcomes"] = [asdict(outcome) for outcome in outcomes]
+            write(options.output, {"rows": found})
+    return found
+
+
+def write(path: Path, record: dict[str, Any]) -> None:
+    """A JSON file of what was measured, with the machine, the commit and the command that measured it."""
+    commit = subprocess.run(
+        ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
+    )
+    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(sys.argv), "machine": machine()}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as temporary:
+        temporary.write_text(json.dumps(head | record, indent=1) + "\n")
+
+
+def machine() -> dict[str, Any]:
+    """What the figures were measured on, and how busy it was."""
+    information = Path("/proc/cpuinfo")
+    lines = information.read_text().splitlines() if information.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return {
+        "kind": f"cpu-{os.cpu_count()}core",
+        "cpu": names[0] if names else platform.processor(),
+        "threads": torch.get_num_threads(),
+        "load_average": [round(x, 2) for x in os.getloadavg()],
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+    }

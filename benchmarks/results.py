@@ -1,0 +1,247 @@
+"""Every figure of the README and of docs/results.md: measured, kept in results.json, filled into their tables.
+
+    python -m benchmarks results                  # measures all (hours), writes results.json and the tables
+    python -m benchmarks results --only leds      # the rows of one table
+    python -m benchmarks results --quick --check  # few problems a row (minutes) against results.json
+
+Rows are data: `ROWS`. With --check nothing is written and the exit status is 1 where a figure lies outside the
+tolerance (`Tolerance`) or a table is not what results.json says; times are shown and not compared. Rows whose data are
+not there are named and left out.
+"""
+
+import argparse
+import json
+import re
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import bench_constellation
+import bench_search
+import bench_views
+import torch
+from record import ROOT, Outcome, line, parser, summary, write
+
+from bpnp import warm_up
+from bpnp.datamodules import MeshDataModule, Outliers
+from bpnp.metrics import rotation_error, translation_error
+from bpnp.models import TrainedNet
+
+FILE = ROOT / "benchmarks" / "results.json"
+DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "results.md")
+COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "right", "confident", "and wrong", "CPU s")
+TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What may differ between two runs of a row, on another machine and with another version of the libraries.
+
+    problems: of the shares right and confident. median: ratio of the median errors, where both exceed `floor_deg`.
+    wrong: more poses that are confident and wrong.
+    """
+
+    problems: int = 1
+    median: float = 1.5
+    floor_deg: float = 0.05
+    wrong: int = 0
+
+
+@dataclass(frozen=True)
+class Row:
+    """A line of a table.
+
+    measure: outcomes of a number of problems, from a seed and the folder of the data. problems: in full, and quickly.
+    right_deg, right_shift: up to which a pose is right. data: the folder, below that of the data, that it needs.
+    """
+
+    table: str
+    name: str
+    measure: Callable[[int, int, Path], list[Outcome]]
+    problems: tuple[int, int]
+    right_deg: float
+    right_shift: float = float("inf")
+    data: str = ""
+    in_readme: bool = False
+
+
+def search(name: str, limit: int, seed: int, data: Path) -> list[Outcome]:
+    return bench_search.outcomes(name, data, limit, seed)
+
+
+def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Outcome]:
+    scenes = bench_views.REPORTED
+    each = -(-limit // len(scenes))
+    return [one for scene in scenes for one in search(scene + suffix, each, seed, data)][:limit]
+
+
+def views(method: str, chosen: dict[str, Any], limit: int, seed: int, data: Path) -> list[Outcome]:
+    return bench_views.outcomes(bench_views.photos(limit, seed, data=data, **chosen), method, seed)
+
+
+def leds(name: str, limit: int, seed: int, _: Path) -> list[Outcome]:
+    return bench_constellation.outcomes(name, limit, seed)
+
+
+def network(weights: str, estimate: str, options: dict[str, Any], limit: int, seed: int, data: Path) -> list[Outcome]:
+    """Packaged weights on meshes or, without `root`, on procedural shapes."""
+    root = str(data / options["root"]) if "root" in options else None
+    module = MeshDataModule(
+        root, num_points=1000, test_pairs=limit, test_shapes=limit, batch_size=1, seed=seed,
+        **{name: value for name, value in options.items() if name != "root"},
+    )  # fmt: skip
+    module.setup("test")
+    net, found = TrainedNet.from_pretrained(weights).eval(), []
+    for batch in module.test_dataloader():
+        start = time.process_time()
+        with torch.no_grad():
+            pose = net(batch).poses[estimate]
+        seconds = time.process_time() - start
+        turn = float(rotation_error(pose.rotation, batch.rotation).nan_to_num(nan=180.0))
+        shift = float(translation_error(pose.translation, batch.translation).nan_to_num(nan=torch.inf))
+        found.append(Outcome(batch.ids[0], turn, shift, "", seconds))
+    return found
+
+
+MAP = {"views": 0, "outliers": 1.0, "most": None}
+ONE = {"views": 1, "most": bench_views.MOST_POINTS}
+PAPER = (15.0, 0.5)  # degrees and scene units
+ROWS = (
+    *(
+        Row("search", f"shapes, any rotation, {ratio:g} outliers a match",
+            partial(search, f"shapes-{ratio:.2f}"), (48, 4), 2.0, in_readme=ratio == 0.25)
+        for ratio in (0, 0.25, 0.5)
+    ),
+    Row("search", "PSB meshes, the paper's protocol", partial(search, "psb"), (100, 3), *PAPER, data="psb",
+        in_readme=True),
+    Row("search", "PSB meshes, any rotation", partial(search, "psb-so3"), (100, 3), *PAPER, data="psb"),
+    Row("search", "PSB meshes, 0.5 outliers a match", partial(search, "psb-0.50"), (100, 3), *PAPER, data="psb"),
+    Row("search", "photos, the points that they see", partial(reported_scenes, ""), (100, 5), 1.0, data="colmap"),
+    Row("search", "photos, 0.5 outliers a match", partial(reported_scenes, "-0.50"), (100, 5), 1.0, data="colmap"),
+    Row("maps", "left out of its map, which view is told", partial(views, "localize", ONE | {"best": True,
+        "outliers": 1.0}), (48, 5), 1.0, data="colmap", in_readme=True),
+    Row("maps", "left out of its map, nothing is told", partial(views, "localize", MAP), (58, 5), 1.0, data="colmap",
+        in_readme=True),
+    *(
+        Row("maps", f"points of one view, no prior, {outliers:.0%} outliers a side",
+            partial(views, "solve", ONE | {"outliers": outliers}), (48, 5), 1.0, data="colmap")
+        for outliers in (0.5, 0.75, 1.0)
+    ),
+    Row("maps", "of another place", partial(views, "localize", ONE | {"outliers": 1.0, "apart": True}), (18, 4), 0.0,
+        data="colmap", in_readme=True),
+    *(
+        Row("leds", name, partial(leds, name), (300, 20), 3.0, in_readme="3 lights" in name)
+        for name in ("ring, 3 lights", "ring, 8 lights, 20 % missing", "headset, 3 lights",
+                     "headset, 8 lights, 20 % missing", "ring, no normals, 3 lights", "drone, 3 lights")
+    ),
+    Row("networks", "`procedural-euler`, PSB meshes, the paper's protocol",
+        partial(network, "procedural-euler", "refined", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER,
+        data="psb", in_readme=True),
+    Row("networks", "`procedural-so3`, procedural shapes, any rotation",
+        partial(network, "procedural-so3", "refined", {"rotation": "so3"}), (100, 3), *PAPER, in_readme=True),
+    Row("networks", "`matcher-clutter`, PSB meshes, 0.5 outliers a match",
+        partial(network, "matcher-clutter", "refined", {"root": "psb", "rotation": "euler",
+        "test_outliers": Outliers(ratio=0.5)}), (40, 2), *PAPER, data="psb"),
+)  # fmt: skip
+
+
+def key(row: Row) -> str:
+    return f"{row.table}: {row.name}"
+
+
+def measure(options: argparse.Namespace) -> Iterator[tuple[Row, dict[str, Any]]]:
+    for row in ROWS:
+        if options.only and row.table not in options.only:
+            continue
+        if row.data and not (options.data / row.data).is_dir():
+            print(f"{key(row)}: left out, needs {options.data / row.data}", flush=True)
+            continue
+        count = row.problems[options.quick]
+        found = summary(row.measure(count, options.seed, options.data), row.right_deg, row.right_shift)
+        print(f"{key(row)}: {line(found)}", flush=True)
+        yield row, found | {"seed": options.seed}
+
+
+def differences(new: dict[str, Any], old: dict[str, Any], allowed: Tolerance = Tolerance()) -> list[str]:
+    """What lies outside the tolerance."""
+    if new["problems"] != old["problems"] or new["seed"] != old["seed"]:
+        return [f"{new['problems']} problems of seed {new['seed']}, not {old['problems']} of {old['seed']}"]
+    found, share = [], allowed.problems / new["problems"] + 1e-3
+    for name in ("right", "confident"):
+        if new[name] is not None and abs(new[name] - old[name]) > share:
+            found.append(f"{name} {new[name]:.2f}, not {old[name]:.2f} within {share:.2f}")
+    low, high = sorted(result["rotation_q_deg"][1] for result in (new, old))
+    if old["right"] > 0.5 and high > max(allowed.median * low, allowed.floor_deg):
+        found.append(f"median {new['rotation_q_deg'][1]:.3g} deg, not {old['rotation_q_deg'][1]:.3g}")
+    if new["confident_and_wrong"] > old["confident_and_wrong"] + allowed.wrong:
+        found.append(f"{new['confident_and_wrong']} confident and wrong, not {old['confident_and_wrong']}")
+    return found
+
+
+def table(name: str, results: dict[str, Any]) -> str | None:
+    """The Markdown of a table, or of the README's rows; None unless all its rows are measured."""
+    rows = [row for row in ROWS if (row.in_readme if name == "readme" else row.table == name)]
+    if not rows or any(key(row) not in results for row in rows):
+        return None
+    lines = [COLUMNS, ("---",) * len(COLUMNS)]
+    for row in rows:
+        result = results[key(row)]
+        quartiles = " / ".join(f"{q:.2g}" if q < 10 else f"{q:.0f}" for q in result["rotation_q_deg"])
+        where = f"{row.right_deg:g} deg" + (f", {row.right_shift:g}" if row.right_shift < 1e9 else "")
+        right = f"{result['right']:.1%} ({where})" if row.right_deg else "none can be"
+        sure = "" if result["confident"] is None else f"{result['confident']:.1%}"
+        wrong = "" if result["confident"] is None else str(result["confident_and_wrong"])
+        lines.append((row.name, str(result["problems"]), quartiles if row.right_deg else "", right, sure, wrong,
+                      f"{result['cpu_seconds']:.2g}"))  # fmt: skip
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
+
+
+def filled(text: str, results: dict[str, Any]) -> str:
+    """A document with the tables between its markers; one of which a row is not measured stays."""
+
+    def replaced(match: re.Match[str]) -> str:
+        new = table(match[1], results)
+        return match[0] if new is None else f"<!-- results: {match[1]} -->\n{new}<!-- end of results -->"
+
+    return re.sub(TABLE.format("([a-z]+)"), replaced, text, flags=re.DOTALL)
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--quick", action="store_true", help="few problems a row")
+    options.add_argument("--check", action="store_true", help="compare, write nothing")
+    options.add_argument("--only", nargs="*", metavar="TABLE", choices=sorted({row.table for row in ROWS}))
+    options.add_argument("--file", type=Path, default=FILE, help="(default: benchmarks/results.json)")
+    chosen = options.parse_args()
+    torch.set_num_threads(1)
+    warm_up()
+    kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
+    part = "quick" if chosen.quick else "full"
+    known: dict[str, Any] = kept.get(part, {})
+    failures = []
+    for row, result in measure(chosen):
+        if chosen.check:
+            old = known.get(key(row))
+            bad = ["never measured"] if old is None else differences(result, old)
+            failures += [f"{key(row)}: {reason}" for reason in bad]
+            continue
+        known[key(row)] = result
+        write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: known})
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        if (new := filled(text, known if part == "full" else kept.get("full", {}))) == text:
+            continue
+        if chosen.check:
+            failures.append(f"{document.name}: a table is not that of {chosen.file.name}; try without --check")
+        else:
+            document.write_text(new, encoding="utf-8")
+    if failures:
+        sys.exit("\n".join(failures))
+
+
+if __name__ == "__main__":
+    main()
