@@ -71,7 +71,7 @@ def anneal_on_points(
     tiles, points = scene.tiles(bearings)
     tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
     sides, rotation, translation = (tuple(tiles), tuple(points)), starts.rotation.copy(), starts.translation.copy()
-    result = np.empty((len(starts), 3), np.float32)
+    result = np.zeros((len(starts), 3), np.float32)
 
     def anneal(i: int, j: int) -> None:
         scratch = sparse_scratch(tiles, len(points.b))

@@ -22,7 +22,8 @@ class Pool:
     """Distinct poses of a scene, best first, from all turns of a search.
 
     enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
-    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far.
+    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far. missed: log10 of the
+    probability that a better optimum than the best pose was not met.
     surrounded, searched: poses around which was searched in vain, of those that exceed chance, and of others.
     """
 
@@ -39,17 +40,29 @@ class Pool:
         """Drop all poses."""
         self.candidates = self.rotations = self.surrounded = Candidates.none()
         self.searched: list[Candidates] = []
+        self._around: Candidates | None = None
+        self.missed = 0.0
 
     def merge(self, found: Candidates) -> None:
         """Take up the poses of a turn.
 
         They are weighed first: a pose that exceeds chance may lie beside one that does not and is likelier.
         """
+        rule, before = self.scene.settings.evidence, self.alarms
         self.candidates = self._weighed(merged([self.candidates, self._weighed(found)], self.scene), 1)
-        if self.missed() > self.scene.settings.evidence.missed:  # else the others are weighed for the verdict
+        if self._around is not None and self.alarms > before - rule.lead and not self.scene.deadline.passed():
+            self.surrounded = Candidates.concatenated([self.surrounded, self._around])
+        self._around = None
+        self.missed = self._missed()
+        if self.missed > rule.missed:  # else the others are weighed for the verdict
             self.candidates = self._weighed(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.preference, kind="stable")]
+            self.missed = self._missed()
         self.rotations = self.different([self.rotations, found])
+
+    def look_around(self, pose: Candidates) -> None:
+        """The next turn searches the surroundings of a pose (1,): in vain, if none is much less likely by chance."""
+        self._around = pose
 
     def _weighed(self, candidates: Candidates, count: int | None = None) -> Candidates:
         """The candidates, of which the first `count`, by default as many as a verdict needs, have false alarms."""
@@ -84,10 +97,6 @@ class Pool:
         rotation, translation = self.scene.enter(leaders.rotation, leaders.translation)
         return replace(leaders, rotation=rotation, translation=translation)
 
-    def looked_around(self, pose: Candidates) -> None:
-        """Note that the surroundings of a pose (1,) were searched in vain."""
-        self.surrounded = Candidates.concatenated([self.surrounded, pose])
-
     def looks(self, leaders: Candidates) -> int:
         """How often the surroundings of the first one, in the user's frame, were searched in vain."""
         if not len(leaders) or not len(self.surrounded):
@@ -108,8 +117,7 @@ class Pool:
         rule, together = self.scene.settings.schedule, Candidates.concatenated(parts)
         return best_distinct(together, self.scene, rule.around_each, degrees=rule.apart_deg, shift=np.inf)
 
-    def missed(self) -> float:
-        """log10 of the probability that a better optimum than the best pose was not met."""
+    def _missed(self) -> float:
         leaders = self.leaders()
         return missed(leaders, self.sets, self.looks(leaders), self.scene.settings.evidence)
 

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.unseen import far, near
+from bpnp.search.evidence.unseen import far_missed, near_missed
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
 from bpnp.search.sources.multistart import multistart, multistart_near
@@ -37,9 +37,10 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
         for number in range(settings.schedule.around):
             yield multistart(scene, number, guess, pool.candidates)[0].without_hits()
     if isinstance(known, PosePrior) and is_near(scene, known):
-        yield from islice(_near(pool, known, proposals), settings.schedule.near)
+        near = _near(pool, known, proposals)
+        yield from islice(near, settings.schedule.near)
         while pool.alarms < 0:
-            yield from _sure(pool, _near(pool, known, None))
+            yield from _sure(pool, near)
         # The prior may be wrong: what was found near it would only be in the way.
         pool.forget()
         known = None
@@ -86,18 +87,16 @@ def _sure(pool: Pool, batches: Iterator[Candidates]) -> Iterator[Candidates]:
     """What excludes the likelier case: a raster search around the best pose, or another batch of starts."""
     leaders, settings = pool.leaders(), pool.scene.settings
     hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
-    if looks < settings.schedule.looks and near(hits, looks, rule) > far(hits, rule):
-        yield from _look(pool)
+    if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far_missed(hits, rule):
+        yield _look(pool)
     else:
         yield next(batches)
 
 
-def _look(pool: Pool) -> Iterator[Candidates]:
-    """A raster search around the best pose; it was in vain where it does not make it much less likely by chance."""
-    alarms, leader, settings = pool.alarms, pool.leader, pool.scene.settings
-    yield search_beside(pool.scene, leader, settings.beside)
-    if pool.alarms > alarms - settings.evidence.lead:
-        pool.looked_around(leader)
+def _look(pool: Pool) -> Candidates:
+    """A raster search around the best pose."""
+    pool.look_around(leader := pool.leader)
+    return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 
 def _batches(pool: Pool, known: Prior | None) -> Iterator[tuple[Candidates, float]]:
@@ -139,4 +138,4 @@ def only_proposed(pool: Pool, proposals: Proposals) -> Iterator[Candidates]:
     """Proposed poses and nothing else, but what is around them."""
     yield from _with_surroundings(pool, proposed(pool, proposals))
     while pool.alarms < 0 and pool.looks(pool.leaders()) < pool.scene.settings.schedule.looks:
-        yield from _look(pool)
+        yield _look(pool)

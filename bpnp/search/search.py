@@ -8,7 +8,7 @@ import numpy as np
 
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.candidates import Candidates
-from bpnp.search.enumeration.search import is_crowd, is_few, search_few
+from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, search_by_enumeration
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool, against_repetitions
 from bpnp.search.scene import Scene, degenerate
@@ -53,7 +53,7 @@ def search_poses(
     candidates. Raises ValueError for `clutter` out of range.
     """
     settings = settings if clutter is None else settings.expecting(clutter)
-    start, few = time.monotonic(), no_pose("no pose was found")
+    start, enumerated = time.monotonic(), no_pose("no pose was found")
 
     def tell(batches: int) -> None:
         if progress is not None:
@@ -63,16 +63,17 @@ def search_poses(
     def entered() -> Scene:
         return Scene(sets, seed, settings, deadline)
 
-    crowd = is_crowd(sets)
-    if not crowd:
+    many = exceeds_enumeration(sets)
+    if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
-    if is_few(sets) and not deadline.passed():
-        few, exhausted = _enumerated(sets, entered, settings, deadline)
+    if is_enumerable(sets) and not deadline.passed():
+        enumerated, exhausted = _enumerated(sets, entered, settings, deadline)
         tell(0)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        if few.verdict == "confident" or small or not crowd and (exhausted or few.log10_false_alarms <= 0):
-            return few
+        settled = exhausted or enumerated.log10_false_alarms <= 0
+        if enumerated.verdict == "confident" or small or (settled and not many):
+            return enumerated
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
@@ -80,8 +81,8 @@ def search_poses(
     lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
     if any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
-    pool = Pool(scene, sets, few)
-    return _until_certain(pool, turns(pool, around, proposals if crowd else None), tell)
+    pool = Pool(scene, sets, enumerated)
+    return _until_certain(pool, turns(pool, around, proposals if many else None), tell)
 
 
 def _until_certain(
@@ -98,7 +99,7 @@ def _until_certain(
         pool.merge(found)
         tell(pool.turns)
         bettered = thinned and pool.alarms < finished - settings.evidence.lead  # on all points more of them match
-        if bettered or pool.missed() <= settings.evidence.missed:
+        if bettered or pool.missed <= settings.evidence.missed:
             finished, result = min(finished, pool.alarms), pool.result(1)
             if result.verdict == "confident" or result.settled:
                 return result
@@ -130,7 +131,7 @@ def _enumerated(
     sets: PointSets, entered: Callable[[], Scene], settings: SearchSettings, deadline: Deadline
 ) -> tuple[SearchResult, bool]:
     """The result of few points, and whether every hypothesis was tried."""
-    found = search_few(sets, deadline, settings)
-    exhaustive = not found.interrupted
-    few = judged(found.candidates, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
-    return against_repetitions(few, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted
+    found = search_by_enumeration(sets, deadline, settings)
+    exhaustive = found.exhausted or found.safe
+    result = judged(found.candidates, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
+    return against_repetitions(result, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted

@@ -3,7 +3,7 @@
 import numpy as np
 
 from bpnp.loops.parallel import NEVER, one_blas_thread
-from bpnp.search.enumeration.search import search_few
+from bpnp.search.enumeration.search import search_by_enumeration
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.neighbours import HashedPoints, sums_near
 from bpnp.search.kernels.raster import add_shifted, add_up
@@ -25,7 +25,7 @@ def warm_up() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (POINTS, 3))
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    search_few(PointSets(rays, points), NEVER, DEFAULT)
+    search_by_enumeration(PointSets(rays, points), NEVER, DEFAULT)
     HashedPoints(points, 0.1).count_on(points, points, 1)
     sums_near(rays, rays, np.eye(3)[:, :2].copy(), np.array([0.1, 0.2]), np.array([1.0, 0.0]))
     _warm_annealing(points, rays)

@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.search.enumeration.search import is_few
+from bpnp.search.enumeration.search import is_enumerable
 from bpnp.solving.arguments import (
     Prior,
     checked_prior,
@@ -196,7 +196,7 @@ def shared_lights(
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
-        if len(problems) > 1 and problem.degenerate is None and is_few(problem.sets):
+        if len(problems) > 1 and problem.degenerate is None and is_enumerable(problem.sets):
             groups.setdefault(problem.image.tobytes() + repr(problem.camera).encode(), []).append(i)
     for members in groups.values():
         taken: set[int] = set()

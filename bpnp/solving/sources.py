@@ -11,7 +11,7 @@ import torch
 from torch import nn
 
 from bpnp.loops.parallel import Deadline
-from bpnp.search.enumeration.search import is_crowd
+from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.solving.matches import finished, without_pose
@@ -130,7 +130,7 @@ def _by_module(net: nn.Module, problems: Mapping[int, Problem], options: Options
     cells = {i: len(problem.image) * len(problem.points3d) for i, problem in problems.items()}
     for i in sorted(problems, key=cells.__getitem__):
         start, problem = time.perf_counter(), problems[i]
-        if isinstance(net, Matcher) and is_crowd(problem.sets):
+        if isinstance(net, Matcher) and exceeds_enumeration(problem.sets):
             result = search_proposed(
                 problem.sets,
                 partial(proposed, net, problem, options.seed),

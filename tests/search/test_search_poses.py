@@ -25,6 +25,8 @@ from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.search.verdict import no_pose
 from bpnp.types import Batch
 
+NO_POSE = no_pose("none yet")
+
 
 @pytest.fixture(scope="module")
 def problem():
@@ -167,7 +169,7 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     assert off(search_poses(sets, settings=few)) > 10
     assert off(search_poses(sets, settings=few, proposals=lambda: (others, np.tile(translation, (200, 1))))) < 0.5
     assert search_poses(sets, proposals=pytest.fail).verdict == "confident"
-    empty = Pool(Scene(sets, 0, few), sets, no_pose("none yet"))
+    empty = Pool(Scene(sets, 0, few), sets, NO_POSE)
     alike = schedule.proposed(empty, lambda: (np.tile(others[77], (50, 1, 1)), np.tile(translation, (50, 1))))
     assert alike.hits.sum() == 0  # fifty alike are no evidence
 
@@ -298,3 +300,37 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
     assert result.verdict == "failed"
     assert result.batches == 0
     assert not len(result.candidates)
+
+
+def test_a_doubtful_pose_near_a_prior_gets_all_sources_in_turn(problem, monkeypatch):
+    """docs/search.md: a raster search near the prior, a batch drawn from it, a batch from anywhere, and so on."""
+    sets = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
+    rotation, translation = (values[0].double().numpy() for values in problem.near(1.0, seed=1))
+    settings = replace(DEFAULT, schedule=replace(DEFAULT.schedule, near=0, looks=0))
+    pool = Pool(Scene(sets, 0, settings), replace(sets, prior=PosePrior(rotation, translation, 5.0, 0.1)), NO_POSE)
+    found = replace(Candidates.none(), log10_false_alarms=np.zeros(0))
+    asked = []
+    for name in ("search_near", "multistart_near", "multistart"):
+        monkeypatch.setattr(schedule, name, lambda *_, name=name: (asked.append(name), (found, 1.0))[1])
+    one = Candidates.unscored(np.eye(3, dtype=np.float32)[None], np.ones((1, 3), np.float32))
+    pool.candidates = replace(one, log10_false_alarms=np.array([-1.0]))
+    turns = schedule.turns(pool, None, None)
+    for _ in range(6):
+        next(turns)
+    assert asked == ["search_near", "multistart_near", "multistart"] * 2
+
+
+def test_a_look_that_betters_nothing_is_counted_at_once(problem):
+    """And one that the deadline cut short is not."""
+    sets = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
+    for deadline, looks in ((Deadline(), 1), (Deadline.after(0.0), 0)):
+        pool = Pool(Scene(sets, 0, DEFAULT, deadline), sets, NO_POSE)
+        pose = problem.rotation[0].double().numpy()[None], problem.translation[0].double().numpy()[None]
+        entered, one = Candidates.unscored(*pool.scene.enter(*pose)), np.ones(1, np.float32)
+        pool.merge(replace(entered, scale=1e-3 * one, score=5 * one, matched=one))
+        assert pool.alarms < 0
+        unseen = pool.missed
+        pool.look_around(pool.leader)
+        pool.merge(Candidates.none())
+        assert pool.looks(pool.leaders()) == looks
+        assert (pool.missed < unseen) == bool(looks)

@@ -19,15 +19,15 @@ from bpnp.search.verdict import is_certain, weighed
 Array = NDArray[np.float64]
 
 
-def is_few(sets: PointSets, rule: EnumerationSettings = DEFAULT) -> bool:
+def is_enumerable(sets: PointSets, rule: EnumerationSettings = DEFAULT) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
     products = len(sets.bearings) * len(sets.points3d)
     return products <= (rule.most_products if sets.pairs_that_fix == 3 else rule.most_products_known)
 
 
-def is_crowd(sets: PointSets) -> bool:
+def exceeds_enumeration(sets: PointSets) -> bool:
     """Whether there are more points than are enumerated without a prior; with one the enumeration may miss a pose."""
-    return not is_few(replace(sets, prior=None))
+    return not is_enumerable(replace(sets, prior=None))
 
 
 class Enumerated(NamedTuple):
@@ -45,7 +45,7 @@ class Enumerated(NamedTuple):
     interrupted: bool
 
 
-def search_few(
+def search_by_enumeration(
     sets: PointSets, deadline: Deadline, settings: SearchSettings, rule: EnumerationSettings = DEFAULT
 ) -> Enumerated:
     """Enumerate the poses of few points.

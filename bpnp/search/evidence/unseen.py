@@ -35,15 +35,15 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.1, -3.3]
     """
-    unseen = near(hits, looks, rule) + far(hits, rule)
+    unseen = near_missed(hits, looks, rule) + far_missed(hits, rule)
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near(hits: int, looks: int, rule: Evidence) -> float:
+def near_missed(hits: int, looks: int, rule: Evidence) -> float:
     """Probability that a better optimum beside the best pose was not met."""
     return max(0.5**hits, rule.another) * rule.look_fails**looks
 
 
-def far(hits: int, rule: Evidence) -> float:
+def far_missed(hits: int, rule: Evidence) -> float:
     """Probability that a better optimum far from the best pose was not met."""
     return rule.another * 0.5**hits
