@@ -27,7 +27,7 @@ GROUND = {
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),
     "robust": set(),
-    "search": set(),
+    "search": {"robust"},
     "layers": {"robust"},
     "models": {"robust", "layers", "search"},
     "solving": {"robust", "layers", "search", "models", "report", "datamodules"},

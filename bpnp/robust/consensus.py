@@ -1,8 +1,8 @@
 """Random sample consensus on candidate matches for a whole batch at once: sampling, scoring and local refinement.
 
 The random numbers are a hash of a seed and a counter, the same on every device and for every sample of a batch, so that
-a pose depends neither on the other samples nor on padding. No shape, loop or branch depends on the data, so nothing
-waits for the device.
+a pose depends neither on the other samples nor on padding. No shape depends on the data: the minimal problems alone are
+solved on the CPU, of all samples at once.
 """
 
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from bpnp.geometry import bearings, retract, transform
-from bpnp.robust.p3p import poses_of_triples, take
+from bpnp.robust.minimal_solvers import poses_of_triples, take
 
 SMALLEST_POOL = 16  # matches of largest weight, from which the first triples of a growing pool are drawn
 

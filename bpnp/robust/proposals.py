@@ -14,7 +14,7 @@ from bpnp.distinct_poses import distinct
 from bpnp.geometry import bearings
 from bpnp.precision import full_precision
 from bpnp.robust.consensus import Matches, in_scene, normalised, take, truncated_scores, weighted_draws
-from bpnp.robust.p3p import poses_of_triples
+from bpnp.robust.minimal_solvers import poses_of_triples
 from bpnp.types import SolveStats
 
 TRIPLES = 1024  # solved for each sample

@@ -3,13 +3,13 @@
 import numpy as np
 
 from bpnp.loops.parallel import NEVER, one_blas_thread
+from bpnp.loops.vectors import F
 from bpnp.search.enumeration.search import search_by_enumeration
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.neighbours import HashedPoints, sums_near
 from bpnp.search.kernels.raster import add_shifted, add_up
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, blocks_of
 from bpnp.search.kernels.sparse import build_tiles, descend_sparse, sparse_scratch
-from bpnp.search.kernels.vectors import F
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT
 

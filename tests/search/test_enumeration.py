@@ -2,7 +2,6 @@ import itertools
 import math
 import time
 import tracemalloc
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,9 +12,14 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
-from bpnp.robust.p3p import p3p as batched_p3p
-from bpnp.search.enumeration.minimal_solvers import chords_between, p2p, p3p
-from bpnp.search.enumeration.points import ImageSide, nearest_of, prior_arrays, scene_side, sets_within, triangles_of
+from bpnp.robust.minimal_solvers import p3p, solve_p2p
+from bpnp.search.enumeration.points import (
+    ImageSide,
+    nearest_of,
+    prior_arrays,
+    scene_side,
+    sets_within,
+)
 from bpnp.search.enumeration.poses import EnumeratedPoses, Enumeration, enumerate_poses, margin
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
@@ -45,52 +49,6 @@ def solved(
 ) -> EnumeratedPoses:
     sets = PointSets(rays, points, **known)
     return enumerate_poses(sets, radius=RADIUS, is_safe=is_safe, deadline=deadline)
-
-
-@pytest.fixture(scope="module")
-def compiled_p3p(entry: Any) -> Callable[[Array, Array], list[Array]]:
-    """Poses (12,) of one triple."""
-
-    def solve(rays: Array, points: Array) -> list[Array]:
-        triangles = triangles_of(points, np.empty((0, 3)), np.array([[0, 1, 2]]))
-        if not len(triangles.triples):
-            return []
-        seen, poses = tuple(triangles.triples[0]), np.empty((4, 4, 3))
-        chords = entry(chords_between)(rays, *seen)
-        count = entry(p3p)(rays, seen, chords, triangles, 0, poses)
-        return [pose.ravel() for pose in poses[:count]]
-
-    return solve
-
-
-def test_compiled_p3p_has_the_poses_of_the_batched_one(compiled_p3p: Any) -> None:
-    rng = np.random.default_rng(0)
-    rays, points = np.empty((2000, 3, 3)), rng.uniform(-1, 1, (2000, 3, 3))
-    for i in range(2000):
-        rotation = Rotation.random(random_state=i).as_matrix()
-        rays[i] = directions(points[i] @ rotation.T + [0.3, -0.2, 4])
-    batched = batched_p3p(torch.tensor(rays), torch.tensor(points))
-    different = 0
-    for i in range(2000):
-        found = compiled_p3p(rays[i], points[i])
-        theirs = torch.cat([batched.rotation[i].flatten(1), batched.translation[i]], -1)[batched.valid[i]].numpy()
-        if len(found) != len(theirs):
-            different += 1
-            continue
-        for pose in found:
-            assert np.abs(theirs - pose).max(1).min() < 1e-6
-    assert different <= 2
-
-
-@pytest.mark.parametrize("points", [np.zeros((3, 3)), np.outer([0.0, 1, 3], [1.0, 2, 3]), np.eye(3)[[0, 1, 1]]])
-def test_flat_triangles_have_no_pose(compiled_p3p: Any, points: Array) -> None:
-    assert compiled_p3p(directions(np.random.default_rng(0).normal(0, 0.2, (3, 3)) + [0, 0, 1]), points) == []
-
-
-def test_rays_that_no_pose_explains_have_none(compiled_p3p: Any) -> None:
-    narrow = directions(np.array([[0.0, 0, 1], [1e-9, 0, 1], [0, 1, 0.2]]))
-    for pose in compiled_p3p(narrow, np.eye(3)):
-        assert np.isfinite(pose).all()
 
 
 @pytest.mark.parametrize(("seen", "hidden", "background"), [(4, 0, 0), (5, 0, 0), (6, 0, 3), (8, 6, 4), (12, 6, 5)])
@@ -143,7 +101,7 @@ def brute_force(rays: Array, points: Array, radius: float) -> int:
     """Most one-to-one matches of any pose that P3P gives for any three pairs."""
     triples = list(itertools.product(itertools.combinations(range(len(rays)), 3), itertools.permutations(range(5), 3)))
     rows, columns = (np.array(side) for side in zip(*triples, strict=True))
-    solution = batched_p3p(torch.tensor(rays[rows]), torch.tensor(points[columns]))
+    solution = p3p(torch.tensor(rays[rows]), torch.tensor(points[columns]))
     rotation, translation = solution.rotation[solution.valid].numpy(), solution.translation[solution.valid].numpy()
     seen = directions(points @ rotation.transpose(0, 2, 1) + translation[:, None])
     near = np.linalg.norm(rays[:, None] - seen[:, None], axis=-1) < radius
@@ -225,7 +183,7 @@ def test_two_matches_and_a_direction_give_the_pose(entry: Any, kind: str) -> Non
         known = prior_arrays(sets, scene, image, DEFAULT)
         run = Enumeration(scene, image, known, 2, 2.0, DEFAULT)
         poses = np.empty((4, 4, 3))
-        count = entry(p2p)(0, 1, match[0], match[1], known[1], image.arrays.rays, scene.arrays.points, poses)
+        count = entry(solve_p2p)(0, 1, match[0], match[1], known[1], image.arrays.rays, scene.arrays.points, poses)
         assert 0 < count <= 2
         rotations, translations = run.leave(poses[:count])
         off = np.abs(rotations - rotation).max((1, 2)) + np.abs(translations - translation).max(1)

@@ -9,10 +9,10 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
+from bpnp.loops.vectors import turn
 from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints
 from bpnp.search.kernels.sparse import REACH, Tiles, assign_sparse, build_tiles, descend_sparse, sparse_scratch
-from bpnp.search.kernels.vectors import turn
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 

@@ -14,7 +14,7 @@ from bpnp.geometry import MIN_POINTS, bearings, project, transform
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
 from bpnp.robust.consensus import Matches, distinct_triples, refine_locally
-from bpnp.robust.p3p import p3p
+from bpnp.robust.minimal_solvers import p3p
 
 TRIPLES = 256  # random ones, solved at a time
 PREVIEW = 32  # 2D points on which every hypothesis of random triples is scored

@@ -3,14 +3,11 @@
 import math
 from typing import Any, NamedTuple
 
-from bpnp.loops.compilation import compiler
+from bpnp.loops.vectors import rotated
+from bpnp.robust.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
-from bpnp.search.enumeration.minimal_solvers import chords_between, p2p, p3p, part
-from bpnp.search.enumeration.points import Array, Heading, Places, Triangles
+from bpnp.search.enumeration.points import Array, Heading, Places
 from bpnp.search.enumeration.settings import RULES
-from bpnp.search.kernels.vectors import rotated
-
-compiled = compiler(_nrt=False)
 
 
 class Block(NamedTuple):
@@ -90,9 +87,9 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
                 continue
             solved += 1
             if block.size == 3:
-                count = p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
+                count = solve_p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
             else:
-                count = p2p(i, j, a, b, block.heading, rays, problem.scene.points, poses)
+                count = solve_p2p(i, j, a, b, block.heading, rays, problem.scene.points, poses)
             for s in range(count):
                 pose = poses[s]
                 if not (

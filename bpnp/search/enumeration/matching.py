@@ -7,11 +7,11 @@ the compiled code, and costs time to compile.
 import math
 from typing import Any, NamedTuple
 
-from bpnp.search.enumeration.minimal_solvers import part
+from bpnp.loops.vectors import rotated, turn
+from bpnp.robust.minimal_solvers import part
 from bpnp.search.enumeration.points import Array, ImagePoints, Places, PriorArrays, ScenePoints
 from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
-from bpnp.search.kernels.vectors import rotated, turn
 
 
 class Problem(NamedTuple):

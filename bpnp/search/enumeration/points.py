@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bpnp.robust.minimal_solvers import Triangles, triangles_of
 from bpnp.search.enumeration.settings import RULES, EnumerationSettings
 from bpnp.search.enumeration.symmetries import Motion, near_symmetries
 from bpnp.search.point_sets import PointSets
@@ -19,7 +20,6 @@ Places = NDArray[np.int64]
 DENSE = 64  # points up to which all are ranked; beyond, only the nearest of each
 OPPOSITE = -0.8  # cosine of two normals that no camera faces at once
 SCENES = 8  # whose tables are remembered
-FLAT = 1e-12  # squared height of a triangle over its squared longest side
 SLACK = math.cos(math.radians(95.0))  # the lines of sight to three points are not quite parallel
 EDGE_ON = 0.15  # sine of an angle to the triangle's plane, below which either orientation is possible
 
@@ -60,21 +60,6 @@ class ImagePoints(NamedTuple):
 
     rays: Array
     grid: Grid
-
-
-class Triangles(NamedTuple):
-    """What P3P needs of scene triples that a camera can see.
-
-    triples: (t, 3), turned so that the longest side is 12. sides: (t, 3), |p_0 - p_1|^2 / s^2, |p_2 - p_0|^2 / s^2 and
-    s = |p_1 - p_2|. frames: (t, 3, 3) of `p3p.triangle_axes`. middles: (t, 3). orientation: (t,), 1 where a camera can
-    face all three points and see them in the order of their triangle's normal, 2 in the other order, 3 either.
-    """
-
-    triples: Places
-    sides: Array
-    frames: Array
-    middles: Array
-    orientation: Places
 
 
 class PriorArrays(NamedTuple):
@@ -122,7 +107,7 @@ class SceneSide:
         if (size, near) not in self._triangles:
             sets = sets_within(self.nearest, near, size)
             self._triangles[size, near] = (
-                triangles_of(self.arrays.points, self.arrays.normals, sets) if size == 3 else pairs(sets)
+                visible_triangles(self.arrays.points, self.arrays.normals, sets) if size == 3 else pairs(sets)
             )
         return self._triangles[size, near]
 
@@ -211,27 +196,15 @@ def sets_within(nearest: Places, near: int, size: int) -> Places:
     return np.ascontiguousarray(sets[np.sort(np.unique(key, return_index=True)[1])])
 
 
-def triangles_of(points: Array, normals: Array, triples: Places) -> Triangles:
-    """The triangles of scene triples (t, 3) of points (n, 3). normals: (n, 3) or (0, 3)."""
-    p = points[triples]
-    opposite = ((np.roll(p, -1, 1) - np.roll(p, -2, 1)) ** 2).sum(-1)
-    turn = (opposite.argmax(1)[:, None] + np.arange(3)) % 3
-    triples, p = np.take_along_axis(triples, turn, 1), np.take_along_axis(p, turn[..., None], 1)
-    length2 = np.maximum(opposite.max(1), 1e-300)
-    along = (p[:, 1] - p[:, 2]) / np.sqrt(length2)[:, None]
-    normal = np.cross(along, p[:, 0] - p[:, 2])
-    height2 = (normal**2).sum(-1)
-    normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
-    frames = np.stack([along, np.cross(normal, along), normal], 1)
-    a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
-    orientation: Places = np.full(len(triples), 3)
+def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangles:
+    """The triangles of scene triples (t, 3) that a camera can see. normals: (n, 3) or (0, 3)."""
+    triangles = triangles_of(points, triples)
+    orientation = triangles.orientation
     if len(normals):
-        facing = (normals @ DIRECTIONS.T > SLACK)[triples].all(1)
-        above = normal @ DIRECTIONS.T
-        orientation = np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
-    seen = (height2 > FLAT * length2) & (orientation > 0)
-    tables = triples, np.stack([a, b, np.sqrt(length2)], -1), frames, p.mean(1), orientation
-    return Triangles(*(np.ascontiguousarray(table[seen]) for table in tables))
+        facing = (normals @ DIRECTIONS.T > SLACK)[triangles.triples].all(1)
+        above = triangles.frames[:, 2] @ DIRECTIONS.T
+        orientation &= np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
+    return Triangles(*(np.ascontiguousarray(table[orientation > 0]) for table in triangles))
 
 
 def pairs(sets: Places) -> Triangles:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.kernels.vectors import compiled, part
+from bpnp.loops.vectors import compiled, part
 
 Array = NDArray[np.float64]
 CELLS = 64  # along a side of the grid, at most

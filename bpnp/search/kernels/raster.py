@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from bpnp.loops.vectors import F, compiled, part, rotated
 from bpnp.search.kernels.sides import WeightedPoints, visible_weights
-from bpnp.search.kernels.vectors import F, compiled, part, rotated
 
 
 class Raster(NamedTuple):

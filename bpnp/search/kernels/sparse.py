@@ -13,9 +13,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.loops.vectors import F, compiled, part, sum_of
 from bpnp.search.kernels.dense import directions, move
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, visible_weights
-from bpnp.search.kernels.vectors import F, compiled, part, sum_of
 
 SWEEPS = 2
 TILES = 12  # with neighbours, of a point in the mean, before there is place for more

@@ -1,27 +1,140 @@
-"""Minimal solvers, compiled: three matches (P3P, the solver of `bpnp.robust.p3p` without a batch), or two and a prior.
+"""Minimal solvers, compiled: three matches (P3P), or two where a direction is known (P2P).
 
-The three pairs of points are 01, 12, 20. The caller puts the longest side of the scene's triangle between 1 and 2.
-A division by zero is infinite, as in C; every root is tested before it is used. Poses are (4, 3): R, and t below it.
+The three sides of a triangle are 01, 12, 20, the longest one between 1 and 2. A division by zero is infinite, as in C;
+every root is tested before it is used. Poses are (4, 3): R, and t below it.
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
 
 from bpnp.loops.compilation import compiler
-from bpnp.search.enumeration.points import FLAT
-from bpnp.search.kernels.vectors import cross, rotated
+from bpnp.loops.parallel import in_threads
+from bpnp.loops.vectors import cross, rotated
 
+compiled = compiler(_nrt=False)
 part = compiler(_nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
+FLAT = 1e-12  # squared height of a triangle over its squared longest side
 TOLERANCE = 1e-6  # of the squared sides, in units of the longest
 ROUNDING = 1e-12  # of a discriminant: what is smaller than this counts as zero
 LEVEL = 1e-6  # sine of both rays' height, below which a known vertical says nothing about their depths
 UPRIGHT = 1e-3  # horizontal part of the way between two points, below which it says nothing about the heading
+Array = NDArray[np.float64]
+
+
+class Triangles(NamedTuple):
+    """What P3P needs of t triples of scene points.
+
+    triples: (t, 3) places of the points, turned so that the longest side is 12. sides: (t, 3), |p_0 - p_1|^2 / s^2,
+    |p_2 - p_0|^2 / s^2 and s = |p_1 - p_2|. frames: (t, 3, 3), rows along the longest side, across it, and the normal.
+    middles: (t, 3). orientation: (t,), 1 where a camera can see the points in the order of the triangle's normal, 2 in
+    the other order, 3 either, 0 where the points lie on a line or are not finite.
+    """
+
+    triples: NDArray[np.int64]
+    sides: Array
+    frames: Array
+    middles: Array
+    orientation: NDArray[np.int64]
+
+
+def triangles_of(points: Array, triples: NDArray[np.int64]) -> Triangles:
+    """The triangles of triples (t, 3) of points (n, 3), seen in either order."""
+    p = points[triples]
+    opposite = ((np.roll(p, -1, 1) - np.roll(p, -2, 1)) ** 2).sum(-1)
+    turn = (opposite.argmax(1)[:, None] + np.arange(3)) % 3
+    triples, p = np.take_along_axis(triples, turn, 1), np.take_along_axis(p, turn[..., None], 1)
+    length2 = np.maximum(opposite.max(1), 1e-300)
+    along = (p[:, 1] - p[:, 2]) / np.sqrt(length2)[:, None]
+    normal = np.cross(along, p[:, 0] - p[:, 2])
+    height2 = (normal**2).sum(-1)
+    normal /= np.sqrt(np.maximum(height2, 1e-300))[:, None]
+    a, b = (((p[:, 0] - p[:, k]) ** 2).sum(-1) / length2 for k in (1, 2))
+    sides, frames = np.stack([a, b, np.sqrt(length2)], -1), np.stack([along, np.cross(normal, along), normal], 1)
+    return Triangles(triples, sides, frames, p.mean(1), np.where(height2 > FLAT * length2, 3, 0))
+
+
+class P3P(NamedTuple):
+    """Up to four poses a sample, camera = R p + t; slots without a solution hold NaN and `valid` False."""
+
+    rotation: Float[Tensor, "*b 4 3 3"]
+    translation: Float[Tensor, "*b 4 3"]
+    valid: Bool[Tensor, "*b 4"]
+
+
+def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) -> P3P:
+    """Solve d_i f_i = R p_i + t, d_i > 0, for three matches (rows of the last two axes).
+
+    With x = d_0/d_2 and y = d_1/d_2 the law of cosines in the triangles at the camera gives two conics in (x, y). One
+    real root s of the cubic det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the conics in at
+    most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023). Newton steps on
+    |d_i f_i - d_j f_j| = |p_i - p_j| then make the depths exact.
+
+    bearings: rays in the camera frame, of any length. points3d: scene units, any scale and offset. Computed in float64
+    on the CPU, returned in the type and on the device of `points3d`. The four slots have no order, and where two
+    solutions meet both are given. Points on a line, within a millionth of the longest side, rays that no pose
+    explains, NaN and infinity give `valid` False.
+
+    >>> points3d = torch.eye(3)
+    >>> camera = points3d + torch.tensor([0.0, 0.0, 5.0])
+    >>> solution = p3p(camera, points3d)
+    >>> rotation_is_found = (solution.rotation - torch.eye(3)).abs().amax((-2, -1)) < 1e-5
+    >>> bool((rotation_is_found & solution.valid).any())
+    True
+    """
+    rays, points = (values.detach().double().cpu().numpy().reshape(-1, 3, 3) for values in (bearings, points3d))
+    poses = np.full((len(points), 4, 4, 3), np.nan)
+
+    def solve(first: int, last: int) -> None:
+        corners = points[first:last].reshape(-1, 3)
+        with np.errstate(all="ignore"):  # what is not finite has no pose
+            unit = rays[first:last].reshape(-1, 3)
+            unit = unit / np.linalg.norm(unit, axis=-1, keepdims=True)
+            triangles = triangles_of(corners, np.arange(len(corners)).reshape(-1, 3))
+        _solve_each(unit, triangles, poses[first:last], np.empty((4, 4, 3)))
+
+    in_threads(solve, len(poses))
+    found = torch.from_numpy(poses).reshape(*points3d.shape[:-2], 4, 4, 3).to(points3d)
+    rotation, translation = found[..., :3, :], found[..., 3, :]
+    return P3P(rotation, translation, rotation[..., 0, 0].isfinite())
+
+
+@compiled
+def _solve_each(rays: Any, triangles: Any, poses: Any, scratch: Any) -> None:
+    """Fill `poses` (t, 4, 4, 3), NaN before, of each triangle. scratch: (4, 4, 3)."""
+    for t in range(len(poses)):
+        i, j, k = triangles.triples[t, 0], triangles.triples[t, 1], triangles.triples[t, 2]
+        if triangles.orientation[t]:
+            for s in range(solve_p3p(rays, (i, j, k), chords_between(rays, i, j, k), triangles, t, scratch)):
+                for r in range(4):
+                    for c in range(3):
+                        poses[t, s, r, c] = scratch[s, r, c]
+
+
+def poses_of_triples(rays: Float[Tensor, "b h 3 3"], points3d: Float[Tensor, "b h 3 3"]) -> Float[Tensor, "b s 3 4"]:
+    """Poses [R | t] of all triples of a sample in s = 2 h + 2 slots, those without a pose NaN and last.
+
+    A triple has fewer than two solutions on average. Solutions beyond the s-th are dropped.
+    """
+    solution = p3p(rays, points3d)
+    poses = torch.cat([solution.rotation, solution.translation.unsqueeze(-1)], -1).flatten(1, 2)
+    filled = solution.valid.flatten(1).byte().argsort(dim=1, descending=True, stable=True)
+    return take(poses, filled[:, : 2 * points3d.shape[1] + 2])
+
+
+def take(values: Tensor, index: Int[Tensor, "b k"]) -> Tensor:
+    """values[b, index[b, i], ...] for every sample b."""
+    trailing = values.shape[2:]
+    return values.gather(1, index.view(*index.shape, *(1 for _ in trailing)).expand(*index.shape, *trailing))
 
 
 @part
-def p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
+def solve_p3p(rays: Any, seen: Any, chords: Any, triangles: Any, t: int, poses: Any) -> int:
     """Fill `poses` (4, 4, 3) with those under which triangle t is seen along three of the rays (m, 4); how many.
 
     seen: the three places of the rays. chords: of `chords_between` these.
@@ -225,7 +338,7 @@ def polished(d0: float, d1: float, d2: float, chords: Any, a: float, b: float, d
 
 
 @part
-def p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
+def solve_p2p(i: int, j: int, a: int, b: int, heading: Any, rays: Any, points: Any, poses: Any) -> int:
     """Fill `poses` with those under which points a and b are seen along the rays i and j, a direction being known; how
     many there are, up to two.
 
