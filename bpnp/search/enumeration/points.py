@@ -3,7 +3,7 @@ what a prior says in their frames."""
 
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,6 @@ from scipy.spatial import cKDTree
 
 from bpnp.robust.minimal_solvers import Triangles, triangles_of
 from bpnp.search.enumeration.settings import RULES, EnumerationSettings
-from bpnp.search.enumeration.symmetries import Motion, near_symmetries
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior, Prior, turned_to
 
@@ -115,16 +114,6 @@ class SceneSide:
         """Whether they are there already."""
         return (size, min(near, self.nearest.shape[1])) in self._triangles
 
-    @functools.cached_property
-    def symmetries(self) -> list[Motion]:
-        """Of the points of the arrays."""
-        return near_symmetries(self.arrays.points)
-
-    @property
-    def knows_symmetries(self) -> bool:
-        """Whether they are there already."""
-        return "symmetries" in vars(self)
-
 
 class ImageSide:
     """The image of one problem.
@@ -204,7 +193,8 @@ def visible_triangles(points: Array, normals: Array, triples: Places) -> Triangl
         facing = (normals @ DIRECTIONS.T > SLACK)[triangles.triples].all(1)
         above = triangles.frames[:, 2] @ DIRECTIONS.T
         orientation &= np.stack([(facing & (side * above < EDGE_ON)).any(1) for side in (-1, 1)], -1) @ (1, 2)
-    return Triangles(*(np.ascontiguousarray(table[orientation > 0]) for table in triangles))
+    tables: Any = (np.ascontiguousarray(table[orientation > 0]) for table in triangles)
+    return Triangles(*tables)
 
 
 def pairs(sets: Places) -> Triangles:

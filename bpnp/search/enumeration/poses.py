@@ -168,23 +168,10 @@ class Enumeration:
             self._pace = (Clock.now() - start) / solved
 
     def vary_best(self) -> None:
-        """Refine the best pose again on wider and on other matches, and its mirror twin: its nearly flat matched points
-        seen at the opposite tilt."""
-        if not math.isfinite(self.best):
-            return
-        for reach in (0.5 * self.reach, self.reach):
-            self.refine(self.best_pose, reach, exchanged=reach == self.reach)
-        matched = self.kept.point[int(self.kept.evidence.argmax())]
-        seen = self.scene.arrays.points[matched[matched >= 0]]
-        if len(seen) < 3:
-            return
-        rotation, translation = self.best_pose[:3], self.best_pose[3]
-        centre = seen.mean(0)
-        normal = np.linalg.svd(seen - centre)[2][2]
-        middle = rotation @ centre + translation
-        sight = middle / np.linalg.norm(middle)
-        turned = (np.eye(3) - 2 * np.outer(sight, sight)) @ rotation @ (np.eye(3) - 2 * np.outer(normal, normal))
-        self.refine(np.vstack([turned, middle - turned @ centre]), self.reach)
+        """Refine the best pose again on wider and on other matches."""
+        if math.isfinite(self.best):
+            for reach in (0.5 * self.reach, self.reach):
+                self.refine(self.best_pose, reach, exchanged=reach == self.reach)
 
     def refine(self, pose: Array, reach: float, *, exchanged: bool = False) -> None:
         """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it.
@@ -235,18 +222,10 @@ def enumerate_poses(
     prior = prior_arrays(sets, scene, image, settings)
     run = Enumeration(scene, image, prior, sets.pairs_that_fix, reach, settings)
 
-    def vary(*, late: bool = False) -> None:
-        run.vary_best()
-        if not math.isfinite(run.best):
-            return
-        for turn, shift in scene.symmetries if scene.knows_symmetries or not late else ():
-            rotation, translation = run.best_pose[:3], run.best_pose[3]
-            run.refine(np.vstack([rotation @ turn, rotation @ shift + translation]), run.reach)
-
     def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
         if run.best < run.tests:
             return None
-        vary()
+        run.vary_best()
         poses = _poses(run, "safe")
         if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
             is_safe is None or is_safe(poses)
@@ -263,7 +242,7 @@ def enumerate_poses(
         if stage.matches < run.fixing:
             continue
         if run.seconds_to_begin(stage) > deadline - Clock.now():
-            vary(late=True)
+            run.vary_best()
             return _poses(run, "interrupted")
         run.begin(stage)
         while not run.ended:
@@ -272,12 +251,12 @@ def enumerate_poses(
                 return poses
             late = deadline - Clock.now() < SHORTEST
             if late or run.solved > settings.most:
-                vary(late=late)
+                run.vary_best()
                 return _poses(run, "interrupted" if late else "most")
         complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
         if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
             break
-    vary()
+    run.vary_best()
     return _poses(run, "exhausted" if complete else "most")
 
 
