@@ -98,7 +98,7 @@ def photos(
     """At most `limit` photos of the scenes together. chosen: options of `view_pair`."""
     each = -(-limit // len(scenes))
     pairs = [pair for name in scenes for pair in scene_pairs(data, name, limit=each, seed=seed, **chosen)]
-    return elsewhere(pairs) if apart else pairs[:limit]
+    return (elsewhere(pairs) if apart else pairs)[:limit]
 
 
 def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:

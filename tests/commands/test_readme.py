@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +14,29 @@ from bpnp.commands.parser import parsed_arguments
 from bpnp.examples import load
 
 ROOT = Path(__file__).parents[2]
-TEXTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-COMMAND_LINES = [
-    (text.name, line.split("#")[0].strip())
-    for text in TEXTS
-    for block in re.findall(r"```\n(.*?)```", text.read_text(encoding="utf-8"), re.DOTALL)
-    for line in block.splitlines()
-    if line.startswith(("bpnp ", "make "))
-]
+TEXTS = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
+BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 
 
-def test_there_are_commands_to_test() -> None:
-    assert len(COMMAND_LINES) > 12
+def blocks(text: Path, language: str) -> list[str]:
+    return [code for name, code in BLOCK.findall(text.read_text(encoding="utf-8")) if name == language]
+
+
+def command_lines() -> Iterator[tuple[str, str]]:
+    for text in TEXTS:
+        for line in "".join(blocks(text, "")).replace("\\\n", " ").splitlines():
+            if line.startswith(("bpnp ", "lightning ", "make ")):
+                yield text.name, line.split("#")[0].strip()
+
+
+COMMAND_LINES = list(command_lines())
+
+
+def test_every_command_line_of_the_texts_is_looked_at() -> None:
+    """Counted in another way: lines that begin with a command, wherever they stand."""
+    lines = [line for text in TEXTS for line in text.read_text(encoding="utf-8").splitlines()]
+    assert len(COMMAND_LINES) == sum(bool(re.match(r"(bpnp|lightning|make) [a-z]", line)) for line in lines)
+    assert len(COMMAND_LINES) > 40
 
 
 @pytest.mark.parametrize(("text", "line"), COMMAND_LINES)
@@ -37,7 +48,7 @@ def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture
         return
     name, rest = words[1], words[2:]
     if name in LIGHTNING:
-        if "FILE" not in rest and not (rest and rest[0] == "--help"):
+        if not {"FILE", "--help"} & set(rest):
             with pytest.raises(SystemExit) as stop:
                 main([name, *rest, "--print_config"])  # parses everything and runs nothing
             assert stop.value.code in (0, None), capsys.readouterr().err
@@ -50,27 +61,38 @@ def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture
 
 @pytest.mark.parametrize("text", TEXTS, ids=lambda path: path.name)
 def test_links_lead_somewhere(text: Path) -> None:
-    for target in re.findall(r"\]\(([^)#]+)\)", text.read_text(encoding="utf-8")):
-        if not target.startswith("http"):
-            assert (text.parent / target).exists(), target
+    """Files, and headings in them."""
+    for target, heading in re.findall(r"\]\(([^)#]*)(?:#([^)]*))?\)", text.read_text(encoding="utf-8")):
+        if target.startswith("http"):
+            continue
+        file = (text.parent / target) if target else text
+        assert file.exists(), target
+        if heading:
+            titles = re.findall(r"^#+ (.*)$", file.read_text(encoding="utf-8"), re.MULTILINE)
+            slugs = {re.sub(r"[^\w\- ]", "", title).strip().lower().replace(" ", "-") for title in titles}
+            assert heading in slugs, f"{target}#{heading}"
+
+
+def test_every_picture_is_shown_somewhere() -> None:
+    shown = " ".join(text.read_text(encoding="utf-8") for text in TEXTS)
+    assert [file.name for file in (ROOT / "docs" / "images").iterdir() if file.name not in shown] == []
 
 
 def test_the_readme_is_short() -> None:
     lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 100
+    assert len(lines) <= 90
     assert max(map(len, lines)) <= 120
 
 
 def test_the_code_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert len(blocks) == 2
+    first, second = blocks(ROOT / "README.md", "python")
     names: dict[str, Any] = {}
-    exec(blocks[0], names)
+    exec(first, names)
     assert names["example"].rotation_error_deg(names["solution"].rotation) < 0.5  # the map is off by depth noise
     assert (tmp_path / "pose.png").stat().st_size > 5000
     mesh = load("mesh")
     bearings = np.c_[mesh.points2d, np.ones(200)] @ np.linalg.inv(mesh.camera).T
     names |= {"points2d": bearings[:, :2], "points3d": mesh.points3d}
-    exec(blocks[1], names)
+    exec(second, names)
     assert names["pose"].rotation.shape == (1, 3, 3)
