@@ -62,8 +62,12 @@ def rougher(candidates: Candidates) -> Alternative | None:
 
 def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternative | None:
     """Another focal length or other proportions of the scene, where these explain the residuals significantly better
-    and with them the pose would be a different one; None otherwise. `count`: of the matches."""
-    off = systematic_misfit(linear, count)
+    and with them the pose would be a different one; None otherwise.
+
+    count: of the matches. Where the focal length cannot be told, the camera is believed as it was given; where another
+    one is significantly better and moves the middle of the scene by more than `rule.other_shift`, the pose is in doubt.
+    """
+    off = systematic_misfit(linear, count, rule)
     if math.degrees(off.turn) <= rule.other_deg and off.shift <= rule.other_shift:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"

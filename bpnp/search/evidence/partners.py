@@ -28,6 +28,7 @@ MOST_ZOOM, SAME_ZOOM = 0.2, 0.01  # step of the logarithm, at most; change that 
 BLOCKS = 8  # of the image, along a side
 MOST_NATS = 2.0  # that a block says
 CHANCE = 1e-3  # of a better fit
+FITTED_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # of the residuals, for steps of a pose with its focal length
 
 
 def facing(sets: PointSets, camera: Array, rotation: Array) -> Labels:
@@ -149,6 +150,16 @@ def at_other_focal_length(sets: PointSets, rotation: Array, middle: Array, scale
                 if total > gained:
                     best, gained = step, total
     return best
+
+
+def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:
+    """A pose with residuals of `scale`, and the focal length that fits it best, after a few Gauss-Newton steps of both;
+    None if nothing matches. middle: (3,) of the scene, seen from the camera."""
+    chosen = sets.image.chosen
+    step = _zoomed(sets, chosen, FITTED_WIDTHS[0] * scale, rotation, middle, 1.0)
+    for width in FITTED_WIDTHS:
+        step = None if step is None else _stepped(sets, chosen, width * scale, step)
+    return step
 
 
 def _stepped(sets: PointSets, chosen: Labels, scale: float, at: Zoomed) -> Zoomed | None:

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.partners import Zoomed, across, at_other_focal_length, facing, partners
+from bpnp.search.evidence.partners import Zoomed, across, at_other_focal_length, facing, partners, with_focal_length
 from bpnp.search.point_sets import PointSets
+from bpnp.search.settings import DEFAULT, Evidence
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
@@ -218,13 +219,14 @@ class Misfit(NamedTuple):
     zoom: float = 1.0
 
 
-def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
+def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
     """What is significant in the residuals of a pose, `linearised`, with `count` matches: the largest step of three.
 
     - Beside the pose, five strains of the scene are fitted to the residuals, weighed with the probabilities of the
       partners. Of their principal directions, the pose eliminated, those count whose F statistic chance exceeds once in
       a thousand.
-    - The same with the log of the focal length.
+    - The same with the log of the focal length, once in a hundred (`rule.focal_chance`); with other partners too
+      (`with_focal_length`), since those of a linear fit hold it back.
     - Pose and focal length that explain the points better, with other partners, of `ZOOMED_FROM` matches or more:
       `at_other_focal_length`, if it has a thousandth of the false alarms.
 
@@ -247,16 +249,20 @@ def systematic_misfit(linear: Linearised | None, count: float) -> Misfit:
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)
     distance = max(float(np.linalg.norm(linear.middle)), 1e-300)
     found = []
-    for fitted in (slice(POSE, POSE + 1), slice(POSE + 1, POSE + 1 + len(STRAINS))):
-        moved, step = _moved(products, pose, fitted, free)
+    strains = slice(POSE + 1, POSE + 1 + len(STRAINS))
+    for fitted, chance in ((slice(POSE, POSE + 1), rule.focal_chance), (strains, EXCEEDED)):
+        moved, step = _moved(products, pose, fitted, free, chance)
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
-    other = None
+    pose_of = linear.sets, linear.rotation, linear.middle, linear.scale
+    others = [with_focal_length(*pose_of)] if found[0].zoom != 1 else []
     if count >= ZOOMED_FROM:
-        other = at_other_focal_length(linear.sets, linear.rotation, linear.middle, linear.scale)
-    if other is not None and _decades_ahead(other, linear) >= ZOOMED_LEAD:
-        turn = math.acos(min(1.0, (float(np.trace(other.rotation @ linear.rotation.T)) - 1) / 2))
-        found.append(Misfit(turn, float(np.linalg.norm(other.middle - linear.middle)) / distance, other.zoom))
+        other = at_other_focal_length(*pose_of)
+        others += [other] if other is not None and _decades_ahead(other, linear) >= ZOOMED_LEAD else []
+    for each in others:
+        if each is not None:
+            turn = math.acos(np.clip((np.trace(each.rotation @ linear.rotation.T) - 1) / 2, -1, 1))
+            found.append(Misfit(turn, float(np.linalg.norm(each.middle - linear.middle)) / distance, each.zoom))
     return Misfit(
         max(each.turn for each in found),
         max(each.shift for each in found),
@@ -279,11 +285,12 @@ def _decades_ahead(other: Zoomed, linear: Linearised) -> float:
     return alarms[0] - alarms[1]
 
 
-def _moved(products: Array, pose: Array, fitted: slice, free: float) -> tuple[Array, Array]:
+def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
     """The step (6,) of the pose if the `fitted` columns are fitted to the residuals beside it, and that of these.
 
     products: of the columns with each other; the first six are the pose's, the last one holds the residuals. pose:
-    (6, 6), the inverse of those of the pose. free: numbers that were measured, less those of the pose.
+    (6, 6), the inverse of those of the pose. free: numbers that were measured, less those of the pose. chance: with
+    which less may be significant.
     """
     across = pose @ products[:POSE, fitted]
     values, directions = np.linalg.eigh(products[fitted, fitted] - products[fitted, :POSE] @ across)
@@ -295,6 +302,7 @@ def _moved(products: Array, pose: Array, fitted: slice, free: float) -> tuple[Ar
     step = (products[fitted, -1] - across.T @ products[:POSE, -1]) @ directions / values
     gain = step**2 * values
     rest = products[-1, -1] - float(products[-1, :POSE] @ pose @ products[:POSE, -1]) - float(gain.sum())
-    significant = fdtrc(1, free, gain * free / max(rest, 1e-300)) < EXCEEDED / len(values)
+    # Beyond `free` is what several possible partners of a point add, not the scale of the residuals.
+    significant = fdtrc(1, free, gain * free / np.clip(rest, 1e-300, free)) < chance / len(values)
     step = directions @ np.where(significant, step, 0.0)
     return np.asarray(across @ step), step
