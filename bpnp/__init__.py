@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from bpnp.search.warm_up import warm_up
     from bpnp.solving.solution import Solution
     from bpnp.solving.solve import solve, solve_many
+    from bpnp.solving.verify import verify
     from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 __all__ = [
@@ -28,6 +29,7 @@ __all__ = [
     "SolveStats",
     "solve",
     "solve_many",
+    "verify",
     "warm_up",
 ]
 
@@ -41,6 +43,7 @@ __getattr__, __dir__, _ = lazy_loader.attach(
         "search.warm_up": ["warm_up"],
         "solving.solution": ["Solution"],
         "solving.solve": ["solve", "solve_many"],
+        "solving.verify": ["verify"],
         "types": ["Batch", "Pose", "Prediction", "SolveStats"],
     },
 )

@@ -1,4 +1,4 @@
-"""`bpnp solve`: the pose of a camera from a file of image points and a file of scene points."""
+"""`bpnp solve` and `bpnp verify`: the pose of a camera from a file of image points and a file of scene points."""
 
 import time
 from pathlib import Path
@@ -137,6 +137,84 @@ def solve(
     if colmap is not None:
         written = solution.to_colmap(colmap, name="image.jpg" if photo is None else photo.name)
         say(f"wrote {written}", to=said)
+
+
+def verify(
+    points2d: Path,
+    points3d: Path,
+    pose: Path | None = None,
+    *,
+    rotation: tuple[float, float, float, float, float, float, float, float, float] | None = None,
+    translation: tuple[float, float, float] | None = None,
+    camera: str | None = None,
+    image: str | None = None,
+    matches: Path | None = None,
+    as_it_is: bool = False,
+    output: Path | None = None,
+    json: bool = False,
+    surface: int | None = None,
+    inlier_threshold: float | None = None,
+    time_limit: float | None = None,
+    seed: int = 0,
+) -> None:
+    """Say whether a pose from elsewhere is right, and how well it is known.
+
+    confident; ambiguous (something else may fit as well); or failed: it fits no better than chance, or another pose
+    fits better. Files: as for `bpnp solve`.
+
+    Args:
+        points2d: as for bpnp solve.
+        points3d: as for bpnp solve.
+        pose: JSON with `rotation` and `translation`, such as that of a solution.
+        rotation: the nine numbers of R, row by row, in place of the file; camera = R p + t.
+        translation: the three numbers of t.
+        camera: as for bpnp solve.
+        image: as for bpnp solve.
+        matches: .npy, .csv or .txt with two columns, places of a 2D and of a 3D point, counted from 0.
+        as_it_is: do not refine the pose.
+        output: write the solution as JSON.
+        json: print JSON instead of a table.
+        surface: points to draw from a mesh; its vertices by default.
+        inlier_threshold: largest error of a match, pixels with a camera.
+        time_limit: seconds, 10 by default; inf for no limit.
+        seed: of the search around the pose.
+    """
+    from bpnp.solving.point_files import read_camera, read_pairs, read_points2d, read_points3d, read_pose
+    from bpnp.solving.verify import verify as judge_pose
+
+    given: tuple[Any, Any]
+    if pose is None and rotation is not None and translation is not None:
+        given = [rotation[:3], rotation[3:6], rotation[6:]], translation
+    elif pose is not None and rotation is None and translation is None:
+        given = read_pose(pose)
+    else:
+        raise ValueError("expected the JSON of a pose, or --rotation and --translation")
+    image_points, labels2d = read_points2d(points2d)
+    scene_points, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
+    with progress(items=False) as shown:
+        shown.add_task("looking around the pose", total=None)
+        solution = judge_pose(
+            image_points,
+            scene_points,
+            given[0],
+            given[1],
+            None if camera is None else read_camera(camera, image),
+            normals3d=normals3d,
+            labels2d=labels2d,
+            labels3d=labels3d,
+            matches=None if matches is None else read_pairs(matches),
+            refine=not as_it_is,
+            inlier_threshold=inlier_threshold,
+            seed=seed,
+            time_limit=time_limit,
+        )
+    if json:
+        say(solution.to_json())
+    else:
+        console().print(solution_table(solution))
+    if output is not None:
+        write_text(output, solution.to_json() + "\n")
+        say(f"wrote {output}", to=Console(stderr=True) if json else None)
 
 
 def solution_table(solution: "Solution") -> Table:

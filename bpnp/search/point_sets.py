@@ -28,7 +28,8 @@ class PointSets:
     them the few-point search leaves the normals aside. scores2d (m,), scores3d (n,): probability that a point has a
     partner, in (0, 1]; None for equal ones.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
-    prior: what is known of the pose.
+    prior: what is known of the pose. log10_tried: of the number of poses that were tried; None for as many as triples
+    of matches give.
     """
 
     bearings: Array
@@ -41,6 +42,7 @@ class PointSets:
     scores3d: Array | None = None
     floor: float | None = None
     prior: Prior | None = None
+    log10_tried: float | None = None
 
     @property
     def cones3d(self) -> Array | None:

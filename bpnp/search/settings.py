@@ -161,7 +161,7 @@ class Schedule:
     patience: full batches that do not better the best log-likelihood by `better` nats a bearing before other sources
         are asked. between: batches between these. around_each: poses that raster searches are made around, no two
         turned by less than `apart_deg`, until `in_vain` of them better nothing. looks: in vain around a pose that
-        exceeds chance, at most.
+        exceeds chance, at most. claimed: batches from anywhere beside a pose that comes from elsewhere.
     """
 
     turns: int = 96
@@ -175,6 +175,7 @@ class Schedule:
     apart_deg: float = 10.0
     in_vain: int = 3
     looks: int = 3
+    claimed: int = 3
 
 
 @dataclass(frozen=True)

@@ -101,15 +101,9 @@ def checked_prior(prior: Any) -> Prior | None:
     if prior is None:
         return None
     if isinstance(prior, PosePrior):
-        rotation = _vector("prior.rotation", prior.rotation, (3, 3))
-        off = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
-        if off > 1e-3 or np.linalg.det(rotation) < 0:
-            raise ValueError(f"expected a rotation in `prior.rotation`, got {rotation.tolist()}")
-        shift = None if prior.translation is None else _vector("prior.translation", prior.translation, (3,))
+        rotation, shift = checked_pose("prior.", prior.rotation, prior.translation)
         for name in ("rotation_sigma_deg", "translation_sigma"):
             positive(f"prior.{name}", getattr(prior, name))
-        if off > ROUNDING:
-            rotation = Rotation.from_matrix(rotation).as_matrix()
         return prior._replace(rotation=rotation, translation=shift)
     if isinstance(prior, GravityPrior):
         camera, scene = (_vector(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
@@ -125,6 +119,19 @@ def checked_prior(prior: Any) -> Prior | None:
     raise ValueError(
         f"expected `prior` as PosePrior, GravityPrior, BPnPNet, Matcher, a checkpoint or 'learned', got {prior!r:.60}"
     )
+
+
+def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
+    """A rotation (3, 3), orthonormal, and a translation (3,), None if that is None; `prefix` goes before their names.
+
+    Raises ValueError for a matrix that is no rotation.
+    """
+    matrix = _vector(f"{prefix}rotation", rotation, (3, 3))
+    off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
+    if off > 1e-3 or np.linalg.det(matrix) < 0:
+        raise ValueError(f"expected a rotation in `{prefix}rotation`, R R^T = I and det R = 1, got {matrix.tolist()}")
+    shift = None if translation is None else _vector(f"{prefix}translation", translation, (3,))
+    return Rotation.from_matrix(matrix).as_matrix() if off > ROUNDING else matrix, shift
 
 
 def _vector(name: str, values: Any, shape: tuple[int, ...]) -> Array:

@@ -95,12 +95,26 @@ def read_prior(path: Path, degrees: float, distance: float | None) -> Any:
 
     if path.suffix.lower() != ".json":
         return path
+    rotation, translation = read_pose(path)
+    return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)
+
+
+def read_pose(path: Path) -> tuple[Array, Array]:
+    """Rotation and translation in a JSON file with both, such as that of a solution. Raises ValueError without them."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-        rotation, translation = (np.array(content[name], np.float64) for name in ("rotation", "translation"))
+        return np.array(content["rotation"], np.float64), np.array(content["translation"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {error}") from error
-    return PosePrior(rotation, translation, degrees, np.inf if distance is None else distance)
+
+
+def read_pairs(path: Path) -> Array:
+    """Rows of two numbers, such as matches: .npy or text as for `read_points3d`."""
+    _check_suffix(path, ARRAYS)
+    values = _columns(path)[0]
+    if values.shape[1] != 2:
+        raise ValueError(f"expected two columns in {path}, got {values.shape[1]}")
+    return values
 
 
 def _check_suffix(path: Path, known: tuple[str, ...]) -> None:

@@ -78,7 +78,7 @@ class Problem:
     def without(self, taken: Labels) -> "Problem":
         """The same without some of the m 2D points."""
         sets, stay = self.sets, ~np.isin(self.usable, taken)
-        reason = _degenerate(sets.bearings[stay], self.points3d, MIN_POINTS)
+        reason = degenerate_points(sets.bearings[stay], self.points3d)
         known = {
             name: getattr(sets, name)[stay]
             for name in ("bearings", "labels2d", "scores2d")
@@ -170,7 +170,7 @@ def problem_from(
         floor=None if camera is None else FLOOR_PIXELS / _per_radian(plane[usable], unit, camera),
         prior=known,
     )
-    degenerate = _degenerate(sets.bearings, scene, fewest)
+    degenerate = degenerate_points(sets.bearings, scene, fewest)
     return Problem(sets, usable, image[usable], unit, plane, scene, origin, camera, degenerate, prior)
 
 
@@ -189,7 +189,8 @@ def _origin(points3d: Array) -> Array:
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
 
 
-def _degenerate(bearings: Array, points3d: Array, fewest: int) -> str | None:
+def degenerate_points(bearings: Array, points3d: Array, fewest: int = MIN_POINTS) -> str | None:
+    """Why no pose can follow from points, of which `fewest` different ones fix one; None if one may."""
     for name, points in (("2D", bearings), ("3D", points3d)):
         count, others = 0, points
         while len(others) and count < fewest:

@@ -99,7 +99,12 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
 
 
 def log10_tests(sets: PointSets) -> float:
-    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three pairs with about two poses each; of labels that agree, if given."""
+    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three pairs with about two poses each; of labels that agree, if given.
+
+    The number of poses that were tried, where the sets say it.
+    """
+    if sets.log10_tried is not None:
+        return sets.log10_tried
     m, n = len(sets.bearings), len(sets.points3d)
     choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(FIXING))
     if sets.labels2d is not None and sets.labels3d is not None:
@@ -136,6 +141,14 @@ def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: fl
     terms = _terms(sets, directions_of(sets, rotation, translation), int(own[0]))[:, : len(own)]
     terms = terms.reshape(len(terms), -1)
     return np.asarray(terms[:, terms.sum(0).argmax()])
+
+
+def likeliest_scale(sets: PointSets, rotation: Array, translation: Array) -> float:
+    """Scale of the residuals, radians, at which a pose has the fewest false alarms; the largest if it sees nothing."""
+    seen = directions_of(sets, rotation, translation)
+    if int(np.isfinite(seen[:, 0]).sum()) <= FIXING or len(sets.bearings) <= FIXING:
+        return float(sets.image.scales[-1])
+    return float(sets.image.scales[_log_evidence(sets, seen, 0).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:

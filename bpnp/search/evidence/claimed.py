@@ -1,0 +1,188 @@
+"""A pose that somebody claims: how likely it is by chance, what speaks against it, and the optimum beside it.
+
+One hypothesis has been tried, not all that triples of points give: the number of tests is one, or that of the poses
+which lie as near to the claimed one as the optimum beside it, if this is judged instead. What speaks against a pose is
+what speaks against one that was found (`bpnp.search.verdict`), as far as it is met: the poses that raster searches
+around the claim meet, and a few batches of starts from anywhere; the mirror image of a flat scene, repetitions, another
+focal length; of points few enough to be enumerated all other poses. That a better pose far away was missed is excluded
+for these alone: many points may have one that few starts meet.
+"""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.distinct_poses import turned_by
+from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.search.annealing import anneal_on_points, finish, shaken
+from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
+from bpnp.search.evidence.alternatives import number
+from bpnp.search.evidence.false_alarms import directions_of, likeliest_scale, log10_tests
+from bpnp.search.evidence.partners import facing, partners
+from bpnp.search.evidence.uncertainty import linearised, local_covariance
+from bpnp.search.point_sets import SIGMAS, PointSets
+from bpnp.search.pool import against_repetitions
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
+from bpnp.search.sources.multistart import multistart
+from bpnp.search.sources.raster import search_beside
+from bpnp.search.starts import PosePrior
+from bpnp.search.verdict import SearchResult, judged, with_false_alarms
+
+Array = NDArray[np.float64]
+WITHIN = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand: of a claim and the optimum that it means
+
+
+class Claimed(NamedTuple):
+    """The verdict on a claimed pose, the first of the candidates. optimum: (1,) the pose beside it that the points
+    agree with best, if there is one; the first candidate itself where that was asked for."""
+
+    result: SearchResult
+    optimum: Candidates
+
+
+@one_blas_thread
+def judge_claim(
+    sets: PointSets,
+    rotation: Array,
+    translation: Array,
+    *,
+    refine: bool = True,
+    seed: int = 0,
+    deadline: Deadline = NEVER,
+    settings: SearchSettings = DEFAULT,
+) -> Claimed:
+    """The verdict on a pose (3, 3), (3,); with `refine` on the optimum beside it, if that is the same pose: turned and
+    moved by no more than a verdict calls another one, or than the points leave open."""
+    # What is far away is not asked: no starts were drawn from anywhere.
+    rule = replace(settings.evidence, another=0.0)
+    one = replace(sets, log10_tried=0.0)
+    claim = _unrefined(one, rotation, translation, settings)
+    others, looks, exhaustive = _met(sets, claim, seed, deadline, settings)
+    others = with_false_alarms(replace(others, log10_false_alarms=np.full(len(others), math.nan)), one)
+    others = others[np.argsort(others.log10_false_alarms, kind="stable")]
+    same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
+    optimum = others[same][:1]
+    better = len(optimum) and optimum.log10_false_alarms[0] <= claim.log10_false_alarms[0]
+    if refine and better:
+        scale = float(optimum.scale[0])
+        distance = float(np.linalg.norm(rotation @ sets.middle + translation))
+        prior = PosePrior(rotation, translation, math.degrees(scale) / SIGMAS, scale * distance / SIGMAS)
+        near = replace(sets, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
+        one = replace(sets, log10_tried=max(log10_tests(sets) + near, 0.0))
+        claim = optimum
+    candidates = Candidates.concatenated([claim, others[~same]])
+    candidates = with_false_alarms(replace(candidates, log10_false_alarms=np.full(len(candidates), math.nan)), one)
+    result = judged(candidates, one, batches=looks, looks=looks, exhaustive=exhaustive, rule=rule)
+    scene = Scene(one, seed, settings, deadline)
+    result = against_repetitions(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
+    result = _of_claim(result, candidates[:1])
+    lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
+    if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # likelihoods, Wilks 1938
+        off = math.degrees(turned_by(rotation, optimum.rotation[0]))
+        reason = f"a pose {off:.2g} deg away, the optimum beside it, fits better ({number(-lead)} times the number)"
+        result = replace(result, verdict="ambiguous", reason=f"{_chance(claim)}, but {reason}")
+    refined = refine and result.verdict == "confident"
+    return Claimed(replace(result, batches=max(looks, 1) if refined else 0), optimum)  # no last fit to the matches
+
+
+def _met(
+    sets: PointSets, claim: Candidates, seed: int, deadline: Deadline, settings: SearchSettings
+) -> tuple[Candidates, int, bool]:
+    """Distinct poses that annealing reaches from a claim, and others around it and far away; how often was looked
+    around it, and whether all poses of these points were tried."""
+    scene = Scene(sets, seed, settings, deadline)
+    start = _entered(scene, claim)
+    wide = settings.middle[-1].last_scale * scene.spread
+    around = Candidates.concatenated([start, shaken(scene, start), _mirrored(scene, start)])
+    parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
+    exhaustive, looks = False, 0
+    if is_enumerable(sets):
+        found = search_by_enumeration(sets, deadline, settings)
+        parts.append(_entered(scene, found.candidates))
+        exhaustive = found.exhausted or found.safe
+    while looks < settings.schedule.looks and not exhaustive and not deadline.passed():
+        leader = merged(parts, scene)[:1]
+        parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
+        looks += not deadline.passed()
+    for batch in range(0 if exhaustive else settings.schedule.claimed):
+        parts.append(multistart(scene, batch, None, merged(parts, scene))[0])
+    poses = finish(scene, merged(parts, scene), settings.finished)
+    return in_user_frame(poses, scene), looks, exhaustive
+
+
+def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
+    """The pose (1,) that sees a flat scene nearly the same, its normal on the other side of the line of sight (the
+    ambiguity of a plane seen from afar, Oberkampf, DeMenthon, Davis, CVIU 1996)."""
+    middle = scene.bulk3d.mean(0)
+    normal = np.linalg.svd(scene.bulk3d - middle, full_matrices=False)[2][2]
+    seen = pose.rotation[0] @ middle + pose.translation[0]
+    sight = seen / np.linalg.norm(seen)
+    across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, normal))
+    rotation = (across @ pose.rotation[0] @ flipped).astype(np.float32)
+    return Candidates.unscored(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
+
+
+def _entered(scene: Scene, poses: Candidates) -> Candidates:
+    rotation, translation = scene.enter(poses.rotation, poses.translation)
+    score, matched, scale = (x.astype(np.float32) for x in (poses.score, poses.matched, poses.scale))
+    return replace(poses, rotation=rotation, translation=translation, score=score, matched=matched, scale=scale)
+
+
+def _unrefined(sets: PointSets, rotation: Array, translation: Array, settings: SearchSettings) -> Candidates:
+    """A pose as it is (1,), at the scale of residuals at which chance explains it least."""
+    scale = likeliest_scale(sets, rotation, translation)
+    places = facing(sets, sets.points3d @ rotation.T + translation, rotation)
+    seen, chosen = directions_of(sets, rotation, translation)[places], sets.image.chosen
+    score, matched = -math.inf, 0.0
+    if len(places):
+        i, _, density, every = partners(sets, seen, places, chosen, scale)
+        small = min(len(sets.bearings), len(sets.points3d))
+        matched = min(float((density / every[i]).sum()) * len(sets.bearings) / len(chosen) / small, 1.0)
+        score = float(np.log(2 * math.pi * every).mean())
+    pose = Candidates.unscored(rotation[None], translation[None])
+    pose = replace(pose, score=np.array([score]), matched=np.array([matched]), scale=np.array([scale]))
+    return with_false_alarms(pose, sets)
+
+
+def _is_same(sets: PointSets, claim: Candidates, pose: Candidates, rule: Evidence) -> bool:
+    """Whether a pose (1,) is the claimed one, or within what its points leave open of it."""
+    rotations = np.concatenate([claim.rotation, pose.rotation])
+    translations = np.concatenate([claim.translation, pose.translation])
+    if sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift)[1]:
+        return True
+    linear = linearised(sets, pose.rotation[0], pose.translation[0], float(pose.scale[0]))
+    covariance = local_covariance(linear)
+    if covariance is None or pose.log10_false_alarms[0] > rule.false_alarms:
+        return False
+    turn = claim.rotation[0] @ pose.rotation[0].T
+    vector = 0.5 * np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
+    middles = rotations @ sets.middle + translations
+    step = np.r_[vector, middles[0] - middles[1]]
+    return bool(np.trace(turn) > 1 and step @ np.linalg.solve(covariance, step) < WITHIN)
+
+
+def _of_claim(result: SearchResult, claim: Candidates) -> SearchResult:
+    """A verdict on several poses as one on the claimed one (1,) of them, which becomes the first."""
+    candidates = result.candidates
+    place = int(np.flatnonzero((candidates.translation == claim.translation[0]).all(-1))[0])
+    ordered = candidates[np.r_[place, np.delete(np.arange(len(candidates)), place)]]
+    alarms = float(claim.log10_false_alarms[0])
+    if alarms > 0:
+        reason = f"the pose fits no better than chance: {_chance(claim)}"
+        result = replace(result, verdict="failed", reason=reason)
+    elif place:
+        off = math.degrees(turned_by(candidates.rotation[0], claim.rotation[0]))
+        times = number(float(candidates.log10_false_alarms[0]) - alarms)
+        reason = f"{_chance(claim)}, but a pose {off:.0f} deg away fits better ({times} times the number)"
+        refuted = result.verdict == "confident"  # of the other pose, which explains the claim away
+        result = replace(result, verdict="failed" if refuted else "ambiguous", reason=reason)
+    return replace(result, candidates=ordered)
+
+
+def _chance(claim: Candidates) -> str:
+    return f"unrelated points are expected to fit as well under {number(float(claim.log10_false_alarms[0]))} poses"

@@ -1,0 +1,68 @@
+"""`bpnp verify` on planted problems: a pose from a file or from numbers; a mistake is one line."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from planted import plant
+
+from bpnp import Solution
+from bpnp.cli import main
+
+PLANTED = plant(1, 30, seed=9)
+X, P = PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy()
+R, T = PLANTED.rotation[0].numpy(), PLANTED.translation[0].numpy()
+NUMBERS = ["--rotation", *map(str, R.ravel()), "--translation", *map(str, T + 0.01)]
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> list[str]:
+    np.savetxt(tmp_path / "x.csv", 800 * X + [320, 240], delimiter=",")
+    np.save(tmp_path / "p.npy", P)
+    (tmp_path / "pose.json").write_text(json.dumps({"rotation": R.tolist(), "translation": T.tolist()}))
+    pairs = np.stack([PLANTED.match3d[0].numpy(), np.arange(30)], -1)
+    np.savetxt(tmp_path / "pairs.csv", pairs, delimiter=",", fmt="%d")
+    return [str(tmp_path / "x.csv"), str(tmp_path / "p.npy"), "--camera", "SIMPLE_PINHOLE,800,320,240"]
+
+
+def test_a_pose_from_a_file_is_confirmed(files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    output = tmp_path / "out" / "checked.json"
+    main(["verify", files[0], files[1], str(tmp_path / "pose.json"), *files[2:], "--output", str(output)])
+    assert "confident" in capsys.readouterr().out
+    np.testing.assert_allclose(Solution.from_json(output).rotation, R, atol=1e-6)
+    main(["verify", files[0], files[1], str(output), *files[2:], "--json"])  # that of a solution
+    assert json.loads(capsys.readouterr().out)["verdict"] == "confident"
+
+
+def test_a_pose_in_numbers_with_matches_is_judged(
+    files: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    main(["verify", *files, *NUMBERS, "--matches", str(tmp_path / "pairs.csv"), "--json", "--seed", "3"])
+    content = json.loads(capsys.readouterr().out)
+    assert content["verdict"] == "confident"
+    assert len(content["matches"]) == 30
+    main(["verify", *files, *NUMBERS, "--as_it_is", "--json", "--inlier_threshold", "50", "--time_limit", "100"])
+    content = json.loads(capsys.readouterr().out)
+    np.testing.assert_allclose(content["translation"], T + 0.01, atol=1e-12)
+    assert content["inlier_threshold"] == 50
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda files, folder: files, "expected the JSON of a pose, or --rotation and --translation"),
+        (lambda files, folder: [*files, *NUMBERS[:10]], "expected the JSON of a pose, or --rotation and --translation"),
+        (lambda files, folder: [*files[:2], "nothing.json", *files[2:]], "expected JSON with `rotation`"),
+        (lambda files, folder: [*files, *NUMBERS[:9], "7", *NUMBERS[10:]], "expected a rotation in `rotation`"),
+        (lambda files, folder: [*files, *NUMBERS, "--matches", str(folder / "p.npy")], "expected two columns in"),
+        (lambda files, folder: [*files, *NUMBERS, "--image", "a"], "--image with a COLMAP model"),
+        (lambda files, folder: [*files, *NUMBERS, "--surface", "9"], "a mesh to draw 9 points from"),
+    ],
+)
+def test_a_mistake_is_one_line(
+    change: Any, message: str, files: list[str], tmp_path: Path, fails: Callable[..., str]
+) -> None:
+    assert message in fails("verify", *change(files, tmp_path))

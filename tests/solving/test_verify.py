@@ -1,0 +1,208 @@
+"""`bpnp.verify`: planted poses that are right, a little off, far off, mirrored, or of points that have none."""
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from planted import degrees_between, plant, view_with_outliers
+from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
+
+import bpnp
+from bpnp.solving.matches import fit_pose
+
+
+@pytest.fixture(scope="module")
+def view() -> Any:
+    """60 points with partners among 60 outliers a side, noise of a thousandth."""
+    return view_with_outliers(np.random.default_rng(9), 60, 60)
+
+
+def moved(rotation: np.ndarray, translation: np.ndarray, points: np.ndarray, degrees: float, seed: int = 0) -> Any:
+    """The pose turned about the middle of the points."""
+    axis = np.random.default_rng(seed).standard_normal(3)
+    turned = Rotation.from_rotvec(math.radians(degrees) * axis / np.linalg.norm(axis)).as_matrix() @ rotation
+    return turned, rotation @ points.mean(0) + translation - turned @ points.mean(0)
+
+
+def test_a_right_pose_is_confident_and_refined_to_the_optimum(view: Any) -> None:
+    bearings, points, *pose = view
+    for off in (0.0, 1.0):
+        solution = bpnp.verify(bearings, points, *moved(*pose, points, off))
+        assert solution.verdict == "confident"
+        assert degrees_between(solution.rotation, pose[0]) < 0.2
+        assert (solution.matches[:, 0] == solution.matches[:, 1]).mean() > 0.9
+        assert solution.inlier_count > 50
+
+
+def test_a_pose_as_it_is_stays_as_it_is(view: Any) -> None:
+    bearings, points, *pose = view
+    right = bpnp.verify(bearings, points, *pose, refine=False)
+    assert right.verdict == "confident"
+    assert np.array_equal(right.rotation, pose[0])
+    assert np.array_equal(right.translation, pose[1])
+    turned = moved(*pose, points, 1.0)
+    off = bpnp.verify(bearings, points, *turned, refine=False)
+    assert off.verdict == "ambiguous"
+    assert "the optimum beside it, fits better" in off.reason
+    assert np.array_equal(off.rotation, turned[0])
+    assert off.rotation_std_deg == pytest.approx(1.0, abs=0.1)  # the way to the optimum
+
+
+@pytest.mark.parametrize("degrees", [5.0, 20.0, 90.0, 180.0])
+@pytest.mark.parametrize("refine", [True, False])
+def test_another_pose_fails_with_a_reason_and_stays(view: Any, degrees: float, refine: bool) -> None:
+    bearings, points, *pose = view
+    turned = moved(*pose, points, degrees)
+    solution = bpnp.verify(bearings, points, *turned, refine=refine)
+    assert solution.verdict == "failed"
+    assert "chance" in solution.reason or f"a pose {degrees:.0f} deg away fits better" in solution.reason
+    assert np.array_equal(solution.rotation, turned[0])
+
+
+def test_a_pose_that_sees_nothing_fails() -> None:
+    planted = plant(1, 40, seed=9)
+    x, points, rotation = planted.points2d[0].numpy(), planted.points3d[0].numpy(), planted.rotation[0].numpy()
+    for away in ([0, 0, -5.0], [50.0, 0, 5.0], [0, 0, 1e6]):
+        solution = bpnp.verify(x, points, rotation, away)
+        assert solution.verdict == "failed"
+        assert solution.inlier_count <= 1 or solution.log10_false_alarms > 0
+
+
+def test_unrelated_points_are_never_confident() -> None:
+    rng = np.random.default_rng(9)
+    for count in (4, 6, 20, 100):
+        for _ in range(12):
+            x, points = rng.uniform(-0.4, 0.4, (count, 2)), rng.uniform(-1, 1, (count, 3))
+            pose = Rotation.random(rng=rng).as_matrix(), [0, 0, 4.0]
+            assert bpnp.verify(x, points, *pose).verdict != "confident"
+
+
+def test_the_mirror_image_of_a_plane_is_met() -> None:
+    """Far away a plane looks nearly as tilted to the other side; with this noise only one of both is right."""
+    rng = np.random.default_rng(9)
+    points = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.zeros(80)])
+    rotation, translation = Rotation.from_euler("xz", [35, 20], degrees=True).as_matrix(), np.array([0, 0, 6.0])
+    camera = points @ rotation.T + translation
+    x = camera[:, :2] / camera[:, 2:] + 5e-4 * rng.standard_normal((80, 2))
+    assert bpnp.verify(x, points, rotation, translation).verdict == "confident"
+    mirrored = np.diag([1, 1, -1.0]) @ rotation @ np.diag([1, 1, -1.0])
+    wrong = bpnp.verify(x, points, mirrored, translation)
+    assert wrong.verdict == "failed"
+    assert "fits better" in wrong.reason
+
+
+def test_a_twin_speaks_against_a_right_pose() -> None:
+    """Three equal things of which one is seen: each pose fits equally well."""
+    motif = np.random.default_rng(9).uniform(0, 1, (80, 3))
+    scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
+    image = motif + [0, 0, 6]
+    solution = bpnp.verify(image[:, :2] / image[:, 2:], scene, np.eye(3), np.zeros(3))
+    assert solution.verdict == "ambiguous"
+    assert len(solution.candidates) >= 2
+
+
+def test_a_focal_length_that_is_wrong_speaks_against_a_pose(view: Any) -> None:
+    bearings, points, *pose = view
+    pixels = 500 * bearings[:60, :2] / bearings[:60, 2:] + [320, 240]
+    wrong = bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [400, 320, 240]))
+    assert wrong.verdict != "confident"
+    assert bpnp.verify(pixels, points[:60], *pose, ("SIMPLE_PINHOLE", [500, 320, 240])).verdict == "confident"
+
+
+def test_few_points_that_no_search_is_sure_of_confirm_a_pose() -> None:
+    """One hypothesis costs less than all that eight points allow."""
+    sure = {"solve": 0, "verify": 0}
+    for seed in range(8):
+        bearings, points, *pose = view_with_outliers(np.random.default_rng([9, seed]), 5, 3, noise=1e-3)
+        verdict = bpnp.verify(bearings, points, *pose)
+        assert verdict.verdict != "confident" or degrees_between(verdict.rotation, pose[0]) < 3
+        sure["verify"] += verdict.verdict == "confident"
+        sure["solve"] += bpnp.solve(bearings, points, solver="search").verdict == "confident"
+    assert sure["verify"] > sure["solve"]
+
+
+def test_the_pose_is_judged_on_the_matches_that_are_given(view: Any) -> None:
+    bearings, points, *pose = view
+    pairs = np.stack([np.arange(80), np.arange(80)], -1)  # the last 20 are wrong
+    pairs = np.random.default_rng(0).permutation(pairs)
+    solution = bpnp.verify(bearings, points, *moved(*pose, points, 0.5), matches=pairs)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, pose[0]) < 0.2
+    assert set(map(tuple, solution.matches)) <= set(map(tuple, pairs))
+    assert 55 <= solution.inlier_count <= 61
+    assert (solution.matches[:, 0] < 60).mean() > 0.95
+    assert len(solution.points2d) == 120
+    wrong = np.stack([np.arange(80), np.roll(np.arange(80), 1)], -1)
+    assert bpnp.verify(bearings, points, *pose, matches=wrong).verdict == "failed"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rotation": 2 * np.eye(3)}, r"expected a rotation in `rotation`, R R\^T = I and det R = 1"),
+        ({"rotation": np.diag([1, 1, -1.0])}, "expected a rotation in `rotation`"),
+        ({"rotation": np.eye(4)}, r"expected finite `rotation` of shape \(3, 3\)"),
+        ({"translation": [0, 0, np.nan]}, "expected finite `translation`"),
+        ({"matches": [[0, 0], [0, 1]]}, "expected each point in one of the `matches`, got 2D point 0 in 2"),
+        ({"matches": [[0, 900]]}, "expected `matches` below"),
+        ({"matches": [0, 1]}, "expected `matches` as integers of shape"),
+        ({"time_limit": -1}, "expected a positive `time_limit`"),
+        ({"inlier_threshold": 0}, "expected a positive `inlier_threshold`"),
+    ],
+)
+def test_input_that_is_not_usable_is_named(view: Any, change: dict[str, Any], message: str) -> None:
+    bearings, points, rotation, translation = view
+    with pytest.raises(ValueError, match=message):
+        bpnp.verify(bearings, points, **{"rotation": rotation, "translation": translation} | change)
+
+
+def test_few_matches_fix_no_pose(view: Any) -> None:
+    bearings, points, *pose = view
+    assert bpnp.verify(bearings, points, *pose, matches=[[0, 0], [1, 1]]).verdict == "failed"
+
+
+def test_options_reach_the_verdict(view: Any) -> None:
+    bearings, points, *pose = view
+    tight = bpnp.verify(bearings, points, *pose, inlier_threshold=1e-3)
+    assert tight.inlier_threshold == 1e-3
+    assert tight.inlier_count < bpnp.verify(bearings, points, *pose, inlier_threshold=5e-3).inlier_count
+    labels = np.arange(120) % 2
+    other = bpnp.verify(bearings, points, *pose, labels2d=labels, labels3d=1 - labels)
+    assert other.verdict == "failed"
+    inward = -points / np.linalg.norm(points, axis=1, keepdims=True)
+    facing = bpnp.verify(bearings, points, *pose, normals3d=inward)
+    assert facing.inlier_count < 60
+    assert np.array_equal(bpnp.verify(bearings, points, *pose, seed=3).rotation,
+                          bpnp.verify(bearings, points, *pose, seed=3).rotation)  # fmt: skip
+
+
+@pytest.mark.slow
+def test_the_covariance_of_a_verified_pose_is_calibrated() -> None:
+    """Errors of planted poses, in standard deviations: shares within the quantiles that 1, 2, 3 sigma have."""
+    inside: list[float] = []
+    rng = np.random.default_rng(9)
+    for _ in range(150):
+        true, outliers = int(rng.integers(10, 100)), int(rng.integers(0, 60))
+        bearings, points, *pose = view_with_outliers(rng, true, outliers, noise=float(rng.uniform(3e-4, 2e-3)))
+        solution = bpnp.verify(bearings, points, *moved(*pose, points, 0.3))
+        if solution.verdict == "confident":
+            turn = Rotation.from_matrix(pose[0] @ solution.rotation.T).as_rotvec()
+            error = np.r_[turn, pose[1] - solution.translation]
+            inside.append(float(chi2.cdf(error @ np.linalg.solve(solution.covariance, error), 6)))
+    assert len(inside) > 120
+    for share in (0.683, 0.954, 0.997):
+        assert np.mean(np.array(inside) <= share) == pytest.approx(share, abs=0.08)
+
+
+def test_the_optimum_is_that_of_least_squares_on_the_true_matches(view: Any) -> None:
+    bearings, points, *pose = view
+    solution = bpnp.verify(bearings[:60], points[:60], *moved(*pose, points, 1.0))
+
+    def project(rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+        camera = points[:60] @ rotation.T + translation
+        return camera / np.linalg.norm(camera, axis=1, keepdims=True)
+
+    best, _ = fit_pose(project, bearings[:60], *pose, scale=1e-3)
+    assert degrees_between(solution.rotation, best) < 0.03
