@@ -12,7 +12,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import LIGHTNING, first_line, group_asked_for, parsed_arguments, short_help
+from bpnp.commands.parser import LIGHTNING, first_line, parsed_arguments, short_help
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
@@ -56,13 +56,14 @@ def _run(arguments: list[str]) -> None:
     elif arguments[0] == "--version":
         print(f"bpnp {version('bpnp')}")
     elif arguments[0] in LIGHTNING:
-        group = group_asked_for(arguments)
-        if group == "":
+        if arguments[1:] == ["--help", "all"]:
+            arguments = arguments[:2]
+        elif {"-h", "--help"} & set(arguments):
             print(short_help(arguments[0]))
             return
         from bpnp.commands.training import run_training  # imports torch and Lightning: seconds
 
-        run_training(_with_packaged_configs(arguments), help_of=group)
+        run_training(_with_packaged_configs(arguments))
     else:
         name, *rest = arguments
         command = COMMANDS[_known(name, [*LIGHTNING, *COMMANDS], "a command")]

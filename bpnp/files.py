@@ -6,7 +6,7 @@ import os
 import shutil
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -41,21 +41,6 @@ def write_text(path: Path, text: str) -> Path:
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
     return path
-
-
-def keep_settings(path: Path, settings: Mapping[str, Any]) -> None:
-    """Write what the results of a folder were made with. Raises ValueError if those in it were made with other ones."""
-    text = json.dumps(settings, indent=1, sort_keys=True, default=str) + "\n"
-    if not path.is_file():
-        write_text(path, text)
-        return
-    wanted, before = json.loads(text), json.loads(path.read_text(encoding="utf-8"))
-    other = sorted(key for key in wanted.keys() | before.keys() if wanted.get(key) != before.get(key))
-    if other:
-        raise ValueError(
-            f"expected {path.parent} without results of other settings, got other {', '.join(other)}; try another "
-            "--output"
-        )
 
 
 @contextmanager

@@ -133,14 +133,6 @@ LIGHTNING = {
     "validate": "Evaluate a solver on the validation problems.",
     "test": "Evaluate a solver on the test problems and write their results.",
 }
-# What `bpnp fit --help GROUP` shows: the options that begin with these.
-GROUPS = {
-    "model": ("model", "optimizer", "lr_scheduler"),
-    "data": ("data",),
-    "trainer": ("trainer",),
-    "files": ("best_checkpoint", "last_checkpoint", "results"),
-    "all": ("",),
-}
 OPTIONS = {
     "--config NAME": "packaged configuration or a YAML file; of several, later ones override",
     "--ckpt_path FILE": "checkpoint, `last`, or the name of packaged weights",
@@ -176,23 +168,7 @@ def short_help(command: str) -> str:
             "",
             *options,
             "",
-            f"bpnp {command} --help GROUP lists every option of a group: {', '.join(GROUPS)}.",
+            f"bpnp {command} --help all lists every option,",
             f"bpnp {command} --data.help=CLASS, --model.solver.help=CLASS and so on those of a class.",
         ]
     )
-
-
-def group_asked_for(arguments: list[str]) -> str | None:
-    """The group in `fit --help GROUP`: "" without one, None where no help is asked for.
-
-    Raises ValueError for another word that is no option.
-    """
-    found = next((i for i, text in enumerate(arguments) if text in ("-h", "--help")), None)
-    if found is None:
-        return None
-    following = arguments[found + 1 : found + 2]
-    if following and following[0].startswith("-"):
-        return ""
-    if following and following[0] not in GROUPS:
-        raise ValueError(f"expected --help, or --help and one of {', '.join(GROUPS)}, got {following[0]!r}")
-    return following[0] if following else ""

@@ -93,7 +93,7 @@ def table(
         else:
             with progress() as shown:
                 task = shown.add_task("tests", total=len(missing))
-                for _ in in_processes(lambda i, _: missing[i].run(), range(len(missing)), processes, tell=_nothing):
+                for _ in in_processes(lambda i: missing[i].run(), range(len(missing)), processes):
                     shown.advance(task)
         rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
     published = PAPERS.get(recipe["class_path"].rpartition(".")[2]) if paper == "auto" else paper
@@ -128,7 +128,3 @@ def _rows(label: str, share: float | None, tests: "list[MethodTest]") -> "list[R
             spread = frame.std(skipna=False).to_dict()
             rows.append(Row(f"{name}, standard deviation of {len(results)} seeds", spread | count, rho=share))
     return rows
-
-
-def _nothing(*_: Any) -> None:
-    """Workers say nothing while they test."""

@@ -2,7 +2,6 @@
 
 import re
 import sys
-from argparse import SUPPRESS
 from collections.abc import Sequence
 from contextlib import nullcontext
 from itertools import pairwise
@@ -18,7 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import bpnp.datamodules
 from bpnp.commands.output import say
-from bpnp.commands.parser import GROUPS, OneLineParser, plain
+from bpnp.commands.parser import OneLineParser, plain
 from bpnp.files import claimed
 from bpnp.training.callbacks import InterruptedCheckpoint, OfflineWandbLogger, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
@@ -32,11 +31,11 @@ class _Parser(OneLineParser, LightningArgumentParser):
 class BpnpCLI(LightningCLI):
     """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir.
 
-    command: the one to parse and run. shown: beginnings of the options to show in place of that.
+    command: the one to parse and run.
     """
 
-    def __init__(self, command: str, *args: Any, shown: tuple[str, ...] | None = None, **kwargs: Any) -> None:
-        self.command, self.shown = command, shown
+    def __init__(self, command: str, *args: Any, **kwargs: Any) -> None:
+        self.command = command
         super().__init__(*args, **kwargs)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
@@ -44,9 +43,6 @@ class BpnpCLI(LightningCLI):
         return {self.command: super().subcommands()[self.command]}
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        if self.shown is not None:
-            sys.stdout.write(_options_help(self._subcommand_parsers[self.command], self.command, self.shown))
-            raise SystemExit(0)
         self.config = parser.parse_args(args)
 
     def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
@@ -128,8 +124,8 @@ def _checkpoint_folder(root: str) -> str:
     return str(Path(root) / "checkpoints")
 
 
-def run_training(arguments: Sequence[str], *, help_of: str | None = None) -> None:
-    """Parse the arguments of fit, validate or test, and run it; or show the options of a group of `GROUPS`.
+def run_training(arguments: Sequence[str]) -> None:
+    """Parse the arguments of fit, validate or test, and run it.
 
     Raises ValueError for a mistake of the user's, and for a training that diverged.
     """
@@ -141,7 +137,6 @@ def run_training(arguments: Sequence[str], *, help_of: str | None = None) -> Non
             arguments[0],
             LightningModule if own_task else BlindPnPTask,
             LightningDataModule,
-            shown=None if help_of is None else GROUPS[help_of],
             subclass_mode_model=own_task,
             subclass_mode_data=True,
             seed_everything_default=0,
@@ -176,15 +171,3 @@ def _options_in(file: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise ValueError(f"expected options such as `model:` and `data:` in {file}, got {content!r:.60}")
     return content
-
-
-def _options_help(parser: LightningArgumentParser, command: str, beginnings: tuple[str, ...]) -> str:
-    """The help of the options that begin so, group by group."""
-    for group in parser._action_groups:
-        names = [action.dest.split(".")[0] for action in group._group_actions]
-        group.title, group.description = f"Options of {names[0]}" if names else None, None
-        for name, action in zip(names, group._group_actions, strict=True):
-            if name not in beginnings and "" not in beginnings:
-                action.help = SUPPRESS
-    parser.usage, parser.description = f"bpnp {command} [options]", None
-    return parser.format_help()

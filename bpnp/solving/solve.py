@@ -21,9 +21,8 @@ from bpnp.solving.arguments import (
     source_from,
 )
 from bpnp.solving.problem import Problem, problem_from
-from bpnp.solving.processes import Progress
 from bpnp.solving.solution import Solution
-from bpnp.solving.sources import Options, solutions_of
+from bpnp.solving.sources import Options, Progress, solutions_of
 
 SECONDS, SECONDS_OF_MANY = 10.0, 5.0  # that a problem may take, of `solve` and of `solve_many`
 
@@ -72,7 +71,7 @@ def solve(
     time_limit: seconds for all of it, 10 by default, math.inf for no limit. At the limit each stage of the search ends
         with the poses that it has, and the best of them is returned.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
-    progress: called with (problem, batch of starts, seconds).
+    progress: called with (problem, batch of starts, seconds); many problems are then solved in this process alone.
 
     A pose that is not to be trusted has the verdict "failed"; so have points from which none follows (on one line, or
     fewer than four different ones). Raises ValueError for input that is not usable: wrong or swapped shapes, NaN, fewer

@@ -2,7 +2,7 @@
 
 import multiprocessing
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
@@ -17,9 +17,10 @@ from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for
 from bpnp.solving.problem import Problem
-from bpnp.solving.processes import Progress, in_processes
+from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
 
+Progress = Callable[[int, int, float], None]  # problem, batches of starts so far, seconds
 TOGETHER = 2**26  # cells of the assignments, 2D points x 3D points, that a module solves together on a GPU
 WORTH_FORKING = 0.3  # seconds of work; starting processes takes some tens of milliseconds
 # Seconds, and seconds a 2D or 3D point, that the verdict and matching take after the search; of a limit at most half.
@@ -78,28 +79,22 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
 
 
 def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
-    """In as many processes as torch has threads, where that pays.
+    """In as many processes as torch has threads, where that pays and nobody asks for the progress.
 
     The first one is solved here: it compiles what all need, and tells how long one takes.
     """
-    silent = options.progress is None
-
-    def solved(i: int, tell: Progress) -> Solution:
-        return _by_search(i, problems[i], options._replace(progress=None if silent else tell))
-
-    tell = options.progress or (lambda *_: None)
     waiting = list(problems)
     seconds = 0.0
-    if waiting:
-        first = waiting.pop(0)
-        solution = solved(first, tell)
-        seconds = solution.seconds * len(waiting)
-        yield first, solution
+    for i in waiting[:1]:
+        solution = _by_search(i, problems[i], options)
+        seconds = solution.seconds * (len(waiting) - 1)
+        yield i, solution
+    waiting = waiting[1:]
     workers = 1 if multiprocessing.current_process().daemon else torch.get_num_threads()  # which may have no children
-    if workers > 1 and len(waiting) > 1 and seconds > WORTH_FORKING:
-        yield from in_processes(solved, waiting, workers, tell)
+    if workers > 1 and len(waiting) > 1 and seconds > WORTH_FORKING and options.progress is None:
+        yield from in_processes(lambda i: _by_search(i, problems[i], options), waiting, workers)
     else:
-        yield from ((i, solved(i, tell)) for i in waiting)
+        yield from ((i, _by_search(i, problems[i], options)) for i in waiting)
 
 
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:

@@ -47,7 +47,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
 
 def test_the_help_of_a_training_names_the_networks_and_no_module_of_torch(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["fit", "--help", "model"])
+        main(["fit", "--help", "all"])
     printed = capsys.readouterr().out.split("--model.solver SOLVER\n")[1].split("--model.learning_rate")[0]
     assert "bpnp.BPnPNet,bpnp.Matcher" in "".join(printed.split())
     assert "torch.nn" not in printed

@@ -85,22 +85,15 @@ def test_help_is_short(command: str, capsys: pytest.CaptureFixture[str]) -> None
     assert lines[0] == f"usage: bpnp {command} --config NAME [options]"
 
 
-def test_groups_list_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:
-    listed = {}
-    for group in parser.GROUPS:
-        with pytest.raises(SystemExit):
-            main(["fit", "--help", group])
-        listed[group] = options_of(capsys.readouterr().out)
-    everything = listed.pop("all")
-    of_no_group = {"--help", "--config", "--print_config", "--seed_everything", "--ckpt_path", "--weights_only"}
-    assert set().union(*listed.values()) == everything - of_no_group
-    assert sum(map(len, listed.values())) == len(set().union(*listed.values()))
+def test_the_short_help_names_options_of_the_long_one(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", "--help", "all"])
+    everything = options_of(capsys.readouterr().out)
     told = {option.split()[0] for option in parser.OPTIONS if not option.startswith("--data.")}
     assert told <= everything
-
-
-def test_another_group_is_refused(fails: Callable[..., str]) -> None:
-    assert "one of model, data, trainer, files, all, got 'modle'" in fails("fit", "--help", "modle")
+    assert len(everything) > 100
+    main(["fit", "--help", "--config", "quickstart"])
+    assert capsys.readouterr().out.startswith("usage: bpnp fit --config NAME")
 
 
 def test_a_loss_by_class_path_trains(tmp_path: Path) -> None:

@@ -11,8 +11,7 @@ from report_data import HOSTILE, inflated, rows, write_run
 
 from bpnp.report import read_results, write_page, write_results
 from bpnp.report.page.charts import chart_text, error_chart, page_charts, recall_chart
-from bpnp.report.page.text import headline_html
-from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
+from bpnp.report.page.write import MOST_BYTES, described, page_html, plotly_script
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 
@@ -69,7 +68,7 @@ def test_the_headline_says_what_was_tested(tmp_path: Path) -> None:
         "init_args": {"root": "psb", "rotation": "so3", "seed": None},
     }
     write_results(tmp_path, planted, settings={"data": data, "checkpoint": "best.ckpt"})
-    text = headline_html({"run": read_results(tmp_path)})
+    text = described(read_results(tmp_path))
     low, high = min(row.m for row in planted), max(row.m for row in planted)
     assert f"20 problems with {low} to {high} 2D points" in text
     assert "data MeshDataModule (root psb, rotation so3), checkpoint best.ckpt" in text
@@ -79,7 +78,7 @@ def test_charts_without_data_are_left_out(tmp_path: Path) -> None:
     """Pairs of one size, without times and without a training, have nothing to draw in those charts."""
     planted = [replace(row, m=10, n=12, matches=9, seconds=0.0) for row in rows(30, 0)]
     runs = {"run": write_results(tmp_path, planted)}
-    assert list(page_charts(runs, {})) == ["recall"]
+    assert list(page_charts(runs, {})) == ["Recall"]
     shown = Elements(page_html([tmp_path]))
     assert {a["id"] for tag, a in shown.tags if tag == "section"} == {
         "quartiles", "versus-section", "recall", "failures", "problems"}  # fmt: skip

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bpnp.report import Results, learning_table, recall_table, report, results_table, write_results
-from bpnp.report.page.text import quartiles_html
+from bpnp.report.page.write import quartile_rows
 from bpnp.report.terminal import SplitTable, number
 
 
@@ -134,5 +134,6 @@ def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Pat
     assert [texts[:3] for texts in shown[:2]] == [["1.00"] * 3, shown[1][:3]]
     assert "0.100" not in shown[2]
     assert shown[2] == shown[3] == []
-    assert 'class=best data-value="0.1"' not in quartiles_html(other, None)
-    assert 'class=best data-value="1.0"' in quartiles_html(other, None)
+    best = {value for row in quartile_rows(other, None) for _, value, best in row.cells if best}
+    assert 1.0 in best
+    assert 0.1 not in best

@@ -6,7 +6,7 @@ Each chart takes results by name and returns a `plotly.graph_objects.Figure`, or
 dark one is asked for.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -16,7 +16,7 @@ import torch
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.palette import DASHES, INKS, LIGHT, QUIET
 from bpnp.report.results import Results
-from bpnp.report.runs import TrainingLog, lines_of
+from bpnp.report.runs import Line, TrainingLog, lines_of
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -35,17 +35,15 @@ JOINT_TRANSLATION = 0.5
 INK = {name: light for name, (light, _) in INKS.items()}
 CLEAR = "rgba(0,0,0,0)"
 GRID = {"gridcolor": INK["line"], "zerolinecolor": INK["line"]}
-PICKED = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}}
+HIDDEN = ["sendChartToCloud", "select2d", "lasso2d", "autoScale2d", "tableRotation", "resetCameraLastSave3d"]
 CONFIG = {  # of every figure
     "responsive": True,
     "displaylogo": False,
     "toImageButtonOptions": {"scale": 2, "filename": "bpnp"},
-    "modeBarButtonsToRemove": [
-        "sendChartToCloud", "select2d", "lasso2d", "autoScale2d", "tableRotation", "resetCameraLastSave3d",
-    ],
-}  # fmt: skip
+    "modeBarButtonsToRemove": HIDDEN,
+}
 SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
-TRAINING = {
+TRAINING = {  # curves by chart, and whether their axis is logarithmic
     "Training loss": (("train/loss", "train/correspondence_loss", "train/pose_loss"), False),
     "Validation: correspondence loss": (("val/correspondence_loss",), False),
     "Validation: median rotation error, degrees": (("val/rotation_q2_deg",), True),
@@ -75,10 +73,9 @@ def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = _figure(title, unit, "problems up to this error")
-    figure.update_yaxes(range=[0, 1.01], tickformat=".0%")
+    figure = _figure(title, unit, "problems up to this error", share=True)
     for place, line in enumerate(lines_of(runs)):
-        _line(figure, runs, place, limits, recall_of(runs[line.run], line.estimate, error, limits), "%{y:.1%}")
+        _add(figure, place, line, limits, recall_of(runs[line.run], line.estimate, error, limits), "%{y:.1%}")
     return _logarithmic(figure)
 
 
@@ -87,45 +84,30 @@ def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
     figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees")
     figure.update_yaxes(type="log")
     for place, line in enumerate(lines_of(runs)):
-        rows = sorted(runs[line.run].of(line.estimate), key=lambda row: getattr(row, size))
-        x = np.array([getattr(row, size) for row in rows])
-        if len(np.unique(x)) < 3:
+        frame = runs[line.run].frame().query("estimate == @line.estimate")
+        if frame[size].nunique() < 3:
             continue
-        edges = np.searchsorted(x, np.unique(np.quantile(x, np.linspace(0, 1, GROUPS + 1)[1:-1])), side="right")
-        error = np.array([row.rotation_error_deg for row in rows])
-        groups = [part for part in np.split(np.arange(len(x)), edges) if len(part)]
-        medians = [max(float(np.median(error[part])), 1e-6) for part in groups]
-        _line(figure, runs, place, [np.median(x[part]) for part in groups], medians, "%{y:.3g} deg")
+        edges = np.unique(np.quantile(frame[size], np.linspace(0, 1, GROUPS + 1)[1:-1]))
+        groups = frame.groupby(np.searchsorted(edges, frame[size]))
+        medians = groups.rotation_error_deg.median().clip(lower=1e-6)
+        _add(figure, place, line, groups[size].median(), medians, "%{y:.3g} deg")
     return _logarithmic(figure) if figure.data else None
 
 
-def time_charts(runs: Mapping[str, Results]) -> "list[Figure]":
-    """Share of problems done within a time, and cumulative seconds in the order of the data set.
-
-    The estimates of a run are made together and share their time.
-    """
-    first = {line.run: place for place, line in reversed(list(enumerate(lines_of(runs))))}
-    times = {run: np.array([row.seconds for row in runs[run].of(next(iter(runs[run].estimates)))]) for run in first}
-    positive = np.concatenate([values[values > 0] for values in times.values()])
+def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
+    """Share of problems done within a time; the estimates of a run are made together and share it."""
+    first = {line.run: (place, line) for place, line in reversed(list(enumerate(lines_of(runs))))}
+    times = {
+        run: torch.tensor([row.seconds for row in runs[run].of(line.estimate)]) for run, (_, line) in first.items()
+    }
+    positive = torch.cat([seconds[seconds > 0] for seconds in times.values()])
     if not len(positive):
-        return []
-    limits = np.geomspace(positive.min() * 0.9, positive.max() * 1.1, POINTS)
-    shares = _figure("Problems done within a time", "seconds per problem", "problems within")
-    shares.update_yaxes(range=[0, 1.01], tickformat=".0%")
-    total = _figure("Cumulative run time", "problems, in the order of the data set", "seconds")
-    for run, values in reversed(times.items()):
-        _line(
-            shares,
-            runs,
-            first[run],
-            limits,
-            recall_curve(torch.from_numpy(values), limits.tolist()).numpy(),
-            "%{y:.1%}",
-            name=run,
-        )
-        shown = np.unique(np.linspace(0, len(values) - 1, POINTS).astype(int))
-        _line(total, runs, first[run], shown + 1, np.cumsum(values)[shown], "%{y:.3g} s", name=run)
-    return [_logarithmic(shares), total]
+        return None
+    limits = np.geomspace(float(positive.min()) * 0.9, float(positive.max()) * 1.1, POINTS)
+    figure = _figure("Problems done within a time", "seconds per problem", "problems within", share=True)
+    for run, (place, line) in reversed(first.items()):
+        _add(figure, place, line._replace(label=run), limits, recall_curve(times[run], limits.tolist()), "%{y:.1%}")
+    return _logarithmic(figure)
 
 
 def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
@@ -138,18 +120,13 @@ def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
             posed = training.switch_step is not None
             known = [key for key in keys if key in training.curves and (key == keys[0] or posed)]
             for key in known:
-                short = key.split("/")[1].replace("_", " ")
-                steps, values = training.curves[key]
-                colour = LIGHT[(place if len(logs) > 1 else keys.index(key)) % len(LIGHT)]
-                figure.add_scatter(
-                    x=steps, y=values, name=short if len(logs) == 1 else f"{run} {short}", mode="lines",
-                    line={"color": colour, "dash": _dash(keys.index(key)), "width": 2},
-                )  # fmt: skip
+                short, number = key.split("/")[1].replace("_", " "), keys.index(key)
+                line = Line(run, key, short if len(logs) == 1 else f"{run} {short}", place, number)
+                _add(figure, None, line._replace(colour=number) if len(logs) == 1 else line, *training.curves[key])
             if posed and known and known[0].startswith("train"):
                 text = "pose loss joins" if len(logs) == 1 else f"{run}: pose loss"
-                figure.add_vline(
-                    x=training.switch_step, line={"dash": "dash", "width": 1, "color": QUIET}, annotation={"text": text}
-                )
+                line_style = {"dash": "dash", "width": 1, "color": QUIET}
+                figure.add_vline(x=training.switch_step, line=line_style, annotation={"text": text})
         if figure.data:
             charts.append(figure)
     return charts
@@ -163,26 +140,23 @@ def chart_text(figure: "Figure") -> str:
 
 
 def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) -> "dict[str, list[Figure]]":
-    """The charts of the page by section; sections without one are left out."""
-    if not runs:
-        return {"training": training_charts(logs)}
-    sections: dict[str, Sequence[Figure | None]] = {
-        "recall": [recall_chart(runs, error) for error in RECALLS],
-        "errors": [error_chart(runs, size) for size in SIZES],
-        "time": time_charts(runs),
-        "training": training_charts(logs),
-    }
-    known = {name: [chart for chart in charts if chart is not None] for name, charts in sections.items()}
-    return {name: charts for name, charts in known.items() if charts}
+    """The charts of the page by heading; headings without one are left out."""
+    charts: dict[str, list[Figure | None]] = {}
+    if runs:
+        charts["Recall"] = [recall_chart(runs, error) for error in RECALLS]
+        charts["Errors against size"] = [error_chart(runs, size) for size in SIZES]
+        charts["Time"] = [time_chart(runs)]
+    charts["Training"] = [*training_charts(logs)]
+    known = {name: [chart for chart in several if chart is not None] for name, several in charts.items()}
+    return {name: several for name, several in known.items() if several}
 
 
-def _figure(title: str, x: str, y: str) -> "Figure":
+def _figure(title: str, x: str, y: str, *, share: bool = False) -> "Figure":
     from plotly.graph_objects import Figure
 
     figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
     figure.update_xaxes(title={"text": x}, hoverformat=".3~g")
-    figure.update_yaxes(title={"text": y})
-    return figure
+    return figure.update_yaxes(title={"text": y}, **({"range": [0, 1.01], "tickformat": ".0%"} if share else {}))
 
 
 def _logarithmic(figure: "Figure") -> "Figure":
@@ -196,19 +170,12 @@ def _logarithmic(figure: "Figure") -> "Figure":
     return figure.update_xaxes(type="log", tickformat="~g", **few)
 
 
-def _line(
-    figure: "Figure", runs: Mapping[str, Results], place: int, x: Any, y: Any, hover: str, name: str = ""
-) -> None:
-    """Add a line in the style of the estimate at `place`, by which the page finds it."""
-    line = lines_of(runs)[place]
-    figure.add_scatter(
-        x=np.asarray(x, np.float32), y=np.asarray(y, np.float32), name=name or line.label, mode="lines", meta=place,
-        line={"color": LIGHT[line.colour], "dash": _dash(line.dashes), "width": 2}, hovertemplate=hover,
-    )  # fmt: skip
-
-
-def _dash(number: int) -> str:
-    return ",".join(f"{length:g}px" for length in DASHES[number % len(DASHES)]) or "solid"
+def _add(figure: "Figure", place: int | None, line: Line, x: Any, y: Any, hover: str | None = None) -> None:
+    """Add a line; by the place of its estimate the page finds it."""
+    dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
+    style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
+    points = {"x": np.asarray(x, np.float32), "y": np.asarray(y, np.float32)}
+    figure.add_scatter(**points, name=line.label, mode="lines", meta=place, line=style, hovertemplate=hover)
 
 
 def look() -> dict[str, Any]:
@@ -216,65 +183,69 @@ def look() -> dict[str, Any]:
     axis = GRID | {"linecolor": INK["quiet"], "automargin": True}
     axis3d = GRID | {"color": INK["quiet"], "backgroundcolor": CLEAR, "showspikes": False}
     layout = {
-        "margin": {"l": 50, "r": 12, "t": 44, "b": 40}, "showlegend": False, "paper_bgcolor": CLEAR,
-        "plot_bgcolor": CLEAR, "font": {"color": INK["text"], "size": 11},
+        "margin": {"l": 50, "r": 12, "t": 44, "b": 40},
+        "showlegend": False,
+        "paper_bgcolor": CLEAR,
+        "plot_bgcolor": CLEAR,
+        "font": {"color": INK["text"], "size": 11},
         "hoverlabel": {"namelength": 60, "bgcolor": INK["panel"], "font": {"color": INK["text"]}},
         "modebar": {"bgcolor": CLEAR, "color": INK["quiet"], "activecolor": INK["focus"]},
-        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}}, "xaxis": axis, "yaxis": axis,
+        "title": {"x": 0.02, "xanchor": "left", "font": {"size": 13}},
+        "xaxis": axis,
+        "yaxis": axis,
         "scene": {"xaxis": axis3d, "yaxis": axis3d, "zaxis": axis3d},
-    }  # fmt: skip
+    }
     return {"layout": layout}
 
 
 def figures() -> dict[str, dict[str, Any]]:
     """By the id of their element: run against run, a problem in space, a problem in the image."""
     degrees = {"type": "log", "tickformat": "~g", "dtick": "D2"}
-    diagonal = {
-        "type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper",
-        "line": {"color": INK["quiet"], "width": 1, "dash": "dash"},
-    }  # fmt: skip
+    diagonal = {"type": "line", "x0": 0, "y0": 0, "x1": 1, "y1": 1, "xref": "paper", "yref": "paper"}
+    diagonal |= {"line": {"color": INK["quiet"], "width": 1, "dash": "dash"}}
     hover = "%{text}<br>%{x:.3g} against %{y:.3g} deg<extra></extra>"
-    versus = {
-        "data": [_marks("scatter", size=5, color=INK["text"], opacity=0.5) | {"hovertemplate": hover}],
-        "layout": {
-            "title": {"text": "Rotation error of each problem"}, "hovermode": "closest", "xaxis": degrees,
+    versus = (
+        [_marks(size=5, color=INK["text"], opacity=0.5) | {"hovertemplate": hover}],
+        {
+            "title": {"text": "Rotation error of each problem"},
+            "xaxis": degrees,
             "yaxis": degrees | {"matches": "x"},  # so that the diagonal of the picture is x = y
             "shapes": [diagonal],
         },
-    }  # fmt: skip
+    )
     directions = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
     axes = {axis: {"title": {"text": direction}} for axis, direction in directions.items()}
-    scene = {
-        "data": [
-            _marks("scatter3d", size=3.5, line={"width": 0}),
-            {"type": "scatter3d", "mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 18}},
-        ],
-        "layout": {
-            "margin": dict.fromkeys("lrtb", 0), "hovermode": "closest",
-            "scene": axes | {
-                "aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}
-            },
+    view = {"aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}}
+    space = [_marks(size=3.5, line={"width": 0}), _picked(18)]
+    scene = (
+        [mark | {"type": "scatter3d"} for mark in space],
+        {
+            "margin": dict.fromkeys("lrtb", 0),
+            "scene": axes | view,
         },
-    }  # fmt: skip
+    )
     axis = {"constrain": "domain", "zeroline": False}
-    image = {
-        "data": [
-            _lines(color=INK["quiet"]),
-            _lines(color=INK["wrong"], dash="dot"),
-            _marks("scatter", symbol="circle-open"),
-            _marks("scatter", symbol="x-thin"),
-            {"mode": "markers", "hoverinfo": "skip", "marker": PICKED | {"size": 16}},
-        ],
-        "layout": {
-            "margin": {"l": 40, "r": 10, "t": 10, "b": 30}, "hovermode": "closest", "dragmode": "pan",
-            "xaxis": axis, "yaxis": axis | {"scaleanchor": "x"},
+    lines = [_lines(color=INK["quiet"]), _lines(color=INK["wrong"], dash="dot")]
+    image = (
+        [*lines, _marks(symbol="circle-open"), _marks(symbol="x-thin"), _picked(16)],
+        {
+            "margin": {"l": 40, "r": 10, "t": 10, "b": 30},
+            "dragmode": "pan",
+            "xaxis": axis,
+            "yaxis": axis | {"scaleanchor": "x"},
         },
-    }  # fmt: skip
-    return {"versus": versus, "scene": scene, "image": image}
+    )
+    drawn = {"versus": versus, "scene": scene, "image": image}
+    return {name: {"data": data, "layout": {"hovermode": "closest"} | layout} for name, (data, layout) in drawn.items()}
 
 
-def _marks(kind: str, **marker: Any) -> dict[str, Any]:
-    return {"type": kind, "mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
+def _marks(**marker: Any) -> dict[str, Any]:
+    return {"type": "scatter", "mode": "markers", "marker": marker, "hovertemplate": "%{text}<extra></extra>"}
+
+
+def _picked(size: int) -> dict[str, Any]:
+    marker = {"symbol": "circle-open", "color": INK["wrong"], "line": {"width": 2}, "size": size}
+    return {"mode": "markers", "hoverinfo": "skip", "marker": marker}
 
 
 def _lines(**line: Any) -> dict[str, Any]:

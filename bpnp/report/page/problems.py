@@ -108,19 +108,21 @@ def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
     for name, problem in runs.items():
         if len(problem.points3d) > FEW and (problem.assigned3d >= 0).any():
             numbers2d, numbers3d = problem.numbers()
-            matched = problem.assigned3d >= 0
-            partners2d = numbers2d[problem.assigned3d[matched]].tolist()
-            partner = dict(zip(numbers3d[matched].tolist(), partners2d, strict=True))
+            partner = {j: numbers2d[i] for j, i in zip(numbers3d.tolist(), problem.assigned3d, strict=True) if i >= 0}
             assigned[name] = [place.get(partner.get(j), -1) for j in ids3d]
-    estimates = [pose for problem in runs.values() for pose in problem.estimates.values()]
-    truth, *poses = _poses([shown.pose, *estimates], decimals)
-    left = iter(poses)
     return {
         "points2d": np.round(shown.points2d.astype(float), _decimals(shown.points2d)).tolist(),
         "points3d": np.round(shown.points3d.astype(float), decimals).tolist(),
-        "ids2d": ids2d, "ids3d": ids3d, "match3d": shown.match3d.tolist(), "assigned": assigned, "truth": truth,
-        "poses": {name: dict(zip(problem.estimates, left, strict=False)) for name, problem in runs.items()},
-    }  # fmt: skip
+        "ids2d": ids2d,
+        "ids3d": ids3d,
+        "match3d": shown.match3d.tolist(),
+        "assigned": assigned,
+        "truth": _pose(shown.pose, decimals),
+        "poses": {
+            name: {estimate: _pose(pose, decimals) for estimate, pose in problem.estimates.items()}
+            for name, problem in runs.items()
+        },
+    }
 
 
 def _decimals(points: Array) -> int:
@@ -129,12 +131,9 @@ def _decimals(points: Array) -> int:
     return DIGITS - math.floor(math.log10(extent)) if extent > 0 else DIGITS
 
 
-def _poses(poses: Sequence[tuple[Array, Array] | None], decimals: int) -> list[list[float] | None]:
-    """Quaternions (x, y, z, w) and translations; none without a pose."""
-    missing = np.full((3, 4), np.nan)
-    matrices = np.array([missing if pose is None else np.c_[pose] for pose in poses], float)
-    known = np.isfinite(matrices).all((1, 2))
-    matrices[~known] = np.eye(3, 4)
-    quaternions = np.round(Rotation.from_matrix(matrices[:, :, :3]).as_quat(), DIGITS)
-    numbers = np.c_[quaternions, np.round(matrices[:, :, 3], decimals)].tolist()
-    return [pose if there else None for pose, there in zip(numbers, known.tolist(), strict=True)]
+def _pose(pose: tuple[Array, Array] | None, decimals: int) -> list[float] | None:
+    """Quaternion (x, y, z, w) and translation; none without a pose."""
+    if pose is None or not np.isfinite(np.c_[pose]).all():
+        return None
+    quaternion = Rotation.from_matrix(pose[0]).as_quat()
+    return [*np.round(quaternion, DIGITS).tolist(), *np.round(np.asarray(pose[1], float), decimals).tolist()]

@@ -1,26 +1,29 @@
 """Results as one HTML file that needs nothing else: no network, no server.
 
 plotly's script is inside, compressed: 2.0 MB of text. The numbers and points travel as compressed JSON: eight runs of
-ten thousand problems stay under 20 MB. What is drawn from them is in `assets`.
+ten thousand problems stay under 20 MB. The template and what is drawn by the browser are in `assets`.
 """
 
-import html
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from bpnp.files import written_whole
-from bpnp.report.page.charts import CONFIG, chart_text, figures, look, page_charts
+import numpy as np
+from jinja2 import Environment
+from markupsafe import Markup
+
+from bpnp.files import write_text
+from bpnp.report.page.charts import CONFIG, SIZES, chart_text, figures, look, page_charts
 from bpnp.report.page.problems import compressed, page_numbers, page_points, shown_id
-from bpnp.report.page.text import causes_html, headline_html, options, quartiles_html, series_boxes, visible
-from bpnp.report.palette import INKS
+from bpnp.report.palette import DASHES, INKS
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.points import read_points
-from bpnp.report.results import CAUSES, read_results
-from bpnp.report.runs import TrainingLog, lines_of, named_runs, read_training_log, trained_only
+from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
+from bpnp.report.runs import Line, TrainingLog, lines_of, named_runs, read_training_log, trained_only
+from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
 from bpnp.report.terminal import Paper
 
 SCRIPTS = ("page.js", "problem.js")
@@ -37,14 +40,14 @@ COLUMNS = {  # of the table of problems: head and hover text
     "iterations": ("iterations", "iterations of the solver"),
     "seconds": ("sec", "seconds, the problem's share of its batch"),
 }
-STATUSES = ("converged", "not converged", "no pose")
-HEADINGS = {"recall": "Recall", "errors": "Errors against size", "time": "Time", "training": "Training"}
-VERSUS = (
-    '<div class="controls"><label>A <select id="a" data-state>{0}</select></label>'
-    '<label>B <select id="b" data-state>{1}</select></label></div><p id="versus-text" role="status"></p>'
-    '<div class="chart" id="versus" role="img"></div>'
-    '<p class="note">A point above the diagonal is a problem that A solves better. Click a point to open it.</p>'
-)
+
+
+class TableRow(NamedTuple):
+    """line: None for a published row. cells: text, number and whether it is the best of its column."""
+
+    name: str
+    line: Line | None
+    cells: list[tuple[str, Any, bool]]
 
 
 def write_page(
@@ -55,16 +58,10 @@ def write_page(
     photo: what finds the photo of a problem, to lie under its image points; see `bpnp.report.photos`.
     Raises ValueError if a folder, its points or its training log cannot be read.
     """
-    output = Path(output)
-    text = page_html(paths, paper=paper, photo=photo)
-    with written_whole(output) as temporary:
-        temporary.write_text(text, encoding="utf-8")
-    return output
+    return write_text(Path(output), page_html(paths, paper=paper, photo=photo))
 
 
-def page_html(
-    paths: Sequence[Path | str], *, paper: Paper | None = None, photo: PhotoFinder | None = None
-) -> str:  # fmt: skip
+def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photo: PhotoFinder | None = None) -> str:
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
     logs = _logs(folders)
@@ -72,61 +69,93 @@ def page_html(
     points = {name: read_points(path) for name, path in folders.items()}
     charts = page_charts(runs, logs)
     drawn = [chart for section in charts.values() for chart in section]
-    names = [line.label for line in lines_of(runs)]
-    sections = {
-        **({"quartiles": ("Quartiles", quartiles_html(runs, paper))} if runs else {}),
-        **(
-            {"versus-section": ("Run against run", VERSUS.format(options(names), options(names, 1)))}
-            if names[1:]
-            else {}
-        ),
-        **{name: (HEADINGS[name], _charts_html(section, drawn)) for name, section in charts.items()},
-        **({"failures": ("Failures", causes_html(runs))} if runs else {}),
-    }
-    plotly, assets = plotly_script(), files("bpnp.report.page") / "assets"
-    data = compressed(json.dumps(page_numbers(runs) | {
-        "keys": list(COLUMNS), "causes": CAUSES, "inks": INKS,
+    numbers = page_numbers(runs) | {
+        "keys": list(COLUMNS),
+        "causes": CAUSES,
+        "inks": INKS,
         "photos": {shown_id(id): image for id, image in page_photos(points, photo).items()},
-        "charts": [chart.to_json() for chart in drawn], "config": CONFIG,
+        "charts": [chart.to_json() for chart in drawn],
+        "config": CONFIG,
         "figures": {name: json.dumps(figure) for name, figure in figures().items()},
         "look": json.dumps(look()),
-    }))  # fmt: skip
-    links = {name: heading for name, (heading, _) in sections.items()} | ({"problems": "Problems"} if runs else {})
-    colours = " ".join(f"--{name}: light-dark({light}, {dark});" for name, (light, dark) in INKS.items())
-    parts = {
-        "style": f":root {{ color-scheme: light dark; {colours} }}\n"
-        + (assets / "page.css").read_text(encoding="utf-8"),
-        "script": "\n".join((assets / name).read_text(encoding="utf-8") for name in SCRIPTS),
-        "data": data,
-        "points": page_points(runs, points, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
-        "plotly": plotly,
-        "title": html.escape("bpnp: " + ", ".join(folders)),
-        "headline": headline_html(runs),
-        "list": options(names),
-        "causes": options(CAUSES),
-        "statuses": options(STATUSES),
-        "no-problems": "" if runs else " hidden",
-        "problem-head": problem_head("problem", sort=True),
-        "number-head": problem_head("estimate"),
-        "series": series_boxes(runs),
-        "navigation": " ".join(f'<a href="#{name}">{heading}</a>' for name, heading in links.items()),
-        "sections": "\n".join(
-            f'<section id="{name}"><h2>{heading}</h2>{content}</section>'
-            for name, (heading, content) in sections.items()
-        ),
-        "footer": f"plotly.js (MIT licence) is part of this file: {len(plotly) / 1e6:.1f} MB of it.",
     }
-    pieces = (assets / "page.html").read_text(encoding="utf-8").split("%%")
-    return "".join(parts[piece] if i % 2 else piece for i, piece in enumerate(pieces))
+    data, plotly, lines = compressed(json.dumps(numbers)), plotly_script(), lines_of(runs)
+    # Names are text, whatever is in them: what is not Markup is escaped, bytes that are no UTF-8 are replaced.
+    page = Environment(autoescape=True, finalize=_utf8, trim_blocks=True, lstrip_blocks=True)
+    return page.from_string(_asset("page.html")).render(
+        style=Markup(_asset("page.css")),
+        script=Markup("\n".join(map(_asset, SCRIPTS))),
+        data=data,
+        points=page_points(runs, points, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
+        plotly=plotly,
+        runs={name: (described(results), _facts(results)) for name, results in runs.items()},
+        folders=", ".join(folders),
+        inks=INKS,
+        dashes=DASHES,
+        lines=lines,
+        heads=[column.header for column in RESULT_COLUMNS],
+        rows=quartile_rows(runs, paper),
+        caption=CAPTION,
+        charts={
+            name: [(drawn.index(chart), chart_text(chart)) for chart in several] for name, several in charts.items()
+        },
+        causes=CAUSES,
+        shares=[(line, *_shares(runs[line.run], line.estimate)) for line in lines],
+        solved=f"{SOLVED_DEG:g} degrees",
+        plausible=f"{100 * PLAUSIBLE_INLIERS:.0f} %",
+        columns=COLUMNS,
+    )
 
 
-def problem_head(first: str, *, sort: bool = False) -> str:
-    """The head of a table of problems or of the estimates of one, with buttons that sort."""
-    heads = ""
-    for key, (text, title) in {"id": (first, ""), **COLUMNS}.items():
-        shown = f'<button type="button" data-key="{key}">{text}</button>' if sort else text
-        heads += f'<th scope="col" title="{title}">{shown}</th>'
-    return f'<thead><tr>{heads}<th scope="col" class="words">cause</th></tr></thead><tbody></tbody>'
+def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:
+    """The rows of the table of quartiles, with the terminal's texts."""
+    rows, lines = run_rows(runs, paper), lines_of(runs)
+    best = best_texts(RESULT_COLUMNS, rows)
+    shown = []
+    for i, row in enumerate(rows):
+        line = lines[i] if i < len(lines) else None
+        texts = [(cell(column, row.values), row.values.get(column.key), column.key) for column in RESULT_COLUMNS]
+        cells = [(text, value, bool(line) and text == best.get((row.problems, key))) for text, value, key in texts]
+        shown.append(TableRow(row.name, line, cells))
+    return shown
+
+
+def described(results: Results) -> str:
+    """What was tested, with which settings and with which outcome."""
+    rows = results.of(next(iter(results.estimates)))
+    spans = {what: sorted(getattr(row, key) for row in rows) for key, what in SIZES.items()}
+    sizes = (f"{span[0] if span[0] == span[-1] else f'{span[0]} to {span[-1]}'} {what}" for what, span in spans.items())
+    best, values = min(results.estimates.items(), key=lambda item: item[1]["rotation_q2_deg"])
+    solved = f"{100 * cause_shares(results.of(best))['solved']:.1f} % within {SOLVED_DEG:g} deg"
+    outcome = f"{best}: median rotation error {cell(RESULT_COLUMNS[1], values)} deg, {solved}"
+    facts = [f"{len(rows)} problems with {', '.join(sizes)}", ", ".join(_settings(results.settings)), outcome]
+    return ". ".join(fact for fact in facts if fact)
+
+
+def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
+    """Solver, data and checkpoint of a test, as far as they were recorded."""
+    for name in ("solver", "data"):
+        part = settings.get(name)
+        if isinstance(part, Mapping) and "class_path" in part:
+            plain = {k: v for k, v in (part.get("init_args") or {}).items() if isinstance(v, (int, float, str)) and v}
+            options = ", ".join(f"{key} {value}" for key, value in plain.items() if key not in LOADING)
+            kind = str(part["class_path"]).rpartition(".")[2]
+            yield f"{name} {kind}" + (f" ({options})" if options and name == "data" else "")
+    if settings.get("complete") is False:
+        yield "interrupted before the last problem"
+    if settings.get("checkpoint"):
+        yield f"checkpoint {settings['checkpoint']}"
+
+
+def _facts(results: Results) -> str:
+    names = ("written", "bpnp_version", "correspondence_loss", "settings")
+    return json.dumps({name: getattr(results, name) for name in names}, indent=2)
+
+
+def _shares(results: Results, estimate: str) -> tuple[list[float], float]:
+    """Percent of the problems with each cause, and that the solver calls converged."""
+    shares = np.array(list(cause_shares(results.of(estimate)).values()))
+    return (100 * shares).tolist(), 100 * results.estimates[estimate].get("converged", float("nan"))
 
 
 @cache
@@ -137,14 +166,13 @@ def plotly_script() -> str:
     return compressed(get_plotlyjs())
 
 
-def _charts_html(charts: Iterable[Any], figures: Sequence[Any]) -> str:
-    places = {id(figure): i for i, figure in enumerate(figures)}
-    shown = (
-        f'<div class="chart" role="img" data-chart="{places[id(chart)]}" '
-        f'aria-label="{visible(chart_text(chart))}"></div>'
-        for chart in charts
-    )
-    return f'<div class="charts">{"".join(shown)}</div>'
+def _asset(name: str) -> str:
+    return (files("bpnp.report.page") / "assets" / name).read_text(encoding="utf-8")
+
+
+def _utf8(value: Any) -> Any:
+    plain = isinstance(value, str) and not isinstance(value, Markup)
+    return value.encode("utf-8", "replace").decode() if plain else value
 
 
 def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
