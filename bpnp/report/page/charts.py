@@ -216,7 +216,7 @@ def figures() -> dict[str, dict[str, Any]]:
     directions = {"xaxis": "right", "yaxis": "forward", "zaxis": "up"}  # of the true camera
     axes = {axis: {"title": {"text": direction}} for axis, direction in directions.items()}
     view = {"aspectmode": "data", "dragmode": "orbit", "camera": {"eye": {"x": 1.3, "y": -2.1, "z": 0.9}}}
-    space = [_marks(size=3.5, line={"width": 0}), _picked(18)]
+    space: list[dict[str, Any]] = [_marks(size=3.5, line={"width": 0}), _picked(18)]
     scene = (
         [mark | {"type": "scatter3d"} for mark in space],
         {
@@ -224,7 +224,7 @@ def figures() -> dict[str, dict[str, Any]]:
             "scene": axes | view,
         },
     )
-    axis = {"constrain": "domain", "zeroline": False}
+    axis: dict[str, Any] = {"constrain": "domain", "zeroline": False}
     lines = [_lines(color=INK["quiet"]), _lines(color=INK["wrong"], dash="dot")]
     image = (
         [*lines, _marks(symbol="circle-open"), _marks(symbol="x-thin"), _picked(16)],
@@ -235,7 +235,7 @@ def figures() -> dict[str, dict[str, Any]]:
             "yaxis": axis | {"scaleanchor": "x"},
         },
     )
-    drawn = {"versus": versus, "scene": scene, "image": image}
+    drawn: dict[str, tuple[Any, dict[str, Any]]] = {"versus": versus, "scene": scene, "image": image}
     return {name: {"data": data, "layout": {"hovermode": "closest"} | layout} for name, (data, layout) in drawn.items()}
 
 
