@@ -112,8 +112,8 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
         if float(np.abs(gap).sum()) ** 2 < least * float((gap**2).sum()):
             continue
-        gap = np.bincount(blocks, gap)
-        squared = float((gap**2).sum())
+        sums = np.bincount(blocks, gap)
+        squared = float((sums**2).sum())
         other = _partners(sets, *(x[k] for x in (*poses, scales)))
         reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
