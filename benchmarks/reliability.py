@@ -25,7 +25,7 @@ from scipy.stats import binomtest
 from view_pairs import scene_pairs
 
 from bpnp import solve
-from bpnp.datamodules.meshes.surfaces import normalise, procedural_shape, sample_surface
+from bpnp.datamodules.surfaces import normalise, procedural_shape, sample_surface
 from bpnp.report.figures import save_figure
 from bpnp.search import pool, verdict
 from bpnp.search.verdict import missed

@@ -3,7 +3,7 @@
 Conventions: camera = R p + t. Angles are in degrees, lengths in scene units; everything is computed in float64.
 A problem without a pose (NaN or infinity in the estimate) has errors of 180 deg and infinity: it counts as the worst
 pose and is right at no threshold, it is never left out. A problem with a pose but without a true match has no
-reprojection error (NaN): it is left out of what is said of that error, and counted as "without_true_pairs".
+reprojection error (NaN): it is left out of what is said of that error, and counted as "without_matches".
 """
 
 import math
@@ -138,7 +138,7 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
     """First, second (median) and third quartile of each error, as float64 scalars.
 
     Keys: "rotation_q1_deg", "translation_q2", "centre_q3", "reprojection_q1_deg" and so on; "found", the share of
-    problems with a pose; "without_true_pairs", the number of those without a reprojection error. Linear
+    problems with a pose; "without_matches", the number of those without a reprojection error. Linear
     interpolation between order statistics (numpy's default); a quartile that leans on an infinite neighbour is
     infinite. The reprojection quartiles are absent if no problem has that error. Raises ValueError if there is no
     problem.
@@ -153,7 +153,7 @@ def pose_quartiles(errors: PoseErrors) -> dict[str, Tensor]:
             value = torch.lerp(below, above, position % 1).where(above.isfinite(), above)
             values[f"{name}_q{number}_{unit}".rstrip("_")] = value
     values["found"] = errors.translation.isfinite().double().mean()
-    values["without_true_pairs"] = errors.reprojection_deg.isnan().double().sum()
+    values["without_matches"] = errors.reprojection_deg.isnan().double().sum()
     return values
 
 

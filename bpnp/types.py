@@ -94,7 +94,7 @@ class Prediction(Tensors):
 
 @dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy
 class Batch(Tensors):
-    """Pairs of point sets, padded and masked.
+    """Problems, padded and masked: sets of image points and of scene points, and what is known of them.
 
     points2d: (b, m, 2) normalised image coordinates.
     points3d: (b, n, 3) scene units.

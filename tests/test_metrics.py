@@ -87,7 +87,7 @@ def test_errors_of_planted_poses() -> None:
     torch.testing.assert_close(shifted.centre, torch.full((4,), 0.5, dtype=torch.float64))
 
 
-def test_reprojection_error_is_the_mean_angle_over_true_pairs_and_ignores_padding() -> None:
+def test_reprojection_error_is_the_mean_angle_over_matches_and_ignores_padding() -> None:
     batch = planted_batch(1, 3)
     rotation, translation = random_rotations(5, 3), torch.randn(3, 3, dtype=torch.float64)
     match3d = batch.match3d
@@ -149,7 +149,7 @@ def test_pairs_without_a_true_match_are_left_out_of_the_reprojection_figures_onl
     errors = pose_errors(pose, batch)
     assert errors.reprojection_deg.isnan().tolist() == [True, False, False, False]
     values = pose_quartiles(errors)
-    assert values["without_true_pairs"] == 1
+    assert values["without_matches"] == 1
     assert values["reprojection_q3_deg"] == pytest.approx(90, abs=1e-6)  # of 0, 0, 180
     assert pose_recalls(errors)["recall_reprojection_1deg"].item() == pytest.approx(2 / 3)
     assert pose_recalls(errors)["recall_rotation_1deg"] == 0.75
@@ -160,7 +160,7 @@ def test_without_matches_there_are_no_reprojection_figures() -> None:
     batch = Batch.from_arrays(full.points2d, full.points3d, full.rotation, full.translation)
     values = pose_quartiles(pose_errors(true_pose(batch), batch)) | pose_recalls(pose_errors(true_pose(batch), batch))
     assert not any("reprojection" in key for key in values)
-    assert values["without_true_pairs"] == 2
+    assert values["without_matches"] == 2
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 4, 5, 17, 100])

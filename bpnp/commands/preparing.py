@@ -33,7 +33,7 @@ def prepare_modelnet40(
         normalisation: of each mesh.
         processes: worker processes.
     """
-    from bpnp.datamodules.meshes.module import prepare_meshes
+    from bpnp.datamodules.meshes import prepare_meshes
 
     at_least(4, points=points)
     at_least(1, processes=processes)

@@ -8,8 +8,8 @@ if TYPE_CHECKING:
     from bpnp.datamodules.augment import Outliers
     from bpnp.datamodules.authors import AuthorsDataModule
     from bpnp.datamodules.colmap.module import ColmapDataModule
-    from bpnp.datamodules.meshes.module import MeshDataModule
-    from bpnp.datamodules.module import ProblemDataModule
+    from bpnp.datamodules.loader import ProblemDataModule
+    from bpnp.datamodules.meshes import MeshDataModule
     from bpnp.datamodules.problem import Problem, ProblemSource
     from bpnp.datamodules.stored import StoredDataModule, write_problems
     from bpnp.datamodules.synthetic_maps.maps import SyntheticMapDataModule
@@ -33,8 +33,8 @@ _find, __dir__, _ = lazy_loader.attach(
         "augment": ["Outliers"],
         "authors": ["AuthorsDataModule"],
         "colmap.module": ["ColmapDataModule"],
-        "meshes.module": ["MeshDataModule"],
-        "module": ["ProblemDataModule"],
+        "meshes": ["MeshDataModule"],
+        "loader": ["ProblemDataModule"],
         "problem": ["Problem", "ProblemSource"],
         "stored": ["StoredDataModule", "write_problems"],
         "synthetic_maps.maps": ["SyntheticMapDataModule"],

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.datamodules.module import hold_out
+from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
 from bpnp.datamodules.store import Made, Recipe, Row, Store, cached, is_store, open_store, prepare
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows

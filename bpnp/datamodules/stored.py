@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.datamodules.augment import Augmentation, Side
-from bpnp.datamodules.module import STAGES, ProblemDataModule
+from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
 from bpnp.datamodules.store import Row, Store, StoreError, new_store, open_store
 from bpnp.geometry import MIN_POINTS

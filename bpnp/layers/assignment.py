@@ -42,7 +42,7 @@ def sinkhorn(
         assignment. With it each side gets one more point, the bin (`dustbin_marginals`), which is left out of the
         result, so that P sums to less than one.
     tolerance: largest L1 error of the row and of the column sums at which a sample stops.
-    max_iterations: pairs of scalings for each sample.
+    max_iterations: scalings of rows and of columns for each sample.
     backward_stats: counts the samples of backward passes, and those that did not converge. Without it the latter cause
         a RuntimeWarning.
 
@@ -123,7 +123,7 @@ class Sinkhorn(nn.Module):
         learn_mu: whether mu is learned.
         dustbin: cost of leaving a point unmatched; null for a full assignment.
         tolerance: L1 error of the marginals at which the transport stops.
-        max_iterations: pairs of scalings, at most.
+        max_iterations: scalings of rows and of columns, at most.
 
     >>> layer = Sinkhorn(mu=0.1, learn_mu=True)
     >>> assignment, stats = layer(torch.rand(2, 5, 6))

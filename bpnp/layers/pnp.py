@@ -9,8 +9,17 @@ from torch import Tensor, nn
 from bpnp.checks import checked_shapes
 from bpnp.geometry import hat, is_finite
 from bpnp.layers.implicit import at_optimum
-from bpnp.layers.objective import Columns, Derivatives, Rotations, Translations, aggregate, derivatives, pose_gradient
-from bpnp.layers.pose_solvers import lbfgs, newton
+from bpnp.layers.objective import (
+    Columns,
+    Derivatives,
+    Rotations,
+    Translations,
+    aggregate,
+    derivatives,
+    lbfgs,
+    newton,
+    pose_gradient,
+)
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 

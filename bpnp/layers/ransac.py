@@ -16,7 +16,7 @@ from bpnp.types import SolveStats, unpadded
 Backend = Literal["auto", "poselib", "opencv", "torch"]
 
 
-class PairList(NamedTuple):
+class MatchList(NamedTuple):
     """The most probable matches of each sample, most probable first."""
 
     index2d: Int[Tensor, "b k"]
@@ -24,13 +24,13 @@ class PairList(NamedTuple):
     mask: Bool[Tensor, "b k"]
 
 
-def top_pairs(
+def top_matches(
     assignment: Float[Tensor, "b m n"],
     *,
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
     pairs_factor: float = 1.5,
-) -> PairList:
+) -> MatchList:
     """The k = pairs_factor * min(m, n) matches of highest probability, m and n counting a sample's real points."""
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
@@ -43,7 +43,7 @@ def top_pairs(
     k = min(max(1, int(pairs_factor * min(m, n))), m * n)
     flat = scores.flatten(1).topk(k, dim=-1).indices
     mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
-    return PairList(flat // n, flat % n, mask)
+    return MatchList(flat // n, flat % n, mask)
 
 
 @checked_shapes
@@ -88,7 +88,7 @@ def ransac_pnp(
     check_positive(pairs_factor=pairs_factor, threshold=threshold, max_iterations=max_iterations)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
-    chosen = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
+    chosen = top_matches(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
     matches = Matches(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
     local, centre, scale = normalised(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)

@@ -122,7 +122,7 @@ class OfflineWandbLogger(WandbLogger):
 
 
 class TrainingMonitor(Callback):
-    """Logs "train/pairs_per_second" per epoch and, of the first few validation problems, "val/true_match_mass", the
+    """Logs "train/problems_per_second" per epoch and, of the first few validation problems, "val/true_match_mass", the
     probability that the assignment gives to their true matches, "val/<estimate>_iterations" of each pose, and
     "val/feature_spread_2d" and "_3d" (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a
     set have the same feature the assignment is uniform, and the loss stays where it is.
@@ -153,8 +153,13 @@ class TrainingMonitor(Callback):
         if trainer.is_last_batch:
             # Before the validation that ends the epoch, which is no training.
             seconds = time.perf_counter() - self.started
-            pairs = self.seen * trainer.world_size
-            pl_module.log("train/pairs_per_second", pairs / seconds, on_step=False, on_epoch=True, batch_size=1)
+            pl_module.log(
+                "train/problems_per_second",
+                self.seen * trainer.world_size / seconds,
+                on_step=False,
+                on_epoch=True,
+                batch_size=1,
+            )
 
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int

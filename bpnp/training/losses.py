@@ -79,7 +79,7 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
         return None
     if angle is None:
         return None if batch.match3d is None else correspondence_loss(prediction.assignment, batch.match3d)
-    true = pairs_within(batch.points2d, batch.points3d, *_true_pose(batch), angle)
+    true = within_angle(batch.points2d, batch.points3d, *_true_pose(batch), angle)
     return (prediction.assignment * (1.0 - 2.0 * true)).sum((-2, -1))
 
 
@@ -140,7 +140,7 @@ def _log(probability: Tensor) -> Tensor:
     return probability.clamp_min(SMALLEST).log()
 
 
-def pairs_within(
+def within_angle(
     points2d: Float[Tensor, "b m 2"],
     points3d: Float[Tensor, "b n 3"],
     rotation: Float[Tensor, "b 3 3"],

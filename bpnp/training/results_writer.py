@@ -57,11 +57,15 @@ class ResultsWriter(Callback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         gathered = _gather((self.rows, self.losses, self.chosen, self.points))
+        tabled = getattr(pl_module, "tabled", ())
+        others = {name: value for name, value in trainer.callback_metrics.items() if name not in tabled}
+        logged = ", ".join(f"{name} {float(value):.6g}" for name, value in others.items())
         if any(rows for rows, *_ in gathered):
             self._write_test(trainer, gathered, complete=True)
-            return
-        logged = ", ".join(f"{name} {float(value):.6g}" for name, value in trainer.callback_metrics.items())
-        rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
+            if logged:
+                rank_zero_info(f"logged: {logged}")
+        else:
+            rank_zero_info(f"logged: {logged or 'nothing'}; no results folder: `test_step` does not return {RETURNED}")
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Of an interrupted test the problems that are finished; of several processes those of the first."""

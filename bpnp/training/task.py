@@ -98,6 +98,7 @@ class BlindPnPTask(LightningModule):
         self.refine_validation = refine_validation
         self.training_seed: str | None = None  # of the checkpoint that was loaded, if it is known
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
+        self.tabled: set[str] = set()  # names of the figures that the tables of a test show
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
@@ -273,11 +274,14 @@ class BlindPnPTask(LightningModule):
             metrics.reset()
             for place in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
                 # The metrics have already been gathered over processes.
-                self.log_dict({f"{place}/{key}": value.float() for key, value in values.items()})
+                figures = {f"{place}/{key}": value.float() for key, value in values.items()}
+                self.log_dict(figures)
+                self.tabled |= figures.keys()
         loss = cast(MeanOverProblems, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
+            self.tabled.add(f"{stage}/correspondence_loss")
             loss.reset()
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 from lightning import LightningModule
 from small_data import SMALL_MESHES, SMALL_NET
 from torch import Tensor, nn
@@ -18,6 +19,7 @@ import bpnp.cli as cli
 import bpnp.commands.parser as parser
 from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
+from bpnp.datamodules import MeshDataModule
 from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
 from bpnp.solving.arguments import checked_prior, source_from
@@ -128,6 +130,26 @@ def test_a_task_whose_test_step_returns_nothing_is_tested(tmp_path: Path, caplog
     (said,) = (record.getMessage() for record in caplog.records if "test/points" in record.getMessage())
     assert "logged: test/points 24; no results folder: `test_step` does not return a dictionary" in said
     assert not (tmp_path / "run" / "test").exists()
+
+
+def test_solver_and_metric_of_the_contributing_guide(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    guide = (Path(__file__).parents[2] / "CONTRIBUTING.md").read_text()
+    (tmp_path / "of_the_guide.py").write_text("".join(part.split("```")[0] for part in guide.split("```python\n")[1:]))
+    monkeypatch.syspath_prepend(tmp_path)
+    config = tmp_path / "metric.yaml"
+    config.write_text("trainer:\n  callbacks:\n  - class_path: of_the_guide.DistanceError\n")
+    main(["test", f"--config={config}", "--model.solver=of_the_guide.InFront", *MESHES, *folders(tmp_path)])
+    options = dict(option.removeprefix("--data.").split("=") for option in SMALL_MESHES)
+    data = MeshDataModule(cache_dir=str(tmp_path), **{name: yaml.safe_load(text) for name, text in options.items()})
+    data.setup("test")
+    away = torch.cat([batch.translation.norm(dim=-1) for batch in data.test_dataloader()])
+    (said,) = (text for text in caplog.messages if text.startswith("logged: "))
+    name, value = said.removeprefix("logged: ").split()
+    assert name == "test/distance_error"
+    assert float(value) == pytest.approx(float((4 / away - 1).abs().median()), rel=1e-4)
 
 
 @pytest.mark.parametrize(("name", "kind"), [("procedural-so3", BPnPNet), ("matcher-sfm", Matcher)])

@@ -37,7 +37,7 @@ def augmented(batch: Batch, *seeds: int, **options: Any) -> Batch:
     return augment(batch, Augmentation(**options), row_keys(batch.index, *(seeds or (0,))))
 
 
-def true_pairs(batch: Batch) -> torch.Tensor:
+def matches_of(batch: Batch) -> torch.Tensor:
     return (batch.match3d >= 0).sum(-1)
 
 
@@ -49,7 +49,7 @@ def test_counts_and_box_of_the_protocol(ratio: float, side: str) -> None:
     added = int(ratio * 60)
     assert int(result.count2d) == 60 + added * (side != "3d")
     assert int(result.count3d) == 60 + added * (side != "2d")
-    assert int(true_pairs(result)) == 60
+    assert int(matches_of(result)) == 60
     check_pairs(result)
     assert result.points2d[0].amin(0).tolist() == problem.points2d.min(0).tolist()
     assert result.points3d[0].amax(0).tolist() == problem.points3d.max(0).tolist()
@@ -72,9 +72,9 @@ def test_occlusion_leaves_points_without_a_partner(side: str, left2d: int, left3
     batch = raw(planted(), planted(6, seed=1))
     result = augmented(batch, outliers=Outliers(occlusion=0.25, occluded_side=side))
     assert (int(result.count2d[0]), int(result.count3d[0])) == (left2d, left3d)
-    assert true_pairs(result).tolist() == [45, 4]
+    assert matches_of(result).tolist() == [45, 4]
     check_pairs(result)
-    assert true_pairs(augmented(batch, outliers=Outliers(occlusion=0.9))).tolist() == [6, 4]
+    assert matches_of(augmented(batch, outliers=Outliers(occlusion=0.9))).tolist() == [6, 4]
 
 
 @pytest.mark.parametrize(
@@ -84,13 +84,13 @@ def test_occlusion_leaves_points_without_a_partner(side: str, left2d: int, left3
 def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str, extra2d: int, extra3d: int) -> None:
     batch = raw(planted(40, free2d=12, free3d=30))
     result = augmented(batch, max_points=20, clutter=clutter, clutter_side=side)
-    assert (int(true_pairs(result)), int(result.count2d), int(result.count3d)) == (20, 20 + extra2d, 20 + extra3d)
+    assert (int(matches_of(result)), int(result.count2d), int(result.count3d)) == (20, 20 + extra2d, 20 + extra3d)
     check_pairs(result)
     assert int((result.points2d > 50).all(-1).sum()) == extra2d
     assert int((result.points3d > 50).all(-1).sum()) == extra3d
     assert len(result.points3d[0].unique(dim=0)) == 20 + extra3d
     whole = augmented(batch)
-    assert (int(true_pairs(whole)), int(whole.count2d), int(whole.count3d)) == (40, 52, 70)
+    assert (int(matches_of(whole)), int(whole.count2d), int(whole.count3d)) == (40, 52, 70)
 
 
 def test_every_pair_and_every_clutter_point_is_as_likely() -> None:
@@ -145,7 +145,7 @@ def test_ranges_are_drawn_uniformly_for_each_pair() -> None:
     """Counts follow their ranges: ratio uniform in (0.2, 1.4), occlusion in (0.1, 0.5), each side a third."""
     outliers = Outliers(ratio=(0.2, 1.4), side="random", occlusion=(0.1, 0.5), occluded_side="3d")
     result = augmented(raw(*[planted(200)] * 600), outliers=outliers)
-    true = true_pairs(result).double()
+    true = matches_of(result).double()
     outliers2d, outliers3d = result.count2d - 200, result.count3d - true
     added = torch.maximum(outliers2d, outliers3d) / true
     assert stats.kstest(added.numpy(), "uniform", (0.2, 1.2)).statistic < 0.08

@@ -13,10 +13,8 @@ from scipy.spatial.transform import Rotation
 from small_data import check_pairs, recorded
 
 from bpnp.datamodules.augment import Augmentation, Outliers
-from bpnp.datamodules.loader import ProblemDataset, ProblemKeys
-from bpnp.datamodules.meshes.module import MeshDataModule
-from bpnp.datamodules.meshes.source import POINTS, SURFACES, MeshSource, RandomCameras
-from bpnp.datamodules.module import hold_out
+from bpnp.datamodules.loader import ProblemDataset, ProblemKeys, hold_out
+from bpnp.datamodules.meshes import POINTS, SURFACES, MeshDataModule, MeshSource, RandomCameras
 from bpnp.datamodules.problem import ProblemSource
 from bpnp.datamodules.store import Store, new_store, open_store
 from bpnp.types import Batch
@@ -32,10 +30,10 @@ def cloud(folder: Path, models: int = 5, samples: int = 400) -> Store:
     return open_store(folder / "cloud", SURFACES)
 
 
-def source(folder: Path, cameras: RandomCameras | None = None, *, num_pairs: int = 200, **options: Any) -> MeshSource:
+def source(folder: Path, cameras: RandomCameras | None = None, *, count: int = 200, **options: Any) -> MeshSource:
     store = open_store(folder / "cloud", SURFACES) if (folder / "cloud").exists() else cloud(folder)
     options = {"num_points": 300, "pool_size": 400, "seed": (0, 0), "label": "train"} | options
-    return MeshSource(store, np.arange(5), num_pairs=num_pairs, cameras=cameras or RandomCameras(), **options)
+    return MeshSource(store, np.arange(5), count=count, cameras=cameras or RandomCameras(), **options)
 
 
 def drawn(problems: MeshSource, count: int, epoch: int = 0) -> Batch:
@@ -72,7 +70,7 @@ def test_projections_by_opencv_leave_the_noise(tmp_path: Path) -> None:
 
 
 def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
-    batch = drawn(source(tmp_path, num_pairs=1000, num_points=4), 1000)
+    batch = drawn(source(tmp_path, count=1000, num_points=4), 1000)
     angles = Rotation.from_matrix(batch.rotation).as_euler("xyz", degrees=True)
     offsets = batch.translation.numpy() - [0, 0, 4.5]
     for axis in range(3):
@@ -87,7 +85,7 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
 
 def test_so3_is_uniform(tmp_path: Path) -> None:
     """The angle of a uniform rotation has the distribution function (a - sin a) / pi, its axes are uniform too."""
-    batch = drawn(source(tmp_path, RandomCameras(rotation="so3"), num_pairs=1000, num_points=4), 1000)
+    batch = drawn(source(tmp_path, RandomCameras(rotation="so3"), count=1000, num_points=4), 1000)
     rotations = Rotation.from_matrix(batch.rotation)
     assert stats.kstest(rotations.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
     assert stats.kstest(rotations.as_matrix()[:, 2, 2], stats.uniform(-1, 2).cdf).pvalue > 1e-3
@@ -110,7 +108,7 @@ def test_a_pair_depends_on_seed_epoch_and_index_alone(tmp_path: Path) -> None:
 
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="reach 1 from their origin"):
-        inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), num_pairs=5)
+        inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), count=5)
     batch = ProblemDataset(inside, Augmentation(outliers=Outliers(ratio=0.2))).batch(
         ProblemKeys(0, torch.arange(5), inside.names(range(5)))
     )
@@ -124,7 +122,7 @@ def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     check_pairs(batch, 1e-4)
     blind = RandomCameras(distance=0.0, translation_range=0.0, euler_range=(0.0, 0.0))
     with pytest.warns(UserWarning, match="reach 1"):
-        problems = source(tmp_path, blind, num_points=4, pool_size=4, num_pairs=1)
+        problems = source(tmp_path, blind, num_points=4, pool_size=4, count=1)
     with pytest.raises(ValueError, match=r"4 points in front of the camera, got \d in c/.*#0"):
         drawn(problems, 1)
 

@@ -25,11 +25,9 @@ from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.colmap.module import prepare_colmap
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
-from bpnp.datamodules.meshes.archives import MeshFiles
-from bpnp.datamodules.meshes.module import prepare_meshes
-from bpnp.datamodules.meshes.source import POINTS, SURFACES
-from bpnp.datamodules.meshes.surfaces import normalise, read_mesh, sample_surface
+from bpnp.datamodules.meshes import POINTS, SURFACES, prepare_meshes
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
+from bpnp.datamodules.surfaces import MeshFiles, normalise, read_mesh, sample_surface
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
@@ -123,7 +121,7 @@ def test_several_processes_give_the_same_bytes(
 ) -> None:
     source = zipped(meshes) if packed else meshes
     run(source, tmp_path / "one")
-    monkeypatch.setattr("bpnp.datamodules.meshes.module.MESHES_A_PART", 1)
+    monkeypatch.setattr("bpnp.datamodules.meshes.MESHES_A_PART", 1)
     run(source, tmp_path / "two", processes=2)
     check_same_bytes(tmp_path / "two", tmp_path / "one")
 
@@ -231,7 +229,7 @@ def killed(work: object, seconds: float) -> bool:
 def test_no_kill_leaves_a_wrong_store(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
 ) -> None:  # fmt: skip
-    monkeypatch.setattr("bpnp.datamodules.meshes.module.MESHES_A_PART", 2)
+    monkeypatch.setattr("bpnp.datamodules.meshes.MESHES_A_PART", 2)
     scenes(tmp_path / "scenes", 8)
 
     def work(output: str = "store") -> None:
@@ -320,7 +318,7 @@ def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pyte
 PREPARE = """
 import sys
 from pathlib import Path
-from bpnp.datamodules.meshes.module import prepare_meshes
+from bpnp.datamodules.meshes import prepare_meshes
 if __name__ == "__main__":
     print("ready", flush=True)
     try:

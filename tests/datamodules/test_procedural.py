@@ -9,10 +9,9 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.meshes.module import open_surfaces
-from bpnp.datamodules.meshes.source import POINTS
-from bpnp.datamodules.meshes.surfaces import ProceduralShapes, normalise, procedural_shape, sample_surface
+from bpnp.datamodules.meshes import POINTS, open_surfaces
 from bpnp.datamodules.store import Store
+from bpnp.datamodules.surfaces import ProceduralShapes, normalise, procedural_shape, sample_surface
 
 
 def shapes(folder: Path, split: str, count: int, *, seed: int = 0) -> Store:

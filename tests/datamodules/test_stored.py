@@ -47,7 +47,7 @@ def store(tmp_path: Path) -> Store:
     return open_store(tmp_path / "store", PROBLEMS)
 
 
-def test_matches_put_the_true_pairs_first_and_lose_no_point() -> None:
+def test_matches_come_first_and_lose_no_point() -> None:
     for i, (_, problem) in enumerate(problems()):
         points2d, points3d, match = sets(i)
         assert problem.matched == (match >= 0).sum()

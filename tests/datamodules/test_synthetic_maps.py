@@ -9,6 +9,7 @@ from jsonargparse import ArgumentParser
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules import Outliers, Problem, ProblemSource, SyntheticMapDataModule
+from bpnp.datamodules.synthetic_maps.kinds import blob_points
 from bpnp.datamodules.synthetic_maps.maps import (
     KINDS,
     MOST_ERROR_PX,
@@ -30,11 +31,10 @@ from bpnp.datamodules.synthetic_maps.scene import (
     hidden_by_walls,
     look,
 )
-from bpnp.datamodules.synthetic_maps.surfaces import blob_points
 
 
 def source(*, seed: tuple[int, ...] = (0, 0), **options: object) -> MapSource:
-    return MapSource(MapOptions(**options), num_pairs=100, seed=seed, label="train")
+    return MapSource(MapOptions(**options), count=100, seed=seed, label="train")
 
 
 def problems(count: int, **options: object) -> list[Problem]:
@@ -54,7 +54,7 @@ def errors_px(problem: Problem) -> np.ndarray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_true_pairs_reproject_within_the_noise(kind: str) -> None:
+def test_matches_reproject_within_the_noise(kind: str) -> None:
     for problem in problems(4, num_points=100, kinds={kind: 1.0}, noise_px=0.0):
         assert np.abs(errors_px(problem)).max() < 0.1  # float32
         np.testing.assert_allclose(problem.rotation @ problem.rotation.T, np.eye(3), atol=1e-12)
@@ -77,7 +77,7 @@ def test_of_each_side_at_most_a_share_has_no_partner(limit: float) -> None:
     assert np.median(without) > 0.6  # most keypoints of a photo are in no other photo, or not in the view's
 
 
-def test_a_pair_is_a_function_of_seed_epoch_and_index() -> None:
+def test_a_problem_is_a_function_of_seed_epoch_and_index() -> None:
     options = {"num_points": 40}
     first, index = source(**options), torch.tensor([3, 4])
     assert isinstance(first, ProblemSource)

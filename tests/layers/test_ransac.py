@@ -5,7 +5,7 @@ from torch import Tensor
 
 from bpnp.geometry import camera_centre, project, rotation_angle, transform
 from bpnp.layers import RansacPnP, ransac_pnp
-from bpnp.layers.ransac import top_pairs
+from bpnp.layers.ransac import top_matches
 
 THRESHOLD = 0.01
 
@@ -47,25 +47,25 @@ def test_the_residual_is_the_mean_error_of_the_inliers() -> None:
     planted = plant(5, 50, noise=0.003, seed=3)
     assignment = wrong_pairs(planted, 0.3)
     r, t, stats = ransac_pnp(assignment, planted.points2d, planted.points3d, pairs_factor=1.0)
-    pairs = top_pairs(assignment, pairs_factor=1.0)
+    pairs = top_matches(assignment, pairs_factor=1.0)
     for i in range(5):
         seen = project(transform(r[i], t[i], planted.points3d[i, pairs.index3d[i]]))
         error = (seen - planted.points2d[i, pairs.index2d[i]]).norm(dim=-1)
         torch.testing.assert_close(error[error <= THRESHOLD].mean(), stats.residual[i])
 
 
-def test_top_pairs_are_the_largest_entries_of_each_sample() -> None:
+def test_top_matches_are_the_largest_entries_of_each_sample() -> None:
     mask2d = torch.arange(6)[None] < torch.tensor([[6], [3], [1], [0]])
     mask3d = torch.arange(8)[None] < torch.tensor([[8], [5], [1], [2]])
     assignment = torch.rand(4, 6, 8)
-    pairs = top_pairs(assignment, mask2d=mask2d, mask3d=mask3d)
+    pairs = top_matches(assignment, mask2d=mask2d, mask3d=mask3d)
     assert pairs.mask.sum(-1).tolist() == [9, 4, 1, 0]  # 1.5 min(m, n), m n at most
     for i, (m, n) in enumerate([(6, 8), (3, 5), (1, 1)]):
         k = int(pairs.mask[i].sum())
         expected = assignment[i, :m, :n].flatten().sort(descending=True).values[:k]
         assert torch.equal(assignment[i, pairs.index2d[i, :k], pairs.index3d[i, :k]], expected)
         assert pairs.mask[i, :k].all()
-    assert top_pairs(assignment, pairs_factor=100.0).mask.sum(-1).tolist() == [48] * 4
+    assert top_matches(assignment, pairs_factor=100.0).mask.sum(-1).tolist() == [48] * 4
 
 
 @pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])

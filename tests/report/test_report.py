@@ -116,7 +116,7 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "summary.json").read_text(), parse_constant=refuse)
     assert (summary["format"], summary["problems"], summary["correspondence_loss"]) == (2, 2, None)
     assert summary["estimates"]["pnp"]["translation_q3"] == "inf"
-    assert summary["estimates"]["pnp"]["without_true_pairs"] == 1
+    assert summary["estimates"]["pnp"]["without_matches"] == 1
     assert read_results(tmp_path).estimates["pnp"]["translation_q3"] == math.inf
 
 

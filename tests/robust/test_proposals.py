@@ -8,7 +8,7 @@ from torch import Tensor
 
 from bpnp.geometry import project, quaternion_rotation, transform
 from bpnp.metrics import rotation_error
-from bpnp.models.search_solver import refine
+from bpnp.models.evaluation import refine
 from bpnp.robust.proposals import drawn_poses, pose_hypotheses
 from bpnp.types import Batch
 

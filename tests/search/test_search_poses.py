@@ -13,7 +13,7 @@ from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
-from bpnp.models.search_solver import best_poses, refine
+from bpnp.models.evaluation import best_poses, refine
 from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets

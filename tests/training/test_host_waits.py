@@ -40,10 +40,10 @@ READS = {
     "layers/implicit.py:record": 1,  # unconverged backward passes
     "layers/laplacian.py:conjugate_gradients": 1,  # the end, every eighth iteration
     "layers/laplacian.py:solve_laplacian": 2,  # float64: what to factorise
-    "layers/pose_solvers.py:lbfgs": 1,  # the paper's solver, an option
-    "layers/pose_solvers.py:newton": 1,  # the end, each iteration
+    "layers/objective.py:lbfgs": 1,  # the paper's solver, an option
+    "layers/objective.py:newton": 1,  # the end, each iteration
     "layers/plan.py:degree": 1,  # whether differences have lost their digits
-    "layers/ransac.py:top_pairs": 1,  # of numbers of the host
+    "layers/ransac.py:top_matches": 1,  # of numbers of the host
     "layers/transport.py:_absorb": 3,
     "layers/transport.py:_anneal": 1,
     "layers/transport.py:_range": 1,

@@ -19,9 +19,9 @@ from bpnp.training.losses import (
     matching_likelihood_loss,
     matching_losses,
     own_losses,
-    pairs_within,
     pose_loss,
     reprojection_loss,
+    within_angle,
 )
 from bpnp.training.task import BlindPnPTask
 
@@ -53,7 +53,7 @@ def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
 def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: float) -> None:
     planted = plant(2, 12, noise=0.01, outliers2d=3)
     assignment = random_assignment(planted)
-    within = pairs_within(planted.points2d, planted.points3d, *planted.pose, threshold)
+    within = within_angle(planted.points2d, planted.points3d, *planted.pose, threshold)
     found = correspondence_losses(Prediction(assignment), planted.batch(), angle=threshold)
     assert found is not None
     for b in range(2):
@@ -68,7 +68,7 @@ def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: fl
 
 def test_correspondences_from_a_pose_contain_the_true_ones_in_float32() -> None:
     planted = plant(3, 500, dtype=torch.float32)
-    within = pairs_within(planted.points2d, planted.points3d, *planted.pose, 1e-5)
+    within = within_angle(planted.points2d, planted.points3d, *planted.pose, 1e-5)
     assert (within & (planted.permutation() > 0)).sum((-2, -1)).tolist() == [500] * 3
 
 

@@ -114,7 +114,7 @@ def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None
     assert [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]] == pytest.approx(
         [0.25] * 3
     )
-    speeds = [float(row["train/pairs_per_second"]) for row in rows if row["train/pairs_per_second"]]
+    speeds = [float(row["train/problems_per_second"]) for row in rows if row["train/problems_per_second"]]
     assert len(speeds) == 3
     assert min(speeds) > 0
     drawn = sorted(path.relative_to(tmp_path / "pictures") for path in (tmp_path / "pictures").rglob("*.png"))
@@ -156,7 +156,7 @@ def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
     events = EventAccumulator(str(tmp_path / "board" / "version_0"), size_guidance={"images": 0})
     events.Reload()
     assert [event.value for event in events.Scalars("val/true_match_mass")] == pytest.approx([0.25] * 3)
-    assert len(events.Scalars("train/pairs_per_second")) == 3
+    assert len(events.Scalars("train/problems_per_second")) == 3
     for name in ("val/problem0", "val/problem1"):
         pictures = events.Images(name)
         assert len(pictures) == 2

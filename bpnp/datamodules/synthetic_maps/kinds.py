@@ -1,13 +1,17 @@
-"""The kinds of scenes: buildings from outside, streets from within, and objects seen from around."""
+"""The kinds of scenes, buildings from outside, streets from within and objects seen from around, and the surfaces that
+they are made of, with points where keypoints would be."""
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.synthetic_maps.scene import (
+    Array,
     Blobs,
     Scene,
+    Surface,
     Viewpoint,
     Walls,
     assembled,
@@ -15,18 +19,193 @@ from bpnp.datamodules.synthetic_maps.scene import (
     joined,
     right_of,
 )
-from bpnp.datamodules.synthetic_maps.surfaces import (
-    FACADE_CELL,
-    RELIEF,
-    before,
-    blob_points,
-    box_walls,
-    column_points,
-    ground_points,
-    horizon_points,
-    tree_points,
-    wall_points,
-)
+
+WINDOW_POINTS, LEDGES, PATCHES = 14, 5, 8  # of each wall
+OTHER_SIDES = 0.2  # points on an area of a wall that the camera cannot see, of those on as much of another
+RELIEF = 0.8  # metres, of a facade: windows are recessed, balconies stand out
+FACADE_CELL = 3.2  # metres between two windows
+GROUND_PATCHES = 8
+CLUSTERS = 14  # of each ellipsoid's points, some of them almost empty
+SPREAD = (0.15, 1.5)  # of a cluster on the unit sphere, lowest and highest
+PLAIN = (0.2, 0.9)  # share of an ellipsoid's points that are spread evenly, lowest and highest
+
+
+def box_walls(
+    centre: Array,
+    half: Array,
+    yaw: Array,
+    height: Array,
+    *,
+    cell: float = FACADE_CELL,
+    relief: float = RELIEF,
+    weight: float = 1.0,
+) -> Walls:
+    """Four walls of each of b boxes: centre (b, 2), half widths (b, 2), yaw (b,), height (b,); metres, radians."""
+    side = (yaw[:, None] + np.pi / 2 * np.arange(4)).ravel()  # headings of the walls, counter-clockwise
+    along = directions(side)
+    ahead, right = half[:, [0, 1, 0, 1]].ravel(), half[:, [1, 0, 1, 0]].ravel()
+    outwards = right_of(along)
+    k = len(side)
+    return Walls(
+        start=np.repeat(centre, 4, 0) + right[:, None] * outwards - ahead[:, None] * along,
+        along=along,
+        normal=outwards,
+        width=2 * ahead,
+        height=np.repeat(height, 4),
+        weight=np.full(k, weight),
+        cell=np.full(k, cell),
+        relief=np.full(k, relief),
+    )
+
+
+def wall_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
+    """Points on walls; each kind of them prefers walls of its own. In some scenes all walls bear the same pattern."""
+    kinds = (_windows, _ledges, _patches, _plain)
+    counts = rng.multinomial(count, rng.dirichlet([3.0, 1.0, 2.0, 3.0]))
+    area = walls.width * walls.height * walls.weight
+    weight = np.cumsum(area * np.exp(0.7 * rng.standard_normal((len(kinds), len(area)))), 1)
+    on = [np.searchsorted(w, w[-1] * rng.random(n)) for w, n in zip(weight, counts, strict=True)]
+    local = np.concatenate([kind(walls, chosen, rng) for kind, chosen in zip(kinds, on, strict=True)], 1)
+    wall = np.concatenate(on)
+    flat = walls.start[wall] + local[0, :, None] * walls.along[wall] + local[2, :, None] * walls.normal[wall]
+    return Surface(upright(flat, np.abs(local[1])), upright(walls.normal[wall], np.zeros(count)), 0.5)
+
+
+def before(walls: Walls, view: Viewpoint) -> Walls:
+    """The walls with fewer points on those that a camera at the viewpoint sees from behind or not at all."""
+    middle = walls.start + walls.width[:, None] / 2 * walls.along
+    towards = view.centre[:2] - middle
+    ahead = (towards * (view.centre - view.target)[:2]).sum(-1) > 0
+    seen = ahead & ((towards * walls.normal).sum(-1) > 0)
+    return walls._replace(weight=walls.weight * np.where(seen, 1.0, OTHER_SIDES))
+
+
+def upright(flat: Array, up: Array) -> Array:
+    """(n, 3) of (n, 2) and the heights (n,)."""
+    points = np.empty((len(flat), 3))
+    points[:, :2], points[:, 2] = flat, up
+    return points
+
+
+def column_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
+    """A row of columns before the first wall, or a tower beside it; many points on the rings around them."""
+    columns = int(rng.integers(1, 9))
+    tower = columns == 1
+    radius = rng.uniform(2, 5) if tower else rng.uniform(0.3, 0.8)
+    height = walls.height[0] * (rng.uniform(1, 1.8) if tower else rng.uniform(0.4, 0.9))
+    foot = walls.start[0] + walls.normal[0] * rng.uniform(1, 4) - walls.along[0] * (2 * radius if tower else 0)
+    place = (rng.integers(0, columns, count) + 0.5) / columns * (0 if tower else walls.width[0])
+    angle, up = rng.uniform(0, 2 * np.pi, count), rng.random(count)
+    rings = rng.random(5)[rng.integers(0, 5, count)]
+    up = np.where(rng.random(count) < 0.6, rings + 0.01 * rng.standard_normal(count), up)
+    outward = directions(angle)
+    points = foot + place[:, None] * walls.along[0] + radius * outward
+    return Surface(upright(points, height * np.abs(up)), upright(outward, np.zeros(count)), 0.5)
+
+
+def tree_points(low: Array, high: Array, count: int, rng: np.random.Generator) -> Surface:
+    """Up to five fuzzy blobs with their centres between two corners (3,) of a box."""
+    trees = int(rng.integers(1, 6))
+    centre = rng.uniform(low, high, (trees, 3))
+    spread = rng.uniform(0.05, 0.25, (trees, 3)) * (high[2] - low[2] + 1)
+    which = rng.integers(0, trees, count)
+    points = centre[which] + spread[which] * rng.standard_normal((count, 3))
+    np.abs(points[:, 2], out=points[:, 2])
+    return Surface(points, np.zeros((count, 3)), 0.25)
+
+
+def ground_points(low: Array, high: Array, count: int, rng: np.random.Generator) -> Surface:
+    """The ground in patches, between two corners (2,); every point is turned upwards."""
+    centre = rng.uniform(low, high, (GROUND_PATCHES, 2))
+    spread = rng.uniform(0.03, 0.5, (GROUND_PATCHES, 1)) * np.abs(high - low)
+    which = rng.integers(0, GROUND_PATCHES, count)
+    flat = centre[which] + spread[which] * rng.standard_normal((count, 2))
+    normals = np.zeros((count, 3))
+    normals[:, 2] = 1.0
+    return Surface(upright(flat, 0.003 * spread.max() * rng.standard_normal(count)), normals, 0.4)
+
+
+def horizon_points(centre: Array, distance: float, count: int, rng: np.random.Generator) -> Surface:
+    """Hills, clouds and houses in clusters around a centre (3,), from a distance to twenty times as far."""
+    clusters = int(rng.integers(4, 12))
+    around = rng.uniform(0, 2 * np.pi, clusters)
+    far = distance * 20 ** rng.random(clusters)
+    middle = centre + upright(far[:, None] * directions(around), rng.uniform(0, 0.25, clusters) * far)
+    which = rng.integers(0, clusters, count)
+    points = middle[which] + (0.2 * far)[which, None] * rng.standard_normal((count, 3)) * [1.0, 1.0, 0.4]
+    return Surface(points, np.zeros((count, 3)), 0.3)
+
+
+def blob_points(blobs: Blobs, count: int, rng: np.random.Generator) -> Surface:
+    """Points in clusters on the ellipsoids, outside of all the others; `count` of them, with repetition if few are."""
+    parts = len(blobs.centre)
+    drawn = count + count // 2
+    on = rng.choice(parts, drawn, p=rng.dirichlet(np.full(parts, 2.0)))
+    middle = rng.standard_normal((parts, CLUSTERS, 3))
+    spread = SPREAD[0] * (SPREAD[1] / SPREAD[0]) ** rng.random((parts, CLUSTERS))
+    cluster = (CLUSTERS * rng.random(drawn) ** 1.5).astype(int)
+    unit = middle[on, cluster] / np.linalg.norm(middle[on, cluster], axis=-1, keepdims=True)
+    unit = unit + spread[on, cluster][:, None] * rng.standard_normal((drawn, 3))
+    plain = rng.random(drawn) < rng.uniform(*PLAIN)
+    unit[plain] = rng.standard_normal((int(plain.sum()), 3))
+    unit /= np.linalg.norm(unit, axis=-1, keepdims=True)
+    from_sphere = np.linalg.inv(blobs.to_sphere)
+    points = blobs.centre[on] + np.einsum("nij,nj->ni", from_sphere[on], unit)
+    normals = np.einsum("nij,ni->nj", blobs.to_sphere[on], unit)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    offset = np.einsum("kij,kj->ki", blobs.to_sphere, blobs.centre)
+    depth = np.stack([((points @ blobs.to_sphere[k].T - offset[k]) ** 2).sum(-1) for k in range(parts)], 1)
+    depth[np.arange(drawn), on] = np.inf
+    chosen = np.argsort(depth.min(1) < 1, kind="stable")[:count]
+    return Surface(points[chosen], normals[chosen], 0.55)
+
+
+def _windows(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """(3, n): along the wall, up, and out of it; corners of the windows of a grid and points in them, all alike."""
+    k = len(walls.width)
+    columns = np.ceil(walls.width / (walls.cell * rng.uniform(0.6, 1.6, k)))
+    rows = np.ceil(walls.height / (walls.cell * rng.uniform(0.8, 1.4, k)))
+    pattern = rng.uniform(-0.4, 0.4, (2, k, WINDOW_POINTS))
+    pattern[:, :, :4] = rng.uniform(0.15, 0.4, (2, k, 1)) * np.array([[[-1, 1, -1, 1]], [[-1, -1, 1, 1]]])
+    recess = -rng.uniform(0, 0.15, (k, 1)) * walls.cell[:, None] * (rng.random((k, WINDOW_POINTS)) < 0.6)
+    if rng.random() < 0.3:
+        pattern, recess = np.repeat(pattern[:, :1], k, 1), np.repeat(recess[:1], k, 0)
+    uneven = rng.uniform(0.6, 1.8, (2, k))  # windows at one end have more points
+    which = rng.integers(0, WINDOW_POINTS, len(on))
+    cells = np.array([columns, rows])
+    place = 0.012 * walls.cell[on] * rng.standard_normal((3, len(on)))
+    cell = np.floor(rng.random((2, len(on))) ** uneven[:, on] * cells[:, on]) + 0.5
+    place[:2] += (cell + pattern[:, on, which]) * (np.array([walls.width, walls.height]) / cells)[:, on]
+    place[2] += recess[on, which]
+    return place
+
+
+def _ledges(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    k = len(walls.width)
+    level = rng.random((k, LEDGES)) * walls.height[:, None]
+    out = rng.uniform(0, 0.2, (k, LEDGES)) * walls.cell[:, None]
+    which = rng.integers(0, LEDGES, len(on))
+    place = 0.02 * walls.cell[on] * rng.standard_normal((3, len(on)))
+    place[0] = rng.random(len(on)) * walls.width[on]
+    place[1] += level[on, which]
+    place[2] += out[on, which]
+    return place
+
+
+def _patches(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Clusters such as doors, signs and statues, in relief."""
+    k = len(walls.width)
+    centre = rng.random((2, k, PATCHES)) * np.array([walls.width, walls.height])[:, :, None]
+    spread = rng.uniform(0.1, 0.8, (3, k, PATCHES)) * np.array([1.0, 1.0, 0.2])[:, None, None] * walls.cell[:, None]
+    which = (PATCHES * rng.random(len(on)) ** 2).astype(np.int64)
+    place = spread[:, on, which] * rng.standard_normal((3, len(on)))
+    place[:2] += centre[:, on, which]
+    return place
+
+
+def _plain(walls: Walls, on: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    return rng.random((3, len(on))) * np.array([walls.width, walls.height, np.full(len(walls.width), 0.05)])[:, on]
+
 
 MAIN_WEIGHT = 3.0  # points on an area of the building that is looked at, of those on as much of another
 TELE = 0.15  # half of the image over the focal length; from narrower views the camera steps back no further

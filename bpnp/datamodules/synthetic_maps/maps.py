@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp.datamodules.augment import Augmentation, Drawn, bounds
-from bpnp.datamodules.module import PARTS, ProblemDataModule
+from bpnp.datamodules.loader import PARTS, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, stacked
 from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
 from bpnp.datamodules.synthetic_maps.scene import (
@@ -245,15 +245,15 @@ class MapSource:
     Raises ValueError for no problems.
     """
 
-    def __init__(self, options: MapOptions, *, num_pairs: int, seed: Sequence[int], label: str) -> None:
-        if num_pairs < 1:
-            raise ValueError(f"expected at least one {label} problem, got {num_pairs}")
-        self.options, self.num_pairs, self.seed, self.label = options, num_pairs, tuple(seed), label
+    def __init__(self, options: MapOptions, *, count: int, seed: Sequence[int], label: str) -> None:
+        if count < 1:
+            raise ValueError(f"expected at least one {label} problem, got {count}")
+        self.options, self.count, self.seed, self.label = options, count, tuple(seed), label
 
     @property
     def counts(self) -> Counts:
         """Most points of each problem; most have fewer."""
-        most = np.full(self.num_pairs, self.options.num_points)
+        most = np.full(self.count, self.options.num_points)
         return Counts(most, most, most)
 
     def names(self, index: Sequence[int]) -> tuple[str, ...]:
@@ -329,10 +329,10 @@ class SyntheticMapDataModule(ProblemDataModule):
             field_of_view=field_of_view,
             noise_px=noise_px,
         )
-        self.num_pairs = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
+        self.problems = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
         self.fresh = fresh_views
         self.augmentations = dict.fromkeys(PARTS, Augmentation(rotate=frame == "any"))
 
     def _source(self, part: str, seed: tuple[int, int]) -> MapSource:
         split = "test" if part == "predict" else part
-        return MapSource(self.options, num_pairs=self.num_pairs[split], seed=seed, label=split)
+        return MapSource(self.options, count=self.problems[split], seed=seed, label=split)

@@ -101,7 +101,7 @@ class RandomRansac(SingleSolver):
 
 
 def probability_of_true_triple(matches: int, m: int, n: int) -> float:
-    """Probability that three random pairs of points, no point twice, are all among the one-to-one matches."""
+    """Probability that three random image points and three random scene points are three of the one-to-one matches."""
     return math.prod(max(0, matches - i) / ((m - i) * (n - i)) for i in range(3))
 
 

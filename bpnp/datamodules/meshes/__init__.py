@@ -1,1 +1,0 @@
-"""Meshes, or procedural shapes, seen by virtual cameras."""
