@@ -17,8 +17,6 @@ NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
 SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 2}}
 SMALLER = [argument for argument in SMALL_NET if "=bpnp" not in argument]
 
-pytestmark = pytest.mark.slow
-
 
 def run(language: str, code: str, names: dict[str, Any]) -> None:
     """A block of Python, or of commands of which trainings and tables are cut short."""

@@ -97,6 +97,33 @@ def test_gravity_is_three_numbers_of_either_side(tmp_path: Path, capsys: pytest.
     np.testing.assert_allclose(json.loads(capsys.readouterr().out)["rotation"], PLANTED.rotation[0], atol=1e-4)
 
 
+def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path) -> None:
+    """What each does there: tests/solving/test_options.py."""
+    rng = np.random.default_rng(9)
+    sides = np.column_stack([P, np.tile([0.0, 0, 1], (40, 1)), rng.integers(0, 2, 40)])
+    colours = np.empty((40, 1))
+    colours[PLANTED.match3d[0].numpy(), 0] = sides[:, 6]
+    np.savetxt(tmp_path / "x.csv", np.hstack([X, colours]), delimiter=",", header="x,y,label", comments="")
+    np.savetxt(tmp_path / "p.csv", sides, delimiter=",", header="x,y,z,nx,ny,nz,label", comments="")
+
+    asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
+    with pytest.MonkeyPatch.context() as patch:
+
+        def noted(*points: Any, **options: Any) -> Solution:
+            asked.append(options)
+            return solution
+
+        patch.setattr("bpnp.solving.solve.solve", noted)
+        words = "--clutter 0.25 --seed 7 --solver search --time_limit 3 --inlier_threshold 0.1"
+        main(["solve", str(tmp_path / "x.csv"), str(tmp_path / "p.csv"), *words.split()])
+    (options,) = asked
+    np.testing.assert_array_equal(options["normals3d"], sides[:, 3:6])
+    np.testing.assert_array_equal(options["labels3d"], sides[:, 6])
+    np.testing.assert_array_equal(options["labels2d"], colours[:, 0])
+    given = {name: options[name] for name in ("clutter", "seed", "solver", "time_limit", "inlier_threshold")}
+    assert given == {"clutter": 0.25, "seed": 7, "solver": "search", "time_limit": 3.0, "inlier_threshold": 0.1}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

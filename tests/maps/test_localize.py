@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from planted import degrees_between
 from planted_model import Planted, plant_model
 from scipy.spatial.transform import Rotation
 
-from bpnp import SceneMap, Solution
-from bpnp.maps.localize import counted
+from bpnp import PosePrior, SceneMap, Solution
+from bpnp.maps.localize import BRIEF, counted
 from bpnp.search.settings import DEFAULT
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
@@ -85,6 +87,51 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     solution = scene.localize(keypoints[shuffled], CAMERA, views=["photo 1.jpg"], scores=scores[shuffled])
     assert_right(solution, truth, 1, ids[shuffled])
     np.testing.assert_allclose(solution.points2d, (keypoints[shuffled] - [400, 300]) / 520)
+
+
+def test_a_prior_says_on_which_side_the_photo_was_taken(planted: tuple[SceneMap, Planted]) -> None:
+    """Points and their copies turned by 180 degrees about the axis: two poses explain a photo, the prior names one."""
+    scene, truth = planted
+    half = truth.points3d[:70] * [1, 1, 0.5]
+    turn = np.diag([-1.0, -1.0, 1.0])
+    points = np.concatenate([half, half @ turn])
+    everything = np.arange(140, dtype=np.int32)
+    poses = [(np.eye(3), np.array([0.0, 0, 3])), (turn, np.array([0.0, 0, 3]))]
+    views = tuple(
+        replace(scene.views[0], name=name, rotation=rotation, translation=translation, points=everything)
+        for name, (rotation, translation) in zip("ab", poses, strict=True)
+    )
+    twins = SceneMap(points, everything.astype(np.int64), np.full(140, 2, np.int32), views)
+    camera = points + [0, 0, 3]
+    pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
+    for rotation, translation in poses:
+        prior = PosePrior(rotation, translation, 5.0, 0.3)
+        found = twins.localize(pixels, CAMERA, prior=prior, solver="search", time_limit=20)
+        assert degrees_between(found.rotation, rotation) < 1
+
+
+def test_the_solver_that_is_asked_for_solves(planted: tuple[SceneMap, Planted]) -> None:
+    class Refuses(torch.nn.Module):
+        def forward(self, batch: object) -> None:
+            raise RuntimeError("was asked")
+
+    scene, truth = planted
+    with pytest.raises(RuntimeError, match="was asked"):
+        scene.localize(photo_of(truth, 0)[0], CAMERA, solver=Refuses())
+
+
+def test_the_seed_decides_where_nothing_else_does(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, _ = planted
+    monkeypatch.setattr("bpnp.maps.scene_map.LONGER", BRIEF)
+    noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
+    guesses = [
+        scene.localize(noise, CAMERA, views=["photo 0.jpg"], solver="search", seed=seed, time_limit=1e5)
+        for seed in (0, 0, 1)
+    ]
+    np.testing.assert_array_equal(guesses[0].rotation, guesses[1].rotation)
+    assert not np.array_equal(guesses[0].rotation, guesses[2].rotation)
 
 
 def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap, Planted]) -> None:

@@ -175,11 +175,14 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
 
 
 def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):
+    """Many starts beside the true pose end at it, and from anywhere some do."""
     sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
-    rotation, translation = (values[0].numpy() for values in problem.near(1.0, seed=1))
-    hopeless = replace(DEFAULT, schedule=Schedule(around=6, turns=1), first_starts=1, starts=1)
-    result = search_poses(sets, around=PosePrior(rotation, translation, 1.0, 0.01), settings=hopeless)
-    assert (result.candidates.hits <= 1).all()
+    rotation, translation = (values[0].numpy() for values in problem.near(0.02, seed=1))
+    one_turn = DEFAULT.limited(1)
+    around = search_poses(sets, around=PosePrior(rotation, translation, 1.0, 0.01), settings=one_turn)
+    assert degrees_between(around.best[0], problem.rotation[0].numpy()) < 0.5
+    assert (around.candidates.hits == 0).all()
+    assert search_poses(sets, settings=DEFAULT.limited(4)).candidates.hits.max() > 0
 
 
 def test_starts_cover_all_rotations():

@@ -1,0 +1,45 @@
+"""What version 0.1.0 wrote is read, or refused by an error that says what to do."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from bpnp import Solution
+from bpnp.datamodules.store import StoreError, open_store
+from bpnp.examples import load
+from bpnp.models.weights import TrainedNet
+
+RELEASED = Path(__file__).parent / "released"
+
+
+def test_a_solution_of_the_last_release_is_read() -> None:
+    """`solution-0.1.0.json` is what `bpnp.solve` of that version gave for the LEDs of `bpnp.examples`."""
+    solution, ring = Solution.from_json(RELEASED / "solution-0.1.0.json"), load("leds")
+    assert solution.verdict == "confident"
+    assert ring.rotation_error_deg(solution.rotation) < 1
+    assert len(solution.matches) == 10
+    assert np.isnan(solution.rotation_std_deg)  # which it did not know
+    assert solution.stats.taken2d == 0
+    assert Solution.from_json(solution.to_json()).reason == solution.reason
+    cut = json.loads((RELEASED / "solution-0.1.0.json").read_text())
+    del cut["rotation"]
+    with pytest.raises(ValueError, match="expected the JSON of a solution, got 'rotation'"):
+        Solution.from_json(json.dumps(cut))
+
+
+def test_a_store_of_the_last_release_is_refused_and_to_be_prepared_anew(tmp_path: Path) -> None:
+    manifest = {"format": 3, "kind": "problems", "rows": 0, "bulk": [], "columns": {}, "checksum": 0}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(StoreError, match="expected problems in format 4, got problems in format 3 .*try"):
+        open_store(tmp_path, "problems")
+
+
+def test_a_checkpoint_of_the_last_release_is_refused_by_its_name(tmp_path: Path) -> None:
+    solver = {"class": "BPnPNet", "settings": {"channels": 128, "blocks": 12, "centre_features": True}}
+    weights = {"solver.features2d.enter.weight": torch.zeros(2)}
+    torch.save({"solver": solver, "state_dict": weights}, tmp_path / "old.ckpt")
+    with pytest.raises(ValueError, match=r"got one of an older form: .*old\.ckpt; try"):
+        TrainedNet.from_checkpoint(tmp_path / "old.ckpt")
