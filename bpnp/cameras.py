@@ -19,6 +19,14 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float64]
 ROUND_TRIP = 0.01  # pixels
+FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from the axis: focal lengths, coefficients
+    "SIMPLE_FISHEYE": (1, 0),
+    "FISHEYE": (2, 0),
+    "SIMPLE_RADIAL_FISHEYE": (1, 1),
+    "RADIAL_FISHEYE": (1, 2),
+    "OPENCV_FISHEYE": (2, 4),
+}
+BISECTIONS = 54  # of an angle, to the last digit
 MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
 
@@ -36,6 +44,10 @@ class Pinhole:
     def normalise(self, pixels: Array) -> Array:
         """Normalised coordinates (k, 2) of pixels (k, 2)."""
         return np.asarray((pixels - self.matrix[:2, 2]) @ np.linalg.inv(self.matrix[:2, :2]).T, np.float64)
+
+    def bearings(self, pixels: Array) -> Array:
+        """Unit vectors (k, 3) towards pixels (k, 2)."""
+        return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
 
     def project(self, points: Array) -> Array:
         """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
@@ -76,12 +88,41 @@ class Lens:
             good = np.linalg.norm(back - pixels, axis=-1) < ROUND_TRIP
         return np.where(good[:, None], points, np.nan)
 
+    def bearings(self, pixels: Array) -> Array:
+        """Unit vectors (k, 3) towards pixels (k, 2), of a fisheye up to 180 degrees off its axis; NaN where there is
+        none."""
+        name, params = self.camera.model.name, np.asarray(self.camera.params, np.float64)
+        if name not in FISHEYE:
+            return _of_length_one(np.column_stack([self.normalise(pixels), np.ones(len(pixels))]))
+        focals, count = FISHEYE[name]
+        seen = (pixels - params[focals : focals + 2]) / params[:focals]
+        radius = np.linalg.norm(seen, axis=-1)
+        # t (1 + k1 t^2 + ...) rises up to the first root of its derivative, or to the angle of a full turn.
+        radial = np.zeros(2 * count + 2)
+        radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
+        distance = np.polynomial.Polynomial(radial)
+        roots = distance.deriv().roots()
+        turns = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        widest = min([np.pi, *turns.tolist()])
+        low, high = np.zeros(len(radius)), np.full(len(radius), widest)
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            below = distance(middle) < radius
+            low, high = np.where(below, middle, low), np.where(below, high, middle)
+        angle = np.where(radius <= distance(widest), high, np.nan)
+        aside = seen * (np.sin(angle) / np.maximum(radius, np.finfo(float).tiny))[:, None]
+        return np.column_stack([aside, np.cos(angle)])
+
     def project(self, points: Array) -> Array:
         """Pixels (k, 2) of points (k, 3) in camera coordinates; NaN at and behind the plane of the camera."""
         return np.asarray(self.camera.img_from_cam(np.ascontiguousarray(in_front(points))), dtype=np.float64)
 
 
 Camera = Pinhole | Lens
+
+
+def _of_length_one(rays: Array) -> Array:
+    return np.asarray(rays / np.linalg.norm(rays, axis=-1, keepdims=True))
 
 
 def in_front(points: Array) -> Array:

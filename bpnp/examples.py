@@ -15,10 +15,11 @@ from scipy.spatial.transform import Rotation
 from bpnp.datamodules.surfaces import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
-Kind = Literal["mesh", "photo", "leds"]
+Kind = Literal["mesh", "photo", "leds", "stars"]
 CAMERA = np.array([[800.0, 0.0, 640.0], [0.0, 800.0, 480.0], [0.0, 0.0, 1.0]])  # of 1280 x 960 pixels
 NOISE_PX = 0.5
 LEDS, LIGHTS = 17, 3
+CATALOGUE, STARS, FALSE_STARS = 500, 42, 18
 PHOTO_CAMERA = ("PINHOLE", 640, 480, (560.0, 560.0, 320.0, 240.0))  # COLMAP's, pixels
 TEXELS = 80.0  # of a texture, a metre: about as many as the photos have pixels
 LIGHT = (0.95, 0.6, 0.8, 0.7, 1.0, 0.4)  # on the faces of a box towards -y, y, -x, x, z, -z
@@ -62,7 +63,8 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
 
     - "mesh": 200 points on a shape, all of them seen, from any side;
     - "photo": keypoints of a photo and points of a map, of which a third have no partner;
-    - "leds": 17 LEDs on a ring with their normals, those that face the camera, and 3 background lights.
+    - "leds": 17 LEDs on a ring with their normals, those that face the camera, and 3 background lights;
+    - "stars": 60 lights of which 42 are among 500 directions; `points3d` are unit vectors, for `at_infinity=True`.
 
     Raises ValueError for another kind.
 
@@ -73,7 +75,7 @@ def load(kind: Kind | str, *, seed: int = 0) -> Example:
     if kind not in get_args(Kind):
         raise ValueError(f"expected an example among {', '.join(get_args(Kind))}, got {kind!r}")
     rng = np.random.default_rng(seed)
-    return {"mesh": _mesh, "photo": _photo, "leds": _leds}[kind](rng)
+    return {"mesh": _mesh, "photo": _photo, "leds": _leds, "stars": _stars}[kind](rng)
 
 
 def _mesh(rng: np.random.Generator) -> Example:
@@ -107,6 +109,17 @@ def _leds(rng: np.random.Generator) -> Example:
     seen = _pixels(points[facing], rotation, translation) + rng.normal(0, NOISE_PX, (facing.sum(), 2))
     lights = rng.uniform(seen.min(0) - 40, seen.max(0) + 40, (LIGHTS, 2))
     return Example(rng.permutation(np.concatenate([seen, lights])), points, CAMERA, rotation, translation, normals)
+
+
+def _stars(rng: np.random.Generator) -> Example:
+    directions = rng.standard_normal((CATALOGUE, 3))
+    directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+    rotation, size = Rotation.from_quat(rng.standard_normal(4)).as_matrix(), 2 * CAMERA[:2, 2]
+    front = directions[(directions @ rotation.T)[:, 2] > 0]
+    pixels = _pixels(front, rotation, np.zeros(3))
+    seen = rng.permutation(pixels[((pixels > 1) & (pixels < size - 1)).all(-1)])[:STARS]
+    lights = np.concatenate([seen + rng.normal(0, NOISE_PX / 2, seen.shape), rng.uniform(0, size, (FALSE_STARS, 2))])
+    return Example(rng.permutation(np.clip(lights, 0, size)), directions, CAMERA, rotation, np.zeros(3))
 
 
 def _pixels(points: Any, rotation: Any, translation: Any) -> Any:

@@ -125,3 +125,36 @@ def test_a_scaled_camera_sees_the_same_rays_at_scaled_pixels() -> None:
             scaled_camera(camera, size)
     with pytest.raises(ValueError, match="got None"):
         scaled_camera(camera_from(K), (800, 600))
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_FISHEYE", [600.0, 1000, 1000]),
+        ("FISHEYE", [600.0, 610, 1000, 990]),
+        ("SIMPLE_RADIAL_FISHEYE", [600.0, 1000, 1000, 0.02]),
+        ("RADIAL_FISHEYE", [600.0, 1000, 1000, 0.02, -0.004]),
+        ("OPENCV_FISHEYE", [600.0, 610, 1000, 990, 0.02, -0.01, 0.003, -0.0002]),
+        ("OPENCV", [900.0, 910, 1000, 990, -0.1, 0.01, 0.001, 0]),
+        ("PINHOLE", [900.0, 910, 1000, 990]),
+    ],
+)
+def test_bearings_are_the_directions_that_pycolmap_projects(model: str, params: list[float]) -> None:
+    rays = RAYS / np.linalg.norm(RAYS, axis=-1, keepdims=True)
+    camera = pycolmap.Camera(model=model, width=2000, height=2000, params=params)
+    np.testing.assert_allclose(camera_from(camera).bearings(camera.img_from_cam(rays)), rays, atol=1e-9)
+
+
+def test_a_fisheye_sees_behind_itself() -> None:
+    """The radius of OpenCV's fisheye at the angle t is f (t + k1 t^3 + ...), also beyond 90 degrees."""
+    angle, around = np.radians([0, 60, 89.9, 90, 91, 110, 120]), np.linspace(0, 6, 7)
+    radius = 500 * (angle - 0.02 * angle**3 + 0.002 * angle**5)
+    pixels = 1000 + radius[:, None] * np.stack([np.cos(around), np.sin(around)], -1)
+    camera = camera_from(("OPENCV_FISHEYE", [500, 500, 1000, 1000, -0.02, 0.002, 0, 0]))
+    expected = np.stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)], -1)
+    np.testing.assert_allclose(camera.bearings(pixels), expected, atol=1e-9)
+    assert np.isnan(camera.bearings(np.array([[1e5, 1e5]]))).all()
+    turning = camera_from(
+        ("OPENCV_FISHEYE", [500, 500, 1000, 1000, -0.1, 0, 0, 0])
+    )  # its radius falls from 105 degrees
+    assert np.isnan(turning.bearings(np.array([[1620.0, 1000]]))).all()

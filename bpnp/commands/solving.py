@@ -35,6 +35,7 @@ def solve(
     up_scene: tuple[float, float, float] | None = None,
     up_degrees: float = 2.0,
     clutter: float | None = None,
+    at_infinity: bool = False,
     solver: str = "auto",
     inlier_threshold: float | None = None,
     time_limit: float | None = None,
@@ -66,6 +67,7 @@ def solve(
         up_scene: the same direction in the scene, such as 0 0 1.
         up_degrees: standard deviation of the direction up.
         clutter: share of the points without a partner, if known.
+        at_infinity: points3d are unit directions, such as of stars; the rotation alone is found.
         solver: auto, which asks a packaged matcher when the search is in doubt; search; or a
             network, packaged weights by name or a checkpoint.
         inlier_threshold: largest error of a match, pixels with a camera.
@@ -118,6 +120,7 @@ def solve(
             prior=known,
             inlier_threshold=inlier_threshold,
             clutter=clutter,
+            at_infinity=at_infinity,
             seed=seed,
             time_limit=time_limit,
             device=device,

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = npt.NDArray[np.float64]
+ROTATION = 3  # numbers of a turn: of points at infinity, no more is known
 FORMAT = 2  # 2 has the false alarms
 
 
@@ -74,7 +75,8 @@ class Solution:
             C = max(H^-1, H^-1 (sum_i g_i g_i^T) H^-1),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
         with the gradients g_i of each image point's log-likelihood, its partner unknown (Louis 1982, White 1982;
-        docs/verdict.md). NaN if the verdict is "failed", or the points do not fix the pose.
+        docs/verdict.md). NaN if the verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at
+        infinity.
     candidates: the distinct poses that were found, best first; the first is this one.
     verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits
         better than chance, and this one, if there is one, is a guess. reason: why, in words.
@@ -130,7 +132,9 @@ class Solution:
 
     @property
     def centre_std(self) -> float:
-        """Standard deviation of `centre` along its least certain axis, scene units."""
+        """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
+        if len(self.covariance) == ROTATION:
+            return math.nan
         return _largest(centre_covariance(self.covariance, self.translation))
 
     @property
@@ -250,7 +254,7 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in another form
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),
-    "covariance": lambda values: _array([[math.nan if x is None else x for x in row] for row in values], shape=(6, 6)),
+    "covariance": lambda values: np.array([[_float(x) for x in row] for row in values], np.float64),
     "points2d": partial(_array, shape=(-1, 2)),
     "points3d": partial(_array, shape=(-1, 3)),
     "matches": lambda values: np.array(values, np.int64).reshape(-1, 2),

@@ -20,6 +20,7 @@ from bpnp.solving.arguments import (
     positive,
     source_from,
 )
+from bpnp.solving.infinity import refuse_at_infinity, solve_directions
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
@@ -41,6 +42,7 @@ def solve(
     prior: Prior | str | Path | None = None,
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
+    at_infinity: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
     device: str | torch.device | None = None,
@@ -68,6 +70,9 @@ def solve(
         image (radians for bearings). By default three times the residuals' own scale.
     clutter: share of the points that has no partner, if known: it is expected throughout, and a pose that matches most
         of the other points is believed sooner.
+    at_infinity: `points3d` are unit directions, such as of stars: the rotation alone is found, and the translation is
+        zero. Pixels of a fisheye may lie 90 degrees and more off its axis. Points with the largest `scores2d` are tried
+        first. See docs/stars.md.
     time_limit: seconds for all of it, 10 by default, math.inf for no limit. At the limit each stage of the search ends
         with the poses that it has, and the best of them is returned.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
@@ -88,6 +93,27 @@ def solve(
     >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
     True
     """
+    if at_infinity:
+        module = None if solver in ("auto", "search") else solver
+        refuse_at_infinity(
+            normals3d=normals3d,
+            labels2d=labels2d,
+            labels3d=labels3d,
+            scores3d=scores3d,
+            solver=module,
+            prior=prior,
+            clutter=clutter,
+            device=device,
+        )
+        return solve_directions(
+            points2d,
+            points3d,
+            camera,
+            scores2d=scores2d,
+            inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+            seed=seed,
+            time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
+        )
     return solve_many(
         [points2d],
         [points3d],

@@ -74,7 +74,7 @@ class HashedPoints:
 
 
 @part
-def _entry(heads: Any, x: Any, y: Any, z: Any, cell: Any) -> Any:
+def entry(heads: Any, x: Any, y: Any, z: Any, cell: Any) -> Any:
     """Place in the table `heads`, 2^k long, of the cell with the point (x, y, z): Teschner et al., VMV 2003."""
     i, j, k = math.floor(x / cell), math.floor(y / cell), math.floor(z / cell)
     return (73856093 * i ^ 19349663 * j ^ 83492791 * k) & (len(heads) - 1)
@@ -86,7 +86,7 @@ def _enter(points: Any, tolerance: float, heads: Any, links: Any) -> None:
     for e in range(len(links)):
         x, y, z = points[e >> 3, 0], points[e >> 3, 1], points[e >> 3, 2]
         x, y, z = x + tolerance * (2 * (e & 1) - 1), y + tolerance * ((e & 2) - 1), z + tolerance * ((e & 4) / 2 - 1)
-        h = _entry(heads, x, y, z, 2 * tolerance)
+        h = entry(heads, x, y, z, 2 * tolerance)
         links[e], heads[h] = heads[h], e
 
 
@@ -100,7 +100,7 @@ def _count_on(
             if counts[s] + len(moved) - k < least:
                 break
             x, y, z = moved[k, 0] + shifts[s, 0], moved[k, 1] + shifts[s, 1], moved[k, 2] + shifts[s, 2]
-            e = heads[_entry(heads, x, y, z, 2 * tolerance)]
+            e = heads[entry(heads, x, y, z, 2 * tolerance)]
             while e >= 0:
                 dx, dy, dz = points[e >> 3, 0] - x, points[e >> 3, 1] - y, points[e >> 3, 2] - z
                 if dx * dx + dy * dy + dz * dz < tolerance * tolerance:

@@ -1,0 +1,119 @@
+"""How likely a rotation fits by chance, how well it is known, and whether the camera is to blame.
+
+The number of false alarms is that of `bpnp.search.evidence.false_alarms` for three unknowns: an unrelated image point
+f_i falls with the density l_i of the directions around it; a rotation that explains a share w of the points with
+residuals of s predicts
+
+    x_i = 1 - w + w exp(-r_i^2 / 2 s^2) / (2 pi s^2 l_i),
+
+r_i the distance to the nearest direction, times as many. Its mean is at most 1 for unrelated points, so that
+
+    log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),    T = (m)_2 (n)_2 / 2,
+
+bounds how many rotations fit unrelated points as well: each pair of image points gives one for each pair of directions.
+Two matches fix a rotation, so the two largest x_i are no evidence. c_i image points within 2 s of point i are one
+observation. Where fewer rotations can be told apart than there are pairs, 8 pi^2 h / s^3 of cells of width s, h the
+spread of the image points, that is T.
+
+Sources: A. Desolneux, L. Moisan, J.-M. Morel, Meaningful alignments, IJCV 2000; F. L. Markley, Attitude determination
+using vector observations and the singular value decomposition, J. Astronautical Sciences 1988 (covariance).
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import fdtrc, fdtri, stdtrit
+
+from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+FIXING = 2  # matches that fix a rotation
+SHARES = np.array([0.15, 0.4, 0.75])  # w
+STEPS = 5  # scales s, each half of the one before, from the largest noise that is searched for
+
+
+class Background(NamedTuple):
+    """What chance is measured against, for one problem: scales s (S,) in pixels, logarithm of the number of rotations
+    (S,) and c_i (m, S); bearings (m, 3) and the angle of a pixel (m,)."""
+
+    scales: Array
+    log_tests: Array
+    together: Array
+    bearings: Array
+    pixel: Array
+
+
+def background_of(bearings: Array, pixel: Array, count: int, noise: float) -> Background:
+    """Of image points and `count` directions; noise: the largest s, pixels."""
+    m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
+    spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
+    cells = 8 * math.pi**2 * spread / (scales * np.median(pixel)) ** 3
+    tests = np.log(np.maximum(np.minimum(cells, m * (m - 1) / 2 * count * (count - 1)), 1.0))
+    tree, reach = cKDTree(bearings), 2 * scales * np.median(pixel)
+    together = np.stack([tree.query_ball_point(bearings, r, return_length=True) for r in reach], -1)
+    return Background(scales, tests, together.astype(np.float64), bearings, pixel)
+
+
+def log10_false_alarms(squared: Array, density: Array, known: Background) -> tuple[float, Array]:
+    """log10 NFA of a rotation, and the decades (m,) of each image point at the scale and share where it is largest.
+
+    squared (m,): squared distances in squared pixels to the nearest directions, inf beyond reach; density (m,): of
+    these, a steradian.
+    """
+    width = known.scales * known.pixel[:, None]
+    ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
+    terms = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
+    fixing = np.sort(terms, 0)[-FIXING:]
+    evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0) - known.log_tests[:, None]
+    best = np.unravel_index(evidence.argmax(), evidence.shape)
+    mean = np.logaddexp.reduce(evidence, None) - math.log(evidence.size)
+    return -float(mean) / math.log(10), terms[:, best[0], best[1]] / math.log(10)
+
+
+class Known(NamedTuple):
+    """Covariance (3, 3) of the turn w, R' = exp([w]x) R, radians squared; the angle that its error exceeds once in a
+    thousand, radians; noise of the matches, pixels; and how far the strain of the image that the residuals show moves
+    a point of it, pixels, 0 where none is significant."""
+
+    covariance: Array
+    bound: float
+    noise: float
+    strain: float
+
+
+def how_well_known(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> Known:
+    """Of matches between directions `seen` (k, 3) in the camera and bearings (k, 3), whose pixels have the angles
+    `pixel`. A strain, f ~ (I + S) f, is another focal length or a camera that is not as given."""
+    weight = np.repeat(1 / pixel, 3)[:, None]
+    cross = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2).reshape(-1, 3) * weight  # w x v
+    residual = (bearings - seen).ravel() * weight[:, 0]
+    free = 2 * len(seen) - 3
+    if free <= 0:
+        return Known(np.full((3, 3), math.nan), math.inf, math.nan, 0.0)
+    before = float(residual @ residual)
+    noise = math.sqrt(before / free)
+    inverse = np.linalg.pinv(cross.T @ cross, rcond=1e-12)
+    covariance = np.asarray(noise**2 * float(stdtrit(free, ONE_SIGMA)) ** 2 * inverse, np.float64)
+    total, axes = float(np.trace(inverse)), float((inverse**2).sum())
+    bound = noise * math.sqrt(total * float(fdtri(total**2 / axes, free, 1 - EXCEEDED)))
+
+    def moved(points: Array) -> Array:
+        """(k, 3, 5) by each strain."""
+        stretched = np.einsum("sab,kb->kas", STRAINS, points)
+        return stretched - points[:, :, None] * np.einsum("ka,kas->ks", points, stretched)[:, None]
+
+    design = np.concatenate([cross, moved(seen).reshape(-1, len(STRAINS)) * weight], 1)
+    size = np.linalg.norm(design, axis=0)
+    solution, _, rank, _ = np.linalg.lstsq(design / size, residual, 1e-6)
+    after, added = float(((residual - design / size @ solution) ** 2).sum()), int(rank) - 3
+    strain = 0.0
+    if added > 0 and free > added and after > 0:
+        ratio = (before - after) / added / (after / (free - added))
+        if fdtrc(added, free - added, ratio) < EXCEEDED:
+            change = moved(all_bearings) @ (solution[3:] / size[3:]) + np.cross(solution[:3] / size[:3], all_bearings)
+            strain = float(np.linalg.norm(change, axis=-1).max() / np.median(pixel))
+    return Known(covariance, bound, noise, strain)

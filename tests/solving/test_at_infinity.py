@@ -1,0 +1,233 @@
+"""`solve(..., at_infinity=True)`: planted rotations, laws, what is not believed, and what it says of bad input."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp import PosePrior, Solution, solve
+from bpnp.cameras import camera_from
+
+Array = NDArray[np.float64]
+SIZE = 2000.0  # pixels of a side
+
+
+def sphere(rng: np.random.Generator, count: int) -> Array:
+    points = rng.standard_normal((count, 3))
+    return points / np.linalg.norm(points, axis=-1, keepdims=True)
+
+
+def lens(field: float) -> tuple[str, tuple[float, ...]]:
+    """A camera whose images are as wide as this field of view, degrees."""
+    half = np.radians(field / 2)
+    if field < 100:
+        return "SIMPLE_PINHOLE", (SIZE / 2 / np.tan(half), SIZE / 2, SIZE / 2)
+    return "OPENCV_FISHEYE", (SIZE / 2 / half, SIZE / 2 / half, SIZE / 2, SIZE / 2, 0, 0, 0, 0)
+
+
+def pixels(seen: Array, field: float) -> Array:
+    """Of directions in the camera, NaN beyond the image."""
+    focal, angle = lens(field)[1][0], np.arctan2(np.linalg.norm(seen[:, :2], axis=-1), seen[:, 2])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        radius = focal * (angle if field >= 100 else np.where(angle < 1.5, np.tan(angle), np.nan))
+        image = radius[:, None] * seen[:, :2] / np.linalg.norm(seen[:, :2], axis=-1, keepdims=True) + SIZE / 2
+        inside = (np.abs(image - SIZE / 2) < SIZE / 2).all(-1) & (angle < np.radians(field / 2 if field >= 100 else 80))
+    return np.where(inside[:, None], image, np.nan)
+
+
+def sky(
+    seed: int, *, field: float = 40.0, count: int = 600, false: float = 0.3, noise: float = 0.3
+) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Pixels, directions, rotation, and the direction of each pixel, -1 for none; a fifth of the stars is missing."""
+    rng = np.random.default_rng(seed)
+    directions, rotation = sphere(rng, count), Rotation.from_quat(rng.standard_normal(4)).as_matrix()
+    image = pixels(directions @ rotation.T, field)
+    seen = np.flatnonzero(np.isfinite(image[:, 0]) & (rng.random(count) > 0.2))
+    extra = round(len(seen) * false / (1 - false))
+    lights = np.concatenate(
+        [image[seen] + noise * rng.standard_normal((len(seen), 2)), rng.uniform(0, SIZE, (extra, 2))]
+    )
+    order = rng.permutation(len(lights))
+    return lights[order], directions, rotation, np.r_[seen, np.full(extra, -1)][order]
+
+
+def turned(one: Array, other: Array) -> float:
+    """Degrees between two rotations."""
+    return float(np.degrees(Rotation.from_matrix(one @ other.T).magnitude()))
+
+
+@pytest.mark.parametrize(("field", "count"), [(12.0, 4000), (40.0, 600), (75.0, 300), (180.0, 200), (220.0, 900)])
+def test_a_planted_rotation(field: float, count: int) -> None:
+    for seed in range(3):
+        image, directions, rotation, star = sky(seed, field=field, count=count)
+        solution = solve(image, directions, lens(field), at_infinity=True, seed=seed)
+        assert solution.verdict == "confident", solution.reason
+        assert turned(solution.rotation, rotation) < 0.05
+        assert solution.translation.tolist() == [0, 0, 0]
+        i, j = solution.matches.T
+        assert (star[i] == j).mean() > 0.97
+        assert len(i) > 0.95 * (star >= 0).sum()
+        assert solution.reprojection_error < 1
+        assert 0 < solution.rotation_std_deg < 0.03
+        assert solution.covariance.shape == (3, 3)
+
+
+def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
+    image, directions, rotation, _ = sky(0)
+    bearings = camera_from(lens(40.0)).bearings(image)
+    for points in (bearings, bearings[:, :2] / bearings[:, 2:]):
+        solution = solve(points, directions, at_infinity=True)
+        assert solution.verdict == "confident"
+        assert turned(solution.rotation, rotation) < 0.02
+
+
+def test_the_answer_turns_with_the_catalogue() -> None:
+    image, directions, _, _ = sky(1)
+    turn = Rotation.random(random_state=3).as_matrix()
+    one, other = (solve(image, d, lens(40.0), at_infinity=True) for d in (directions, directions @ turn.T))
+    assert np.allclose(other.rotation, one.rotation @ turn.T, atol=1e-7)
+    assert np.array_equal(one.matches, other.matches)
+    assert other.log10_false_alarms == pytest.approx(one.log10_false_alarms, abs=1e-3)
+
+
+def test_order_and_seed_say_nothing() -> None:
+    image, directions, _, _ = sky(2)
+    before = image.copy(), directions.copy()
+    one = solve(image, directions, lens(40.0), at_infinity=True)
+    again = solve(image, directions, lens(40.0), at_infinity=True)
+    assert np.array_equal(one.rotation, again.rotation)
+    assert np.array_equal(image, before[0])
+    assert np.array_equal(directions, before[1])
+    rng = np.random.default_rng(0)
+    rows, columns = rng.permutation(len(image)), rng.permutation(len(directions))
+    other = solve(image[rows], directions[columns], lens(40.0), at_infinity=True, seed=5)
+    assert np.allclose(one.rotation, other.rotation, atol=1e-7)
+    assert {(rows[i], columns[j]) for i, j in other.matches} == set(map(tuple, one.matches))
+
+
+def test_what_is_no_sky_is_not_believed() -> None:
+    """Points that are not stars, and the image in a mirror, which has the same angles."""
+    for seed in range(6):
+        image, directions, _, _ = sky(seed, count=300)
+        noise = np.random.default_rng(seed).uniform(0, SIZE, image.shape)
+        for points in (noise, [SIZE, 0] + image * [-1, 1]):
+            solution = solve(points, directions, lens(40.0), at_infinity=True)
+            assert solution.verdict != "confident"
+            assert solution.log10_false_alarms > -2
+
+
+def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
+    for seed in range(3):
+        image, directions, rotation, star = sky(seed, count=300)
+        part, turn = directions[star[star >= 0]], Rotation.random(random_state=seed).as_matrix()
+        solution = solve(image, np.concatenate([part, part @ turn.T]), lens(40.0), at_infinity=True)
+        assert solution.verdict == "ambiguous"
+        assert "another rotation" in solution.reason
+        either = [
+            min(turned(one.rotation, r) for r in (rotation, rotation @ turn.T)) for one in solution.candidates[:2]
+        ]
+        assert max(either) < 0.1
+        assert turned(solution.candidates[0].rotation, solution.candidates[1].rotation) > 1
+
+
+@pytest.mark.parametrize("factor", [0.8, 0.95, 1.02, 1.1])
+def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float) -> None:
+    for seed in range(3):
+        for field in (40.0, 180.0):
+            image, directions, rotation, _ = sky(seed, field=field, count=500)
+            model, (focal, *rest) = lens(field)
+            wrong = (
+                (factor * focal, *rest) if model == "SIMPLE_PINHOLE" else (factor * focal, factor * rest[0], *rest[1:])
+            )
+            solution = solve(image, directions, (model, wrong), at_infinity=True)
+            assert solution.verdict != "confident" or turned(solution.rotation, rotation) < 0.1
+
+
+def test_rougher_points_are_found_with_their_own_noise() -> None:
+    image, directions, rotation, _ = sky(4, noise=1.5)
+    solution = solve(image, directions, lens(40.0), at_infinity=True)
+    assert solution.verdict == "confident"
+    assert turned(solution.rotation, rotation) < 0.3
+    assert 3 < solution.inlier_threshold < 6  # three times the noise
+
+
+def test_the_covariance_is_that_of_the_errors() -> None:
+    sigmas = []
+    for seed in range(40):
+        image, directions, rotation, _ = sky(seed, field=30.0, count=400)
+        solution = solve(image, directions, lens(30.0), at_infinity=True)
+        if solution.verdict != "confident":
+            continue
+        error = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec()
+        sigmas.append(error / np.sqrt(np.diag(solution.covariance)))
+    assert len(sigmas) > 30
+    inside = [float((np.abs(sigmas) < k).mean()) for k in (1, 2, 3)]
+    assert 0.58 < inside[0] < 0.82
+    assert inside[1] > 0.9
+    assert inside[2] > 0.97
+
+
+def test_points_with_the_largest_scores_are_tried_first() -> None:
+    image, directions, _, star = sky(5, false=0.6)
+    good = np.where(star >= 0, 1.0, 0.1)
+    first, last = (solve(image, directions, lens(40.0), scores2d=s, at_infinity=True) for s in (good, 1.1 - good))
+    assert first.stats.iterations < last.stats.iterations
+
+
+def test_matches_lie_within_the_threshold() -> None:
+    image, directions, _, star = sky(6)
+    counts = []
+    for threshold in (0.3, 2.0):
+        solution = solve(image, directions, lens(40.0), inlier_threshold=threshold, at_infinity=True)
+        assert solution.inlier_threshold == threshold
+        counts.append(solution.inlier_count)
+    assert counts[0] < counts[1] == (star >= 0).sum()
+
+
+def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
+    image, directions, _, _ = sky(0, field=180.0, count=300)
+    solution = solve(image, directions, lens(180.0), at_infinity=True)
+    read = Solution.from_json(solution.to_json())
+    assert np.array_equal(read.covariance, solution.covariance)
+    assert read.rotation_std_deg == solution.rotation_std_deg
+    assert np.isnan(read.centre_std)
+    solution.plot().savefig(tmp_path / "sky.png")
+
+
+def test_no_time_ends_at_once() -> None:
+    image, directions, _, _ = sky(0)
+    assert solve(image, directions, lens(40.0), at_infinity=True, time_limit=1e-6).stats.iterations <= 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"points3d": np.full((9, 3), 2.0)},
+            r"expected unit vectors in `points3d` with `at_infinity`, got one",
+        ),
+        ({"points3d": np.ones((9, 2))}, r"expected `points3d` of shape \(k, 3\)"),
+        ({"points2d": np.ones((2, 2))}, "expected 3 or more points in `points2d`"),
+        ({"points2d": np.full((9, 2), 0.1)}, "expected pixels with a `camera`"),
+        ({"camera": None}, "expected normalised image coordinates without a `camera`"),
+        (
+            {"prior": PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)},
+            "expected no `prior` with `at_infinity`, got Pose",
+        ),
+        ({"normals3d": np.ones((9, 3))}, "expected no `normals3d` with `at_infinity`"),
+        ({"labels2d": [1], "labels3d": [1]}, "expected no `labels2d` with `at_infinity`"),
+        ({"clutter": 0.2}, "expected no `clutter` with `at_infinity`"),
+        ({"solver": "matcher-maps"}, "expected no `solver` with `at_infinity`"),
+        ({"scores2d": np.zeros(9)}, "expected probabilities above 0"),
+        ({"inlier_threshold": -1}, "expected a positive `inlier_threshold`"),
+    ],
+)
+def test_bad_input_is_one_clear_error(change: dict[str, Any], message: str) -> None:
+    rng = np.random.default_rng(0)
+    arguments: dict[str, Any] = {"points2d": rng.uniform(0, SIZE, (9, 2)), "points3d": sphere(rng, 9)}
+    arguments |= {"camera": lens(40.0), "at_infinity": True} | change
+    with pytest.raises(ValueError, match=message):
+        solve(**arguments)
