@@ -1,90 +1,201 @@
-"""How often the best pose of a search is wrong, against the probability claimed that a better one was missed.
+"""How often confident poses are wrong, by family; and a diagram of what the search claims against what is observed.
 
-python benchmarks/reliability.py --data ../shared/data --problems 40 --seeds 1 2 --output rows.json
-python benchmarks/reliability.py rows.json others.json --output docs/images/reliability.png
+    python -m benchmarks reliability --families leds shapes photos maps hard --seed 9 --limit 100 --output rows.jsonl
+    python -m benchmarks reliability --draw docs/images/reliability.png rows.jsonl others.jsonl
 
-Rows: {family: [{"deg", "shift", "verdict", "alarms", "log10_missed", "cpu", "claims"}]}; shift of the middle of the
-scene in distances, claims [log10_missed, deg, shift] of the best pose whenever it exceeds chance.
+Families: leds (the settings of `bench_constellation.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
+the points of one view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard
+(`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong). --limit: problems
+of each setting. Photos are of scenes on which no constant was chosen (`--scenes`).
+
+Wrong: more than 3 degrees off, or the middle of the scene moved by more than a tenth of its distance, and beyond the
+bound that the solution claims (`record.beyond_bound`); with a wrong focal length: the camera's centre more than a
+twentieth of the distance off. A row is written as soon as it is known; those that the file has are not solved again.
 """
 
-import argparse
 import json
 import time
-from collections import defaultdict
-from collections.abc import Iterator
-from itertools import product
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 import pandas as pd
+from bench_constellation import SETTINGS, picture, search
+from bench_search import shapes
+from hard_scenes import CAMERA, SCENES, wrong_focal_plane
 from matplotlib.figure import Figure
-from scipy.spatial.transform import Rotation
+from record import TIME_LIMIT, Array, beyond_bound, degrees, parser
 from scipy.stats import binomtest
-from view_pairs import scene_pairs
+from view_pairs import LEAST_PAIRS, scene_pairs
 
-from bpnp import solve
-from bpnp.datamodules.surfaces import normalise, procedural_shape, sample_surface
+from bpnp import Solution, solve, warm_up
+from bpnp.cameras import camera_from
 from bpnp.report.figures import save_figure
 from bpnp.search import pool, verdict
 from bpnp.search.verdict import missed
+from bpnp.solving.problem import problem_from
+from bpnp.solving.sources import Options, solutions_of
 
-SCENES = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")  # no constant was chosen on them
-FAMILIES = (*product(["shapes"], (0.0, 0.25, 0.5)), *product(["photos"], (0.5, 0.75, 1.0)))
+REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")  # no constant was chosen on them
+OUTLIERS = (0.0, 0.25, 0.5, 0.75, 1.0)
+RATIOS = (0.0, 0.25, 0.5)
+FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
+WRONG_DEG, WRONG_SHIFT, WRONG_CENTRE = 3.0, 0.1, 0.05
 GROUPS = {"right, confident": "tab:green", "right": "tab:olive", "wrong": "0.8", "wrong, confident": "tab:red"}
 
 
-def problems(kind: str, clutter: float, seed: int, options: argparse.Namespace) -> Iterator[tuple[np.ndarray, ...]]:
-    """points2d, points3d, rotation, translation. clutter: of shapes random points a match on either side; of photos,
-    each against one view, share of the points of a side without a partner."""
-    for scene in options.scenes if kind == "photos" and options.data else ():
-        for pair in scene_pairs(options.data, scene, limit=options.problems, views=1, outliers=clutter, seed=seed):
-            yield pair.points2d, pair.points3d, pair.rotation, pair.translation
-    for k in range(options.problems if kind == "shapes" else 0):
-        rng = np.random.default_rng([seed, k])
-        points = normalise(sample_surface(procedural_shape(rng), 400, rng), "unit_sphere")
-        rotation, translation = Rotation.random(random_state=rng).as_matrix(), rng.uniform(-0.5, 0.5, 3) + [0, 0, 4.5]
-        camera, others = points @ rotation.T + translation, round(400 * clutter)
-        image = camera[:, :2] / camera[:, 2:] + 2 / 800 * rng.standard_normal((400, 2))
-        sides = (np.concatenate([x, rng.uniform(x.min(0), x.max(0), (others, x.shape[1]))]) for x in (image, points))
-        yield *(rng.permutation(side) for side in sides), rotation, translation
+class Problem(NamedTuple):
+    """Something to solve, and the poses of which any is right; none where points have no pose in common.
+
+    points3d: of the scene, whose middle tells how far a pose is off.
+    """
+
+    name: str
+    solve: Callable[[], Solution]
+    poses: list[tuple[Array, Array]]
+    points3d: Array
 
 
-def solved(problem: tuple[np.ndarray, ...], seed: int) -> dict[str, Any]:
-    points2d, points3d, rotation, translation = problem
-    claims: list[tuple[float, float, float]] = []
-    true = rotation @ (middle := np.median(points3d, 0)) + translation
+def leds(options: Any) -> Iterator[Problem]:
+    for k, (name, setting) in enumerate(SETTINGS.items()):
+        rng = np.random.default_rng([options.seed, k])
+        for i in range(options.limit):
+            shown = picture(setting, 1000 * options.seed + i // 5, rng)
+            pose = shown.rotation, shown.translation
+            yield Problem(f"{name}/{i}", partial(search, shown, setting, rng), [pose], shown.device.points3d)
 
-    def errors(turned: np.ndarray, seen: np.ndarray) -> tuple[float, float]:
-        angle = np.arccos(np.clip((np.trace(turned @ rotation.T) - 1) / 2, -1, 1))
-        return float(np.degrees(angle)), float(np.linalg.norm(seen - true) / np.linalg.norm(true))
+
+def of_shapes(options: Any) -> Iterator[Problem]:
+    for ratio in RATIOS:
+        for name, points2d, points3d, *pose in shapes(ratio, options.limit, options.seed):
+            run = partial(solve, points2d, points3d, seed=options.seed, time_limit=options.time_limit)
+            yield Problem(f"{ratio:g} outliers a match/{name}", run, [tuple(pose)], points3d)
+
+
+def photos(options: Any) -> Iterator[Problem]:
+    for outliers in OUTLIERS:
+        for pair in _pairs(options, outliers, 1):
+            yield _with_camera(f"{outliers:.0%} outliers/{pair.name}", pair, 1.0, options)
+
+
+def focal(options: Any) -> Iterator[Problem]:
+    for k, pair in enumerate(_pairs(options, 0.5, 1)):
+        for factor in FACTORS[k % 2 :: 2]:
+            yield _with_camera(f"photos {abs(factor - 1):.0%}/{pair.name} x {factor}", pair, factor, options)
+    rng = np.random.default_rng([options.seed, 1])
+    for k in range(options.limit):
+        pixels, points3d, poses = wrong_focal_plane(rng)
+        run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
+        yield Problem(f"planes/{k}", run, poses, points3d)
+
+
+def maps(options: Any) -> Iterator[Problem]:
+    for pair in _pairs(options, 1.0, 0):
+        camera = np.diag([pair.focal, pair.focal, 1.0])
+        known = {"seed": options.seed, "time_limit": options.time_limit}
+        run = partial(pair.scene.localize, pair.focal * pair.points2d, camera, **known)
+        yield Problem(f"maps/{pair.name}", run, [(pair.rotation, pair.translation)], pair.points3d[pair.match3d >= 0])
+
+
+def hard(options: Any) -> Iterator[Problem]:
+    for draw in SCENES:
+        rng = np.random.default_rng(options.seed)
+        for k in range(options.limit):
+            pixels, points3d, poses = draw(rng)
+            run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
+            yield Problem(f"{draw.__name__}/{k}", run, poses, points3d)
+
+
+FAMILIES = {"leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal}
+
+
+def _pairs(options: Any, outliers: float, views: int) -> Iterator[Any]:
+    """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true pairs."""
+    known = {"limit": options.limit, "views": views, "outliers": outliers, "seed": options.seed}
+    turns = [scene_pairs(options.data, scene, most=1024 if views else None, **known) for scene in options.scenes]
+    for pairs in zip(*turns, strict=False):
+        yield from (pair for pair in pairs if pair.true_pairs >= LEAST_PAIRS)
+
+
+def _with_camera(name: str, pair: Any, factor: float, options: Any) -> Problem:
+    """A photo against one view, with the cones of the points, and a camera of `factor` times the focal length."""
+
+    def run() -> Solution:
+        camera = camera_from(np.diag([factor * pair.focal, factor * pair.focal, 1.0]))
+        cones = {"normals3d": pair.cones.axes, "cosines3d": pair.cones.cosines}
+        problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, **cones)
+        return solutions_of({0: problem}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
+
+    return Problem(name, run, [(pair.rotation, pair.translation)], pair.points3d)
+
+
+def row_of(family: str, problem: Problem) -> dict[str, Any]:
+    """What was found. claims: [log10 of the probability that a better pose was missed, whether the best one is wrong],
+    whenever one exceeds chance."""
+    claims: list[tuple[float, bool]] = []
+    middle = np.median(problem.points3d, 0)
+
+    def errors(rotation: Array, seen: Array) -> tuple[float, float]:
+        """Degrees, and shift of the middle, seen from the camera, in distances, to the nearest of the true poses."""
+        true = [(turn, turn @ middle + shift) for turn, shift in problem.poses]
+        off = [(degrees(rotation, turn), float(np.linalg.norm(seen - at) / np.linalg.norm(at))) for turn, at in true]
+        return min(off, default=(180.0, np.inf))
+
+    def is_far(deg: float, shift: float) -> bool:
+        return not (deg <= WRONG_DEG and shift <= WRONG_SHIFT)
 
     def watched(poses: Any, sets: Any, *rest: Any, independent: bool = True) -> float:
         claim = missed(poses, sets, *rest, independent=independent)
-        if independent and len(poses) and poses.log10_false_alarms[0] < 0:
-            claims.append((claim, *errors(poses.rotation[0], poses.rotation[0] @ sets.middle + poses.translation[0])))
+        same_scene = len(sets.points3d) == len(problem.points3d)  # not a part of a map; its origin may be another one
+        if independent and same_scene and len(poses) and poses.log10_false_alarms[0] < 0:
+            seen = poses.rotation[0] @ sets.middle + poses.translation[0]
+            claims.append((claim, is_far(*errors(poses.rotation[0], seen))))
         return claim
 
     cpu = time.process_time()
     with patch.object(pool, "missed", watched), patch.object(verdict, "missed", watched):
-        solution = solve(points2d, points3d, seed=seed)
-    deg, shift = errors(solution.rotation, solution.rotation @ middle + solution.translation)
-    row = {"deg": deg, "shift": shift, "verdict": solution.verdict, "alarms": solution.log10_false_alarms}
-    return row | {"log10_missed": claims[-1][0] if claims else 0.0, "cpu": time.process_time() - cpu, "claims": claims}
+        found = problem.solve()
+    row: dict[str, Any] = {"family": family, "name": problem.name, "cpu": time.process_time() - cpu}
+    deg, shift = errors(found.rotation, found.rotation @ middle + found.translation)
+    outside, wrong = all(beyond_bound(found, *pose) for pose in problem.poses), is_far(deg, shift)
+    centre = np.nan
+    if family == "focal":
+        rotation, translation = problem.poses[0]
+        distance = np.linalg.norm(rotation @ middle + translation)
+        centre = float(np.linalg.norm(found.centre + rotation.T @ translation) / distance)
+        wrong, outside = not centre <= WRONG_CENTRE, True
+    row |= {"deg": deg, "shift": shift, "centre": centre, "outside": outside, "wrong": wrong and outside}
+    row |= {"verdict": found.verdict, "reason": found.reason, "alarms": found.log10_false_alarms}
+    return row | {"claims": list({int(claim // 1): (claim, far) for claim, far in claims}.values())}
 
 
-def draw(files: list[Path], path: Path) -> None:
-    families = (item for file in files for item in json.loads(file.read_text()).items())
-    rows = pd.DataFrame([row | {"family": family} for family, part in families for row in part])
-    claims = [(k, max(claim, -6), *pose) for k, part in enumerate(rows.claims) for claim, *pose in part]
-    met = pd.DataFrame(claims, columns=["problem", "claim", "deg", "shift"])
-    met["decade"] = met.claim // 1  # in each a problem counts once; below 1e-6 is one
-    for frame in (rows, met):
-        frame["wrong"] = ~(frame.deg.le(3) & frame["shift"].le(0.1))  # so is NaN, no pose
+def summary(rows: pd.DataFrame) -> str:
+    """A line for each family and setting: problems, right, confident, and of these wrong."""
+    lines = []
+    for (family, setting), part in rows.groupby(["family", rows.name.str.split("/").str[0]], sort=False):
+        sure, wrong = part.verdict == "confident", part.wrong
+        believed = (sure & ~wrong).sum() / max((~wrong).sum(), 1)
+        lines.append(
+            f"{family:7} {setting:30} {len(part):5} problems, right {1 - wrong.mean():4.0%}, confident {sure.sum():5}, "
+            f"of these wrong {(sure & wrong).sum()}; {believed:4.0%} of the right, median {part.cpu.median():.3g} CPU s"
+        )
+    sure = rows.verdict == "confident"
+    return "\n".join([*lines, f"confident {sure.sum()}, of these wrong {(sure & rows.wrong).sum()}"])
+
+
+def draw(rows: pd.DataFrame, path: Path) -> None:
+    """Left: claims against shares of wrong poses, in each decade a problem once, with Wilson's intervals. Right: the
+    verdicts."""
+    rows = rows[rows.family != "focal"]
+    met = pd.DataFrame(
+        [(max(claim, -6.0), far) for claims in rows.claims for claim, far in claims], columns=["p", "far"]
+    )
     left, right = (figure := Figure(figsize=(11, 4), layout="constrained")).subplots(1, 2)
-    for _, part in met.drop_duplicates(["problem", "decade"]).groupby("decade"):
-        claimed, test = (10**part.claim).mean(), binomtest(int(part.wrong.sum()), len(part))
+    for _, part in met.groupby(met.p // 1):
+        claimed, test = (10**part.p).mean(), binomtest(int(part.far.sum()), len(part))
         low, high = test.proportion_ci(method="wilson")
         left.plot([claimed] * 3, np.maximum([low, test.statistic, high], 1e-9), "o-", color="tab:blue", markevery=[1])
         left.annotate(f"{test.k} of {test.n}", (claimed, high), ha="center", va="bottom", fontsize=7)
@@ -97,23 +208,36 @@ def draw(files: list[Path], path: Path) -> None:
     save_figure(figure, path)
 
 
+def read(files: list[Path]) -> list[dict[str, Any]]:
+    return [json.loads(line) for file in files if file.exists() for line in file.read_text().splitlines()]
+
+
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("rows", nargs="*", type=Path, help="files to draw; without one, problems are solved")
-    parser.add_argument("--data", type=Path, help="folder with colmap/SCENE; without it shapes alone")
-    parser.add_argument("--scenes", nargs="*", default=SCENES)
-    parser.add_argument("--problems", type=int, default=40, help="of a family of shapes, and photos of a scene")
-    parser.add_argument("--seeds", nargs="*", type=int, default=[1])
-    parser.add_argument("--output", type=Path, required=True)
-    options = parser.parse_args()
-    if options.rows:
-        draw(options.rows, options.output)
-        return
-    rows = defaultdict[str, list[dict[str, Any]]](list)
-    for seed, (kind, clutter) in product(options.seeds, FAMILIES):
-        for problem in problems(kind, clutter, seed, options):
-            rows[f"{kind} {clutter:.0%}"].append(solved(problem, seed))
-            options.output.write_text(json.dumps(rows) + "\n")
+    options = parser(__doc__)
+    options.add_argument(
+        "rows", nargs="*", type=Path, help="files to sum up and draw; without one, problems are solved"
+    )
+    options.add_argument("--draw", type=Path, help="picture to write of the files")
+    options.add_argument("--families", nargs="*", choices=FAMILIES, default=list(FAMILIES))
+    options.add_argument("--scenes", nargs="*", default=REPORTED)
+    options.add_argument(
+        "--time-limit", type=float, default=TIME_LIMIT, help="seconds a problem (default: %(default)s)"
+    )
+    chosen = options.parse_args()
+    files = chosen.rows or [chosen.output or Path("reliability.jsonl")]
+    known = {(row["family"], row["name"]) for row in read(files)}
+    if not chosen.rows:
+        warm_up()
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        for family in chosen.families:
+            for problem in FAMILIES[family](chosen):
+                if (family, problem.name) not in known:
+                    with files[0].open("a") as file:
+                        file.write(json.dumps(row_of(family, problem)) + "\n")
+    rows = pd.DataFrame(read(files))
+    print(summary(rows))
+    if chosen.draw:
+        draw(rows, chosen.draw)
 
 
 if __name__ == "__main__":
