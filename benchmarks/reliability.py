@@ -70,9 +70,9 @@ def leds(options: Any) -> Iterator[Problem]:
 
 def of_shapes(options: Any) -> Iterator[Problem]:
     for ratio in RATIOS:
-        for name, points2d, points3d, *pose in shapes(ratio, options.limit, options.seed):
+        for name, points2d, points3d, rotation, translation in shapes(ratio, options.limit, options.seed):
             run = partial(solve, points2d, points3d, seed=options.seed, time_limit=options.time_limit)
-            yield Problem(f"{ratio:g} outliers a match/{name}", run, [tuple(pose)], points3d)
+            yield Problem(f"{ratio:g} outliers a match/{name}", run, [(rotation, translation)], points3d)
 
 
 def photos(options: Any) -> Iterator[Problem]:

@@ -25,7 +25,7 @@ from bpnp.maps.views import View
 ROOT = Path(__file__).parents[1]
 MODULES = (
     "bench_constellation", "bench_layers", "bench_search", "descriptor_poses", "gpu", "paper_layers", "problems",
-    "rebuilt_maps", "results", "steps", "timing",
+    "rebuilt_maps", "record", "reliability", "results", "steps", "timing",
 )  # fmt: skip
 
 
@@ -199,6 +199,41 @@ def test_shapes_are_seen_where_the_pose_puts_them(bench: SimpleNamespace) -> Non
         assert nearest.max() < 6 * bench.bench_search.NOISE
     (_, points2d, points3d, *_), *_ = bench.bench_search.shapes(0.5, 1, 9)
     assert len(points2d) == len(points3d) == 600
+
+
+def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(bench: SimpleNamespace) -> None:
+    """Errors drawn with the covariance that is claimed: once in a thousand for the rotation, once for the pose."""
+    rng, root = np.random.default_rng(0), np.diag([0.01, 0.02, 0.01, 5.0, 3.0, 40.0])
+    root[3:, :3] = 30 * rng.standard_normal((3, 3))
+    turn, shift = Rotation.from_euler("xyz", [50, 20, -70], degrees=True), np.array([100.0, 20, 900])
+    found = SimpleNamespace(rotation=turn.as_matrix(), translation=shift, covariance=root @ root.T)
+    beyond = []
+    for error in rng.standard_normal((4000, 6)) @ root.T:
+        true = (Rotation.from_rotvec(error[:3]) * turn).as_matrix()
+        beyond.append(bench.record.beyond_bound(found, true, shift + error[3:]))
+    assert 1 <= sum(beyond) <= 16
+    found.covariance = np.full((6, 6), np.nan)  # nothing is claimed
+    assert bench.record.beyond_bound(found, found.rotation, shift)
+    outcomes = [bench.record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
+    assert bench.record.summary(outcomes, 3.0)["confident_and_wrong"] == 1
+
+
+def test_reliability_goes_on_where_it_was(bench: SimpleNamespace, tmp_path: Path, monkeypatch, capsys) -> None:
+    """One device of each setting; a second run solves none of them again, and finds the same."""
+    out, told = tmp_path / "rows.jsonl", []
+    for _ in range(2):
+        arguments = ["reliability", "--families", "leds", "--limit", "1", "--seed", "9", "--output", str(out)]
+        monkeypatch.setattr("sys.argv", arguments)
+        bench.reliability.main()
+        told.append((out.read_text(), capsys.readouterr().out))
+    assert told[0] == told[1]
+    rows = [json.loads(line) for line in told[0][0].splitlines()]
+    assert len(rows) == len(bench.bench_constellation.SETTINGS)
+    assert sum(row["verdict"] == "confident" and row["wrong"] for row in rows) == 0
+    assert sum(not row["wrong"] for row in rows) > len(rows) / 2
+    monkeypatch.setattr("sys.argv", ["reliability", str(out), "--draw", str(tmp_path / "drawn.png")])
+    bench.reliability.main()
+    assert (tmp_path / "drawn.png").stat().st_size > 1000
 
 
 def test_the_list_has_every_benchmark_and_a_sentence_for_each() -> None:
