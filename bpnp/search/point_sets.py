@@ -27,6 +27,8 @@ class PointSets:
     cosines3d: (n,) least cosine between a normal and the direction to a camera that sees the point; None for 0. With
     them the few-point search leaves the normals aside. scores2d (m,), scores3d (n,): probability that a point has a
     partner, in (0, 1]; None for equal ones.
+    odds2d (m, c), classes3d (n, c): their scalar product is how much likelier a match is by its classes than a mean
+    one; the labels are then those of points that are sure of theirs, for searching.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
     prior: what is known of the pose. log10_tried: of the number of poses that were tried; None for as many as triples
     of matches give.
@@ -43,6 +45,8 @@ class PointSets:
     floor: float | None = None
     prior: Prior | None = None
     log10_tried: float | None = None
+    odds2d: Array | None = None
+    classes3d: Array | None = None
 
     @property
     def cones3d(self) -> Array | None:

@@ -5,7 +5,7 @@
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +21,8 @@ Labels = npt.NDArray[np.int64]
 Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
 UNIT_NORM = 1e-3  # largest error of a length
+UNIT_SUM = 1e-3  # largest error of a sum of probabilities
+SURE = 0.8  # probability of a class from which a search matches a point to none of another one
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
 WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
@@ -226,14 +228,55 @@ def checked_normals(values: Any, count: int, where: str) -> Array | None:
     return np.asarray(normals / length[:, None])
 
 
-def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where: str) -> tuple[Labels, Labels] | None:
-    """Integer labels of the 2D and the 3D points, -1 for any; both or neither."""
+class KnownLabels(NamedTuple):
+    """Labels as `PointSets` has them."""
+
+    labels2d: Labels
+    labels3d: Labels
+    odds2d: Array | None = None
+    classes3d: Array | None = None
+
+
+def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where: str) -> KnownLabels | None:
+    """Integer labels of the 2D and the 3D points, -1 for any, or probabilities (m, c), (n, c); both or neither.
+
+    Of image point i with the probabilities p_i and scene point j with q_j, the appearance of i is likelier if they
+    belong together than if not by sum_c p_ic q_jc / b_c, b the mean of the p_i, over its mean over j.
+    """
     if labels2d is None and labels3d is None:
         return None
     for name, values in (("labels2d", labels2d), ("labels3d", labels3d)):
         if values is None:
             raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
-    return _labels("labels2d", labels2d, counts[0], where), _labels("labels3d", labels3d, counts[1], where)
+    if max(getattr(values, "ndim", 1) for values in (labels2d, labels3d)) < 2:
+        given = ("labels2d", labels2d, counts[0]), ("labels3d", labels3d, counts[1])
+        return KnownLabels(*(_labels(*each, where) for each in given))
+    image, scene = _classes("labels2d", labels2d, counts[0], where), _classes("labels3d", labels3d, counts[1], where)
+    if image.shape[1] != scene.shape[1]:
+        raise ValueError(
+            f"expected as many classes in `labels2d` as in `labels3d`{where}, got {image.shape[1]} and {scene.shape[1]}"
+        )
+    odds = image / np.maximum(image.mean(0), 1e-12)
+    odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
+    sure = (np.where(each.max(1) >= SURE, each.argmax(1), -1) for each in (image, scene))
+    return KnownLabels(*sure, odds, scene)
+
+
+def _classes(name: str, values: Any, count: int, where: str) -> Array:
+    """Probabilities (count, c) of classes."""
+    shares = numbers(name, values, where)
+    if shares.ndim != 2 or len(shares) != count:
+        raise ValueError(
+            f"expected probabilities in `{name}` of shape ({count}, c), as in the other one{where}, got {shares.shape}"
+        )
+    off = np.abs(shares.sum(1) - 1)
+    bad = np.flatnonzero(~((shares >= 0).all(1) & (off <= UNIT_SUM)))
+    if len(bad):
+        raise ValueError(
+            f"expected probabilities from 0 that add up to 1 in `{name}`{where}, got {shares[bad[0]].tolist()} at "
+            f"point {bad[0]}; try softmax, or to divide by the sums"
+        )
+    return np.asarray(shares / shares.sum(1, keepdims=True))
 
 
 def _labels(name: str, values: Any, count: int, where: str) -> Labels:

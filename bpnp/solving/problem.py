@@ -29,6 +29,7 @@ from bpnp.solving.arguments import (
 Unit = Literal["px", "normalised", "rad"]
 FAR = 100.0  # median distances of the points from their median; further off float32 steps by 1e-5 of that distance
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
+LIKELY = 0.1  # by their classes, over a mean match, at least, of two points that are matched
 FLOOR_PIXELS = 0.1  # no detector of points is better
 
 
@@ -81,7 +82,7 @@ class Problem:
         reason = degenerate_points(sets.bearings[stay], self.points3d)
         known = {
             name: getattr(sets, name)[stay]
-            for name in ("bearings", "labels2d", "scores2d")
+            for name in ("bearings", "labels2d", "scores2d", "odds2d")
             if getattr(sets, name) is not None
         }
         return replace(
@@ -95,6 +96,8 @@ class Problem:
 
     def allowed(self, i: Labels, j: Labels) -> npt.NDArray[np.bool_]:
         """Whether usable 2D points i and 3D points j can be partners by their labels."""
+        if self.sets.odds2d is not None and self.sets.classes3d is not None:
+            return np.asarray((self.sets.odds2d[i] * self.sets.classes3d[j]).sum(-1) > LIKELY)
         if self.sets.labels2d is None or self.sets.labels3d is None:
             return np.ones(len(i), np.bool_)
         label2d, label3d = self.sets.labels2d[i], self.sets.labels3d[j]
@@ -162,13 +165,15 @@ def problem_from(
         bearings[usable],
         scene - origin,
         checked_normals(normals3d, len(scene), where),
-        None if labels is None else labels[0][usable],
-        None if labels is None else labels[1],
+        None if labels is None else labels.labels2d[usable],
+        None if labels is None else labels.labels3d,
         cosines3d,
         None if scores is None else scores[usable],
         checked_scores("scores3d", scores3d, len(scene), where),
         floor=None if camera is None else FLOOR_PIXELS / _per_radian(plane[usable], unit, camera),
         prior=known,
+        odds2d=None if labels is None or labels.odds2d is None else labels.odds2d[usable],
+        classes3d=None if labels is None else labels.classes3d,
     )
     degenerate = degenerate_points(sets.bearings, scene, fewest)
     return Problem(sets, usable, image[usable], unit, plane, scene, origin, camera, degenerate, prior)

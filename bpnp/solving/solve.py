@@ -57,7 +57,8 @@ def solve(
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
     normals3d: (n, 3) outward unit normals: a point that faces away from the camera is not seen.
     labels2d, labels3d: (m,) and (n,) integers, such as colours, classes or identities: only points of one label are
-        matched; -1 fits any.
+        matched; -1 fits any. Or probabilities (m, c) and (n, c) of c classes, whose rows add up to 1, such as a
+        network's: a match counts as much more as its classes agree better than those of a mean one.
     scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
         strength of a keypoint, or the number of views that see a point; only their ratios matter much.
     solver: "search", which needs no training; "auto", the same, which asks a packaged matcher for poses to start from
@@ -184,7 +185,7 @@ def solve_many(
         until=Deadline(begun + seconds) if count == 1 and seconds is not None else Deadline(),
     )
     known = {
-        name: each_set(name, values, count, 1 + (name == "normals3d"))
+        name: each_set(name, values, count, 2 if name == "normals3d" or _is_table(name, values) else 1)
         for name, values in (
             ("normals3d", normals3d),
             ("labels2d", labels2d),
@@ -209,6 +210,11 @@ def solve_many(
     solutions = solutions_of(problems, options)
     shared_lights(problems, solutions, lambda i, problem: solutions_of({i: problem}, options)[i])
     return [solutions[i] for i in range(count)]
+
+
+def _is_table(name: str, values: Any) -> bool:
+    """Whether labels are one array of class probabilities, for all problems."""
+    return name.startswith("labels") and getattr(values, "ndim", 1) == 2 and "float" in str(values.dtype)
 
 
 def shared_lights(

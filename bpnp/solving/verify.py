@@ -125,6 +125,7 @@ def _of_matches(problem: Problem, pairs: Labels) -> Problem:
     i, j = pairs.T
     sets, usable = problem.sets, np.searchsorted(problem.usable, i)
     known: dict[str, Any] = {"labels2d": np.arange(len(pairs)), "labels3d": np.arange(len(pairs))}
+    known |= {"odds2d": None, "classes3d": None}
     for names, chosen in ((("bearings", "scores2d"), usable), (("points3d", "normals3d", "scores3d"), j)):
         known |= {name: None if getattr(sets, name) is None else getattr(sets, name)[chosen] for name in names}
     restricted = replace(sets, **known)

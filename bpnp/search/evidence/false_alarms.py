@@ -31,6 +31,7 @@ the evidence of dense points, whose neighbours lie as close as their residuals.
 """
 
 import math
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -41,6 +42,7 @@ from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.point_sets import PointSets, faces
 
 Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
 
 FIXING = 3  # pairs that fix a pose
 SHARES = np.array([0.15, 0.4, 0.75])  # w
@@ -183,30 +185,46 @@ def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *
 
     even: against scene points that are spread evenly over the view instead of as they are seen.
     """
-    image = sets.image
-    logs = np.zeros((len(image.chosen), len(scales), len(shares)))
-    for rows, columns in label_groups(image.chosen, sets.labels2d, sets.labels3d, len(seen)):
-        used, bearings = seen[columns][np.isfinite(seen[columns, 0])], sets.bearings[image.chosen[rows]]
-        predicted = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2)
-        density = np.full(len(rows), len(columns) / image.solid_angle) if even else _density(image, bearings, used)
-        ratio = predicted / (2 * math.pi * scales**2 * density[:, None])
-        logs[rows] = np.log1p(shares * (ratio - 1)[:, :, None])
-    return logs
+    image, count = sets.image, len(sets.image.chosen)
+    predicted, smooth, inside, every = np.zeros((count, len(scales))), np.zeros(count), np.zeros(count), np.zeros(count)
+    for rows, columns, odds, share in _partners(sets, len(seen)):
+        ahead = np.isfinite(seen[columns, 0])
+        every[rows] += odds * share.sum()
+        used, share, bearings = seen[columns][ahead], share[ahead], sets.bearings[image.chosen[rows]]
+        near = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2, share)
+        predicted[rows] += odds[:, None] * near
+        among = (np.abs((used - image.centre) @ image.axes) <= image.half_widths).all(-1)
+        inside[rows] += odds * share[among & (used @ image.centre > 0)].sum()
+        if not even:
+            smooth[rows] += odds * _smoothed(image, bearings, used, share)
+    density = (every if even else np.maximum(inside, 1)) / image.solid_angle
+    ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
+    return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
 
 
-def _density(image: ImageStatistics, bearings: Array, directions: Array) -> Array:
-    """Directions per steradian around each bearing, smoothed by OUTLINE spreads; at least their mean density."""
-    inside = (np.abs((directions - image.centre) @ image.axes) <= image.half_widths).all(-1)
-    mean = max(int((inside & (directions @ image.centre > 0)).sum()), 1) / image.solid_angle
-    some = directions[:: -(-len(directions) // MOST_SMOOTHED)] if len(directions) else directions
+def _partners(sets: PointSets, n: int) -> Iterator[tuple[Labels, Labels, Array, Array]]:
+    """Places in the chosen image points (k,) and in the scene of possible partners, the odds (k,) of the former and the
+    share (n,) of the latter: those of a label, or all with their probability of a class, one class after the other."""
+    chosen = sets.image.chosen
+    if sets.odds2d is None or sets.classes3d is None:
+        for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, n):
+            yield rows, columns, np.ones(len(rows)), np.ones(len(columns))
+        return
+    for odds, share in zip(sets.odds2d[chosen].T, sets.classes3d.T, strict=True):
+        yield np.arange(len(chosen)), np.arange(n), odds, share
+
+
+def _smoothed(image: ImageStatistics, bearings: Array, directions: Array, share: Array) -> Array:
+    """Directions per steradian around each bearing, weighed with their share, smoothed by OUTLINE spreads."""
+    step = -(-len(directions) // MOST_SMOOTHED) or 1
+    some, share = directions[::step], share[::step]
     if not len(some):
-        return np.full(len(bearings), mean)
+        return np.zeros(len(bearings))
     width2 = (OUTLINE * image.spread) ** 2
     # From the centre of the view float32 has the digits of a narrow one.
     one, other = ((points - image.centre) / math.sqrt(2 * width2) for points in (bearings, some))
     one = np.column_stack([2 * one, -(one * one).sum(1), np.ones(len(one))]).astype(np.float32)
     other = np.column_stack([other, np.ones(len(other)), -(other * other).sum(1)]).astype(np.float32)
     exponent = one @ other.T
-    kernel = (np.exp(exponent, out=exponent) @ np.ones(len(other), np.float32)).astype(np.float64)
-    smooth = kernel / (2 * math.pi * width2) * (len(directions) / len(some))
-    return np.maximum(smooth, mean)
+    kernel = (np.exp(exponent, out=exponent) @ share.astype(np.float32)).astype(np.float64)
+    return np.asarray(kernel / (2 * math.pi * width2) * (len(directions) / len(some)))

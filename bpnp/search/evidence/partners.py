@@ -67,13 +67,16 @@ def partners(
         i, nth = np.nonzero(np.isfinite(distance))
         j, squared = nearest[i, nth].astype(np.int64), distance[i, nth] ** 2
     candidates = np.full(len(bearings), len(seen))
-    if sets.labels2d is not None and sets.labels3d is not None:
+    odds = np.ones(len(i))
+    if sets.odds2d is not None and sets.classes3d is not None:
+        odds = (sets.odds2d[chosen[i]] * sets.classes3d[places[j]]).sum(-1)
+    elif sets.labels2d is not None and sets.labels3d is not None:
         label, others = sets.labels2d[chosen], sets.labels3d[places]
         agree = (label[i] == others[j]) | (label[i] < 0) | (others[j] < 0)
-        i, j, squared = i[agree], j[agree], squared[agree]
+        i, j, squared, odds = i[agree], j[agree], squared[agree], odds[agree]
         of_label = np.bincount(others + 1, minlength=int(label.max(initial=0)) + 2)
         candidates = np.where(label < 0, len(seen), of_label[label + 1] + of_label[0])
-    density = np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
+    density = odds * np.exp(squared * (-0.5 / scale**2)) * (1 - OUTLIERS) / (candidates[i] * 2 * math.pi * scale**2)
     every = np.bincount(i, density, len(bearings)) + OUTLIERS / sets.image.solid_angle
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 

@@ -13,11 +13,13 @@ Array = NDArray[np.float64]
 CELLS = 64  # along a side of the grid, at most
 
 
-def sums_near(bearings: Array, directions: Array, axes: Array, radii: Array, sharpness: Array) -> Array:
-    """sum_j exp(-sharpness_s |f_i - u_j|^2) over the directions u_j (n, 3) nearer than radii_s to bearing f_i: (k, S).
+def sums_near(
+    bearings: Array, directions: Array, axes: Array, radii: Array, sharpness: Array, weights: Array | None = None
+) -> Array:
+    """sum_j w_j exp(-sharpness_s |f_i - u_j|^2) over the directions u_j (n, 3) nearer than radii_s to bearing f_i.
 
     axes: (3, 2) orthonormal, along which the bearings spread most; they are sorted into a grid over these. radii (S,):
-    ascending. sharpness (S,): 0 counts the directions.
+    ascending. sharpness (S,): 0 counts the directions. weights (n,): one each by default.
     """
     at = bearings @ axes
     low, extent = at.min(0), float(np.ptp(at, 0).max())
@@ -28,14 +30,23 @@ def sums_near(bearings: Array, directions: Array, axes: Array, radii: Array, sha
     start = np.searchsorted(key[order], np.arange(side * side + 1))
     place = np.floor((directions @ axes - low) / cell).astype(np.int64)
     sums, result = np.zeros((len(radii), len(bearings))), np.empty((len(bearings), len(radii)))
-    _add_up(np.ascontiguousarray(bearings[order].T), start, side, directions, place, radii**2, sharpness, sums)
+    weights = np.ones(len(directions)) if weights is None else weights
+    _add_up(np.ascontiguousarray(bearings[order].T), start, side, directions, weights, place, radii**2, sharpness, sums)
     result[order] = sums.T
     return result
 
 
 @compiled
 def _add_up(
-    bearings: Any, start: Any, side: int, directions: Any, place: Any, squares: Any, sharpness: Any, sums: Any
+    bearings: Any,
+    start: Any,
+    side: int,
+    directions: Any,
+    weights: Any,
+    place: Any,
+    squares: Any,
+    sharpness: Any,
+    sums: Any,
 ) -> None:
     """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. place (n, 2): the cell of each
     direction (n, 3), which may lie beyond the grid. sums (S, k): added to."""
@@ -50,7 +61,7 @@ def _add_up(
                 for s in range(len(squares) - 1, -1, -1):
                     if squared >= squares[s]:
                         break
-                    sums[s, i] += math.exp(-sharpness[s] * squared)
+                    sums[s, i] += weights[j] * math.exp(-sharpness[s] * squared)
 
 
 class HashedPoints:

@@ -1,0 +1,117 @@
+"""Class probabilities of both sides: what the evidence makes of them, what they decide, and what is refused."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted import degrees_between, view_with_outliers
+
+import bpnp
+from bpnp.search.evidence.false_alarms import own_evidence
+from bpnp.search.evidence.uncertainty import linearised, local_covariance
+from bpnp.solving.problem import problem_from
+
+Array = NDArray[np.float64]
+SHARP = 1.48  # of which the likeliest of four classes is right in 70 %
+
+
+def probabilities(rng: np.random.Generator, label: NDArray[np.int64], sharp: float = SHARP) -> Array:
+    """The posterior of four classes given scores that are normal about `sharp` for the right one and 0 for others."""
+    scores = rng.standard_normal((len(label), 4))
+    scores[np.arange(len(label)), label] += sharp
+    shares = np.exp(sharp * scores)
+    return shares / shares.sum(1, keepdims=True)
+
+
+@pytest.fixture(scope="module")
+def view() -> Any:
+    """Bearings, points, pose, and the labels of both: 40 partners and 60 outliers a side."""
+    rng = np.random.default_rng(9)
+    bearings, points, rotation, translation = view_with_outliers(rng, 40, 60)
+    labels2d, labels3d = rng.integers(0, 4, (2, 100))
+    labels3d[:40] = labels2d[:40]
+    return bearings, points, rotation, translation, labels2d, labels3d
+
+
+def test_probabilities_of_one_are_labels_and_equal_ones_say_nothing(view: Any) -> None:
+    bearings, points, rotation, translation, labels2d, labels3d = view
+
+    def judged(**labels: Any) -> list[Array]:
+        sets = problem_from(bearings, points, None, **labels).sets
+        covariance = local_covariance(linearised(sets, rotation, translation, 1e-3))
+        assert covariance is not None
+        return [own_evidence(sets, rotation, translation, 1e-3), covariance]
+
+    certain = judged(labels2d=np.eye(4)[labels2d], labels3d=np.eye(4)[labels3d])
+    equal = judged(labels2d=np.full((100, 4), 0.25), labels3d=np.full((100, 4), 0.25))
+    for soft, hard in (
+        *zip(certain, judged(labels2d=labels2d, labels3d=labels3d), strict=True),
+        *zip(equal, judged(), strict=True),
+    ):
+        np.testing.assert_allclose(soft, hard, rtol=1e-5, atol=1e-6)
+    assert certain[0].sum() > equal[0].sum() + 10
+
+
+def test_the_evidence_is_that_of_the_written_out_sum(view: Any) -> None:
+    """x_i with a_ij = sum_c p_ic q_jc / b_c over its mean over j, at one scale and share."""
+    from bpnp.search.evidence.false_alarms import directions_of, point_evidence
+
+    bearings, points, rotation, translation, labels2d, labels3d = view
+    rng = np.random.default_rng(9)
+    p, q = probabilities(rng, labels2d), probabilities(rng, labels3d)
+    sets = problem_from(bearings, points, None, labels2d=p, labels3d=q).sets
+    seen, scale, share = directions_of(sets, rotation, translation), 1e-3, 0.4
+    agreement = (p / p.mean(0)) @ q.T
+    agreement /= agreement.mean(1, keepdims=True)
+    squared = ((bearings[:, None] - seen) ** 2).sum(-1)
+    near = np.where(squared < 18 * scale**2, np.exp(-squared / (2 * scale**2)), 0.0)
+    ratio = (agreement * near).sum(1) / (2 * np.pi * scale**2) / (100 / sets.image.solid_angle)
+    expected = np.log(1 - share + share * ratio)
+    found = point_evidence(sets, seen, np.array([scale]), np.array([share]), even=True)[:, 0, 0]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
+def test_only_the_classes_tell_two_equal_things_apart() -> None:
+    rng = np.random.default_rng(9)
+    shape, label = rng.uniform(-0.7, 0.7, (50, 3)), rng.integers(0, 4, 50)
+    points = np.concatenate([shape, shape + [3.0, 0, 0]])
+    classes3d = np.concatenate([probabilities(rng, label, 3.0), probabilities(rng, (label + 1) % 4, 3.0)])
+    camera = shape + [3.0, 0, 6]
+    image = camera[:, :2] / camera[:, 2:]
+    classes2d = probabilities(rng, (label + 1) % 4)
+    classes: dict[str, Any] = {"labels2d": classes2d, "labels3d": classes3d}
+    right, twin = (np.eye(3), [0, 0, 6.0]), (np.eye(3), [3.0, 0, 6.0])
+    assert bpnp.verify(image, points, *right).verdict != "confident"
+    assert bpnp.verify(image, points, *right, **classes).verdict == "confident"
+    assert bpnp.verify(image, points, *twin, **classes).verdict == "failed"
+
+
+def test_many_problems_share_a_table_of_probabilities(view: Any) -> None:
+    bearings, points, rotation, _, labels2d, labels3d = view
+    classes = np.eye(4)[labels2d]
+    options: dict[str, Any] = {"solver": "search", "labels3d": np.eye(4)[labels3d]}
+    for solution in bpnp.solve_many([bearings, bearings], points, labels2d=classes, **options):
+        assert solution.verdict == "confident"
+        assert degrees_between(solution.rotation, rotation) < 1
+
+
+@pytest.mark.parametrize(
+    ("classes2d", "classes3d", "message"),
+    [
+        (np.full((100, 4), 0.3), np.full((100, 4), 0.25), "add up to 1 in `labels2d`"),
+        (np.full((100, 4), 0.25), np.tile([1.5, -0.5, 0, 0], (100, 1)), "probabilities from 0 .* in `labels3d`"),
+        (
+            np.full((100, 4), 0.25),
+            np.full((100, 5), 0.2),
+            "as many classes in `labels2d` as .*, got 4 and 5",
+        ),
+        (np.full((99, 4), 0.25), np.full((100, 4), 0.25), r"in `labels2d` of shape \(100, c\)"),
+        (np.full((100, 4), 0.25), np.zeros(100, int), r"in `labels3d` of shape \(100, c\)"),
+        (np.full((100, 4), np.nan), np.full((100, 4), 0.25), "in `labels2d`"),
+        (np.full((100, 4), 0.25), None, "both `labels2d` and `labels3d`"),
+    ],
+)
+def test_what_is_no_probability_is_refused(view: Any, classes2d: Any, classes3d: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        bpnp.solve(view[0], view[1], labels2d=classes2d, labels3d=classes3d)
