@@ -51,7 +51,7 @@ def turn(rotation: Any, vector: Any) -> None:
     """R <- exp([w]x) R in place, w the first three of `vector`, at most LARGEST_TURN; through a unit quaternion."""
     x, y, z = vector[0], vector[1], vector[2]
     angle: Any = math.sqrt(x * x + y * y + z * z)
-    shrink = min(F(1), F(LARGEST_TURN) / (angle + F(1e-20)))
+    shrink = F(LARGEST_TURN) / angle if angle > F(LARGEST_TURN) else F(1)
     angle *= shrink
     half = F(0.5) * angle
     factor = shrink * (F(0.5) if angle < F(1e-4) else math.sin(half) / angle)

@@ -233,10 +233,10 @@ def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
     first_column = left >= centre and left >= right
     column = (top[0], middle[0], bottom[0]) if first_column else (top[2], middle[2], bottom[2])
     column = (top[1], middle[1], bottom[1]) if not first_column and centre >= right else column
-    count = np.int64(0)  # as a literal, `_meet` would be compiled for it
+    count: Any = np.int64(0)  # as a literal, `_meet` would be compiled for it
     for line in (row, column):
         count = _meet(line, conics, chords, a, b, poses, count)
-    return int(count)
+    return count
 
 
 @part

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 from bpnp.loops.vectors import rotated
 from bpnp.robust.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
-from bpnp.search.enumeration.points import Array, Heading, Places
+from bpnp.search.enumeration.points import Array, Places
 from bpnp.search.enumeration.settings import RULES
 
 
@@ -15,7 +15,7 @@ class Block(NamedTuple):
     place of either is the one before it again. Image sets below `old_image` meet triangles from `old_scene` on alone.
 
     size: matches that fix a pose, 3 or 2. orders: (6, 3) or (2, 3) of a set. witnesses: (n, w) near points, of which
-    `need` must be matched within `reach` radii for a pose to be looked at further. heading: where two fix a pose.
+    `need` must be matched within `reach` radii for a pose to be looked at further.
     """
 
     size: int
@@ -27,7 +27,6 @@ class Block(NamedTuple):
     witnesses: Places
     need: int
     reach: float
-    heading: Heading
 
 
 @compiled
@@ -39,23 +38,26 @@ def explore(
     reach: float,
     exchanged: bool,
     block: Any,
+    heading: Any,
     problem: Any,
     kept: Any,
     work: Any,
 ) -> Any:
     """`sweep` with a budget, and `vary` without: one entry, so that what both call is compiled once."""
     if budget > 0:
-        return sweep(row, first, budget, stop, block, problem, kept, work)
+        return sweep(row, first, budget, stop, block, heading, problem, kept, work)
     vary(reach, exchanged, problem, kept, work)
     return row, first, 0
 
 
 @part
-def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
+def sweep(
+    row: int, first: int, budget: int, stop: float, block: Any, heading: Any, problem: Any, kept: Any, work: Any
+) -> Any:
     """Solve up to `budget` hypotheses from row `row` on, one of an image set in one order, there from triangle `first`.
 
-    Ends after an image set too when the best pose's evidence is `stop` nats. Returns the next row, the next triangle of
-    it, and the number of hypotheses that were solved.
+    Ends after an image set too when the best pose's evidence is `stop` nats. heading: None where three matches fix a
+    pose. Returns the next row, the next triangle of it, and the number of hypotheses that were solved.
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
@@ -86,10 +88,10 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
             if kept.counts[best[0]] >= RULES.skipped and known[i] == a and known[j] == b and known[k] == c:
                 continue
             solved += 1
-            if block.size == 3:
-                count = solve_p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
+            if heading is not None and block.size == 2:  # without a heading P2P is not even compiled
+                count = solve_p2p(i, j, a, b, heading, rays, problem.scene.points, poses)
             else:
-                count = solve_p2p(i, j, a, b, block.heading, rays, problem.scene.points, poses)
+                count = solve_p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
             for s in range(count):
                 pose = poses[s]
                 if not (
@@ -193,7 +195,7 @@ def copy_pose(pose: Any, to: Any) -> None:
 def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
     """Refine a pose that matches about as many points as any hypothesis did at this reach."""
     count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
-    value = count - RULES.lacking * max(expected - count, 0)
+    value = count - RULES.lacking * (expected - count if expected > count else 0)
     kept.most[0] = max(kept.most[0], value)
     if count > problem.fixing and value >= kept.most[0] - RULES.behind:
         settle(pose, reach, problem, kept, work)

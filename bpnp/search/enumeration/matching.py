@@ -7,6 +7,8 @@ the compiled code, and costs time to compile.
 import math
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from bpnp.loops.vectors import rotated, turn
 from bpnp.robust.minimal_solvers import part
 from bpnp.search.enumeration.points import Array, ImagePoints, Places, PriorArrays, ScenePoints
@@ -53,10 +55,10 @@ def fits(label: int, other: int) -> bool:
 
 
 @part
-def cell_of(u: float, v: float, grid: Any) -> int:
+def cell_of(u: float, v: float, grid: Any) -> Any:
     """The cell of the grid with (u, v), -1 outside."""
     a, b = (u - grid.low_u) * grid.per_cell, (v - grid.low_v) * grid.per_cell
-    return int(a) * RULES.cells + int(b) if a >= 0 and b >= 0 and a < RULES.cells and b < RULES.cells else -1
+    return np.int64(a) * RULES.cells + np.int64(b) if a >= 0 and b >= 0 and a < RULES.cells and b < RULES.cells else -1
 
 
 @part
@@ -104,12 +106,12 @@ def evidence(count: int, visible: int, expected: int, matches: Any, fixing: int,
         k = 0
         for i in range(len(matches.point)):
             k += matches.point[i] >= 0 and matches.distance2[i] <= radius2
-        chance = min(0.5, max(visible, 1) * density * radius2)
+        chance = min(0.5, (visible if visible > 1 else 1) * density * radius2)
         value = -(k - fixing) * math.log(chance) - _log_choose(len(matches.point) - fixing, k - fixing)
         if value > best:
             best, radius = value, math.sqrt(radius2)
         radius2 *= 0.25
-    return best - RULES.missed * max(expected - count, 0), radius
+    return best - RULES.missed * (expected - count if expected > count else 0), radius
 
 
 @part

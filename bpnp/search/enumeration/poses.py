@@ -101,7 +101,8 @@ class Enumeration:
         self.tests = math.log(RULES.ladder) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
-        self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0, heading=prior[1])
+        self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
+        self._heading = prior[1] if fixing == 2 else None
 
     @property
     def best(self) -> float:
@@ -161,7 +162,17 @@ class Enumeration:
         start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
         self._row, self._triangle, solved = explore(
-            self._row, self._triangle, most, stop, 1.0, False, self._block, self.problem, self.kept, self.work
+            self._row,
+            self._triangle,
+            most,
+            stop,
+            1.0,
+            False,
+            self._block,
+            self._heading,
+            self.problem,
+            self.kept,
+            self.work,
         )
         self.solved += solved
         if solved >= most:
@@ -179,7 +190,7 @@ class Enumeration:
         exchanged: and what follows from the best pose with other matches.
         """
         self.work.poses[0] = pose
-        explore(0, 0, 0, 0.0, reach, exchanged, self._block, self.problem, self.kept, self.work)
+        explore(0, 0, 0, 0.0, reach, exchanged, self._block, self._heading, self.problem, self.kept, self.work)
 
     def enter(self, rotation: Array, translation: Array) -> Array:
         """A pose of the given points as (4, 3) in these frames."""

@@ -29,9 +29,11 @@ def sums_near(
     order = np.argsort(key, kind="stable")
     start = np.searchsorted(key[order], np.arange(side * side + 1))
     place = np.floor((directions @ axes - low) / cell).astype(np.int64)
+    first, last = np.clip(place - 1, 0, side), np.clip(place + 2, 0, side)
     sums, result = np.zeros((len(radii), len(bearings))), np.empty((len(bearings), len(radii)))
     weights = np.ones(len(directions)) if weights is None else weights
-    _add_up(np.ascontiguousarray(bearings[order].T), start, side, directions, weights, place, radii**2, sharpness, sums)
+    sorted_bearings = np.ascontiguousarray(bearings[order].T)
+    _add_up(sorted_bearings, start, side, directions, weights, first, last, radii**2, sharpness, sums)
     result[order] = sums.T
     return result
 
@@ -43,19 +45,18 @@ def _add_up(
     side: int,
     directions: Any,
     weights: Any,
-    place: Any,
+    first: Any,
+    last: Any,
     squares: Any,
     sharpness: Any,
     sums: Any,
 ) -> None:
-    """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. place (n, 2): the cell of each
-    direction (n, 3), which may lie beyond the grid. sums (S, k): added to."""
+    """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. first, last (n, 2): the cells
+    around each direction (n, 3), none for one far beyond the grid. sums (S, k): added to."""
     for j in range(len(directions)):
         x, y, z = directions[j, 0], directions[j, 1], directions[j, 2]
-        first = min(max(place[j, 1] - 1, 0), side)
-        last = max(min(place[j, 1] + 2, side), first)
-        for row in range(max(place[j, 0] - 1, 0), min(place[j, 0] + 2, side)):
-            for i in range(start[row * side + first], start[row * side + last]):
+        for row in range(first[j, 0], last[j, 0]):
+            for i in range(start[row * side + first[j, 1]], start[row * side + last[j, 1]]):
                 dx, dy, dz = bearings[0, i] - x, bearings[1, i] - y, bearings[2, i] - z
                 squared = dx * dx + dy * dy + dz * dz
                 for s in range(len(squares) - 1, -1, -1):
