@@ -17,14 +17,10 @@ if TYPE_CHECKING:
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 CAPTION = (
-    "error: mean over the matches, pixels. log10 false: logarithm of the number of false alarms, how many poses are "
-    "expected to fit as well by chance; smaller is surer."
+    "error px: mean distance between the keypoints of the matches and their points. log10 false: how many poses would "
+    "fit as well by chance, as a power of ten; smaller is surer."
 )
 COLUMNS = ("verdict", "view", "matches", "error\npx", "log10\nfalse", "sec")
-LEGEND = (
-    "error px: mean distance between the keypoints of the matches and their points; log10 false: how many poses would "
-    "fit as well by chance, as a power of ten"
-)
 
 
 def localize(
@@ -160,7 +156,6 @@ class _Run:
         records = {name: folder.records[name] for name in files if name in folder.records and name not in self.errors}
         if records:
             out.print(_table(records))
-            say(LEGEND, to=out)
             cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
             say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
         if self.kept:
@@ -216,15 +211,8 @@ def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
 
     rows = []
     for name, record in records.items():
-        error, alarms = (
-            float("nan" if record[key] is None else record[key]) for key in ("reprojection_error", "log10_false_alarms")
-        )
-        cells = (
-            str(record["view"]),
-            str(record["inlier_count"]),
-            number(error),
-            f"{alarms:.0f}",
-            number(record["seconds"]),
-        )
+        known = {key: float("nan") if value is None else value for key, value in record.items()}
+        figures = number(known["reprojection_error"]), f"{known['log10_false_alarms']:.0f}", number(known["seconds"])
+        cells = str(record["view"]), str(record["inlier_count"]), *figures
         rows.append((Text(name), [Text(record["verdict"], VERDICTS[record["verdict"]]), *map(Text, cells)]))
     return SplitTable("", COLUMNS, [rows], CAPTION)

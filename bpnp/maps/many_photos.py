@@ -4,6 +4,7 @@ A solution is known by the content of all that it was made with, not by names: a
 was replaced under its name is another one.
 """
 
+import contextlib
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -22,7 +23,6 @@ from bpnp.solving.pictures import pose_text
 from bpnp.solving.solution import Solution
 
 MADE_WITH = "made_with"  # beside the fields of a solution in its file
-FILE = "file"  # of a solution: its size in bytes, and when it was written
 REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
 REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", MADE_WITH)
 POSES_HEADER = "# NAME, QW, QX, QY, QZ, TX, TY, TZ (COLMAP's cam_from_world)\n"
@@ -144,24 +144,10 @@ class SolutionFolder:
     records: dict[str, Record] = field(default_factory=dict)  # by photo
 
     def __post_init__(self) -> None:
-        folder, index = self.path / "solutions", self._index()
+        folder = self.path / "solutions"
         for file in sorted(folder.rglob("*.json")):
-            name = file.relative_to(folder).as_posix().removesuffix(".json")
-            if name in index and index[name][FILE] == _file_state(file):
-                self.records[name] = index[name]
-                continue
-            try:
-                self._record(name, file.read_text("utf-8"))
-            except (OSError, ValueError, KeyError, TypeError):  # not whole, or of another version
-                continue
-
-    def _index(self) -> Mapping[str, Record]:
-        """The records that results.json has of solutions that are as they were; reading each of them takes longer."""
-        try:
-            photos = json.loads((self.path / "results.json").read_bytes())["photos"]
-            return {name: record for name, record in photos.items() if {*REPORTED, FILE} <= record.keys()}
-        except (OSError, ValueError, KeyError, TypeError, AttributeError):
-            return {}
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):  # not whole, or of another version
+                self._record(file.relative_to(folder).as_posix().removesuffix(".json"), file.read_text("utf-8"))
 
     def changes(self, task: PhotoTask) -> list[str] | None:
         """What of the photo's solution was made with something else; None if there is no solution."""
@@ -208,12 +194,7 @@ class SolutionFolder:
 
     def _record(self, name: str, text: str) -> None:
         content = json.loads(text)
-        state = _file_state(self._file("solutions", name, "json"))
-        self.records[name] = {key: content[key] for key in REPORTED} | {FILE: state}
+        self.records[name] = {key: content[key] for key in REPORTED}
 
     def _file(self, folder: str, name: str, suffix: str) -> Path:
         return self.path / folder / f"{name}.{suffix}"
-
-
-def _file_state(file: Path) -> list[int]:
-    return [file.stat().st_size, file.stat().st_mtime_ns]

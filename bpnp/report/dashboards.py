@@ -11,7 +11,7 @@ from typing import Any
 
 from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.page.charts import RECALLS, recall_chart
-from bpnp.report.points import FEW, ProblemPoints, read_points
+from bpnp.report.points import FEW, ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_shares, read_results
 from bpnp.report.runs import named_runs
 
@@ -40,7 +40,7 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
     )
     try:
-        run.log(scalars(results) | _tables(results) | _curves(results) | _pictures(results, problems))
+        run.log(scalars(results) | _media(results, problems))
         return Path(run.settings.sync_dir)
     finally:
         run.finish()
@@ -63,34 +63,26 @@ def scalars(results: Results) -> dict[str, float]:
     return values
 
 
-def _tables(results: Results) -> dict[str, Any]:
+def _media(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
+    """Tables, recall curves and the worst problems."""
     import wandb
     from pandas import DataFrame
 
     causes = {name: cause_shares(results.of(name)) for name in results.estimates}
     frames = {
-        "quartiles": DataFrame({"estimate": name, **values} for name, values in results.estimates.items()),
-        "causes": DataFrame({"estimate": name, **shares} for name, shares in causes.items()),
-        "problems": results.frame().map(_text),
+        "quartiles": DataFrame.from_dict(results.estimates, orient="index"),
+        "causes": DataFrame.from_dict(causes, orient="index"),
+        "problems": results.frame().map(lambda value: utf8(value) if isinstance(value, str) else value),
     }
-    return {f"test/{name}": wandb.Table(dataframe=frame) for name, frame in frames.items()}
-
-
-def _curves(results: Results) -> dict[str, Any]:
+    tables = {
+        name: frame if name == "problems" else frame.reset_index(names="estimate") for name, frame in frames.items()
+    }
+    media: dict[str, Any] = {f"test/{name}": wandb.Table(dataframe=frame) for name, frame in tables.items()}
     charts = {f"test/recall_curve/{error}": recall_chart({"test": results}, error) for error in RECALLS}
-    return {key: chart for key, chart in charts.items() if chart is not None}
-
-
-def _pictures(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
-    import wandb
-
+    media |= {key: chart for key, chart in charts.items() if chart is not None}
+    media["test/recall"] = wandb.Image(recall_curve({"test": results}))
     # Problems with many points: the worst and some others, as a test keeps them.
     worst = sorted(problems, key=lambda problem: (len(problem.points2d) <= FEW, -problem.error))[:MOST_PICTURES]
-    drawn = [wandb.Image(plot_problem(problem), caption=str(_text(problem.id))) for problem in worst]
-    pictures: dict[str, Any] = {"test/recall": wandb.Image(recall_curve({"test": results}))}
-    return pictures | ({"test/worst_problems": drawn} if drawn else {})
-
-
-def _text(value: Any) -> Any:
-    """Names that are not UTF-8 with replacements; numbers as they are."""
-    return value.encode("utf-8", "replace").decode() if isinstance(value, str) else value
+    if drawn := [wandb.Image(plot_problem(problem), caption=utf8(problem.id)) for problem in worst]:
+        media["test/worst_problems"] = drawn
+    return media

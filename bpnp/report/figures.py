@@ -5,7 +5,6 @@ Figures are made without pyplot: they need no display, no backend, and no closin
 in normalised coordinates where there is none.
 """
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -17,7 +16,7 @@ from bpnp.files import interruptions_later, written_whole
 from bpnp.report.page.charts import RECALLS, Error, recall_of
 from bpnp.report.palette import DASHES, LIGHT, QUIET
 from bpnp.report.photos import Box, box_of, picture_box, size_in_camera
-from bpnp.report.points import Array, ProblemPoints
+from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.runs import lines_of, read_runs
 
@@ -211,11 +210,8 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
         raise ValueError(f"expected a file name that ends in {', '.join(SUFFIXES)}, got {path.name!r}")
-    content = io.BytesIO()
-    with interruptions_later():  # matplotlib would take Ctrl-C for an error of its input
-        figure.savefig(content, format=path.suffix[1:].lower(), dpi=dpi)
-    with written_whole(path) as temporary:
-        temporary.write_bytes(content.getvalue())
+    with written_whole(path) as temporary, interruptions_later():  # matplotlib takes Ctrl-C for an error of its input
+        figure.savefig(temporary, format=path.suffix[1:].lower(), dpi=dpi)
     return path
 
 
@@ -251,7 +247,7 @@ def _colour(problem: ProblemPoints, estimate: str | None) -> str:
 
 def _text(name: str) -> str:
     """A name as matplotlib shows it letter by letter: no formulas, no bytes of no text, no hidden label."""
-    shown = name.encode("utf-8", "replace").decode().replace("$", r"\$")
+    shown = utf8(name).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown
 
 

@@ -4,7 +4,6 @@ Of every problem up to `FEW` points a side are kept; of the worst and of some ot
 depend on the order of batches or on processes.
 """
 
-import io
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -64,6 +63,11 @@ class ProblemPoints:
         return count2d if self.ids2d is None else self.ids2d, count3d if self.ids3d is None else self.ids3d
 
 
+def utf8(name: str) -> str:
+    """A problem's name with replacements for bytes that are no UTF-8, which reach us as surrogates."""
+    return name.encode("utf-8", "replace").decode()
+
+
 def points_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY) -> list[ProblemPoints]:
     """The points of a batch. Of larger sets `most_points` are kept on each side, evenly spaced, matched ones first."""
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
@@ -72,10 +76,11 @@ def points_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY
     assignment = prediction.assignment if prediction.rematched is None else prediction.rematched
     assigned3d = unknown if assignment is None else _host(assignment.argmax(-2))
     poses = {name: (_host(pose.rotation), _host(pose.translation)) for name, pose in prediction.poses.items()}
-    truth = None
+    truth, errors = None, [180.0] * len(batch)
     if batch.rotation is not None and batch.translation is not None:
         truth = (_host(batch.rotation), _host(batch.translation))
-    errors = _first_errors(prediction, batch)
+        for pose in list(prediction.poses.values())[:1]:
+            errors = rotation_error(pose.rotation, batch.rotation).where(pose.found, 180.0).tolist()
     problems = []
     for i in range(len(batch)):
         problem = ProblemPoints(
@@ -156,10 +161,8 @@ def write_points(folder: Path | str, problems: Iterable[ProblemPoints]) -> None:
         parts = [problem.numbers()[name == "ids3d"] if name in IDS else getattr(problem, name) for problem in ordered]
         arrays[name] = np.concatenate([np.empty((0, *width), kind), *parts]).astype(kind)
     arrays |= {f"estimate.{name}": _stacked([problem.estimates[name] for problem in ordered]) for name in names}
-    content = io.BytesIO()
-    np.savez(content, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
-    with written_whole(Path(folder) / FILE) as temporary:
-        temporary.write_bytes(content.getvalue())
+    with written_whole(Path(folder) / FILE) as temporary, temporary.open("wb") as file:
+        np.savez(file, allow_pickle=False, **arrays)  # type: ignore[arg-type, unused-ignore]
 
 
 def read_points(folder: Path | str) -> tuple[ProblemPoints, ...]:
@@ -206,14 +209,6 @@ def _split(pose: Array) -> tuple[Array, Array]:
 
 def _host(values: Tensor) -> Array:
     return values.detach().cpu().numpy()
-
-
-def _first_errors(prediction: Prediction, batch: Batch) -> list[float]:
-    pose = next(iter(prediction.poses.values()), None)
-    if pose is None or batch.rotation is None:
-        return [180.0] * len(batch)
-    error = rotation_error(pose.rotation, batch.rotation)
-    return [float(value) for value in error.where(pose.found, 180.0).tolist()]
 
 
 def _first_then_rest(first: Array, most: int) -> Array:

@@ -18,7 +18,7 @@ import torch
 from scipy.spatial import cKDTree
 
 from bpnp import __version__
-from bpnp.files import written_whole
+from bpnp.files import write_text, written_whole
 from bpnp.geometry import project, transform
 from bpnp.metrics import PoseErrors, RecallThresholds, pose_errors, pose_quartiles, pose_recalls
 from bpnp.types import Batch, Pose, Prediction
@@ -81,7 +81,6 @@ class ProblemRow:
 
 
 TYPES: dict[str, Any] = {field.name: field.type for field in fields(ProblemRow)}
-PARSE: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
 
 
 @dataclass(frozen=True)
@@ -130,20 +129,14 @@ def rows_from(
     indices, share = batch.index.tolist(), seconds / len(batch)
     rows = []
     for estimate, pose in prediction.poses.items():
-        errors, stats = pose_errors(pose, batch), pose.stats
-        columns = (errors.rotation_deg, errors.translation, errors.centre, errors.reprojection_deg)
-        numbers = torch.stack([*columns, stats.residual.double()], -1).tolist()
-        states = zip(stats.iterations.tolist(), stats.converged.tolist(), pose.found.tolist(), strict=True)
-        inliers = count_inliers(pose, batch, threshold=inlier_threshold)
-        for i, (iterations, converged, found) in enumerate(states):
-            rotation, translation, centre, reprojection, residual = numbers[i]
-            m, n, known = sizes[i]
-            rows.append(
-                ProblemRow(
-                    indices[i], batch.ids[i], estimate, rotation, translation, centre, reprojection, inliers[i], m, n,
-                    known, iterations, residual, converged, found, share,
-                )
-            )  # fmt: skip
+        known, stats = pose_errors(pose, batch), pose.stats
+        columns = (known.rotation_deg, known.translation, known.centre, known.reprojection_deg)
+        errors, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch, threshold=inlier_threshold)
+        told = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
+        states = zip(*(values.tolist() for values in told), strict=True)
+        for i, state in enumerate(states):
+            values: Any = (indices[i], batch.ids[i], estimate, *errors[i], inliers[i], *sizes[i], *state, share)
+            rows.append(ProblemRow(*values))
     return rows
 
 
@@ -213,28 +206,19 @@ def write_results(
     from pandas import DataFrame
 
     ordered = _ordered(rows)
-    results = Results(
-        rows=ordered,
-        estimates=summarise(ordered, thresholds=thresholds),
-        correspondence_loss=correspondence_loss,
-        settings=plain(dict(settings or {})),
-        bpnp_version=__version__,
-        written=datetime.now(UTC).isoformat(timespec="seconds"),
-    )
+    written = datetime.now(UTC).isoformat(timespec="seconds")
+    estimates = summarise(ordered, thresholds=thresholds)
+    results = Results(ordered, estimates, correspondence_loss, plain(dict(settings or {})), __version__, written)
     summary = {"format": FORMAT, "problems": results.problems} | vars(results)
     del summary["rows"]
     frame = DataFrame(map(astuple, ordered), columns=list(TYPES), dtype=object)
-    # File names that are not UTF-8 reach us, and leave, as surrogates.
-    table = frame.to_csv(index=False, na_rep="nan", lineterminator="\r\n").encode(errors="surrogateescape")
     folder = Path(folder)
     # Old aggregates must not stand beside new rows, should the process end between the two files.
     (folder / SUMMARY).unlink(missing_ok=True)
-    for name, content in (
-        (ROWS, table),
-        (SUMMARY, json.dumps(plain(summary), indent=2, allow_nan=False).encode() + b"\n"),
-    ):
-        with written_whole(folder / name) as temporary:
-            temporary.write_bytes(content)
+    with written_whole(folder / ROWS) as temporary:
+        # File names that are not UTF-8 reach us, and leave, as surrogates.
+        frame.to_csv(temporary, index=False, na_rep="nan", lineterminator="\r\n", errors="surrogateescape")
+    write_text(folder / SUMMARY, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
     return results
 
 
@@ -246,26 +230,19 @@ def read_results(folder: Path | str) -> Results:
         summary = dict(json.loads(path.read_bytes()))
     except (ValueError, TypeError) as error:
         raise ValueError(f"expected JSON in {path}, got {error}") from error
-    if summary.get("format") != FORMAT:
-        wrong = f"expected results of format {FORMAT} in {path}, got {summary.get('format')!r}"
+    if (version := summary.pop("format", None)) != FORMAT:
+        wrong = f"expected results of format {FORMAT} in {path}, got {version!r}"
         raise ValueError(f"{wrong}; try `bpnp test` again, or the bpnp that wrote them")
     rows = _read_rows(_existing(Path(folder) / ROWS))
     try:
-        loss, problems = summary["correspondence_loss"], summary["problems"]
-        results = Results(
-            rows=rows,
-            estimates={name: {k: float(v) for k, v in values.items()} for name, values in summary["estimates"].items()},
-            correspondence_loss=None if loss is None else float(loss),
-            settings=summary["settings"],
-            bpnp_version=summary["bpnp_version"],
-            written=summary["written"],
-        )
+        count, loss = summary.pop("problems"), summary.pop("correspondence_loss")
+        loss = None if loss is None else float(loss)
+        estimates = {name: {k: float(v) for k, v in values.items()} for name, values in summary["estimates"].items()}
+        results = Results(rows, correspondence_loss=loss, **summary | {"estimates": estimates})
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"expected what `bpnp test` writes in {path}, got {type(error).__name__}: {error}") from error
-    if len(rows) != problems * len(results.estimates):
-        raise ValueError(
-            f"expected {problems} x {len(results.estimates)} rows in {ROWS}, as {path} says, got {len(rows)}"
-        )
+    if len(rows) != count * len(estimates):
+        raise ValueError(f"expected {count} x {len(estimates)} rows in {ROWS}, as {path} says, got {len(rows)}")
     return results
 
 
@@ -290,18 +267,21 @@ def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     from pandas import read_csv
 
     try:
-        frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
-        missing = [name for name in TYPES if name not in frame]
-        if missing:
-            raise ValueError(f"no column {missing[0]!r} among {', '.join(frame)}")
-        if frame.isna().any(axis=None):
-            raise ValueError(f"too few columns in row {int(frame.isna().any(axis=1).argmax()) + 1}")
-        columns = [[PARSE[kind](text) for text in frame[name]] for name, kind in TYPES.items()]
-    except (ValueError, KeyError) as error:
+        frame = read_csv(
+            path,
+            dtype=TYPES | {name: object for name, kind in TYPES.items() if kind is str},
+            na_values={name: ["nan"] for name, kind in TYPES.items() if kind is float},
+            keep_default_na=False,
+            encoding_errors="surrogateescape",
+            index_col=False,
+            usecols=list(TYPES),
+            float_precision="round_trip",
+        )
+    except ValueError as error:
         raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
     if frame.empty:
         raise ValueError(f"expected at least one row in {path}, got none")
-    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
+    return tuple(ProblemRow(*values) for values in frame[list(TYPES)].itertuples(index=False, name=None))
 
 
 def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:

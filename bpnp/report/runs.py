@@ -115,15 +115,19 @@ def trained_only(paths: Sequence[Path | str]) -> dict[str, TrainingLog]:
 def read_training_log(results: Path | str) -> TrainingLog | None:
     """The log of the run that a results folder belongs to: in `logs` or `lightning_logs` of it or of its parent.
 
-    Of several versions the newest that trained counts, with those before it that it continues (a resumed run); of a
-    training too short to log its loss, what was validated. None if nothing was trained. Raises ValueError that names
-    the file if a value is no number.
+    Of several versions the newest that trained counts, with the steps before it of those that it continues (a resumed
+    run); of a training too short to log its loss, what was validated. None if nothing was trained. Raises ValueError
+    that names the file if a value is no number.
     """
     folder = Path(results).absolute()
     for place in (folder, folder.parent):
         files = [file for name in LOGS for file in (place / name).glob("version_*/metrics.csv")]
-        logs = [(file, _read_log(file)) for file in sorted(files, key=_version)]
-        trained = [log for log in logs if LOSS in log[1]] or [log for log in logs if _steps(log[1])]
+        logs = {file: _read_log(file) for file in sorted(files, key=_version, reverse=True)}
+        trained = {file: log for file, log in logs.items() if LOSS in log} or {
+            file: log
+            for file, log in logs.items()
+            if log.index.max() > 0  # untrained weights are at step 0
+        }
         if trained:
             return _joined(trained)
     return None
@@ -140,32 +144,29 @@ def _read_log(file: Path) -> "DataFrame":
         raise ValueError(f"expected numbers in {file}, and a column 'step', got {error}") from error
 
 
-def _steps(log: "DataFrame") -> list[int]:
-    """The steps that were trained, as far as they were logged; untrained weights are at step 0."""
-    logged = log[LOSS].dropna().index if LOSS in log else log.index[log.index > 0]
-    return [int(step) for step in logged]
-
-
-def _joined(logs: "list[tuple[Path, DataFrame]]") -> TrainingLog:
-    """The newest log, and of older ones that started before it the steps up to its start."""
-    file, log = logs[-1]
-    files = [file]
-    for file, older in reversed(logs[:-1]):
-        start = _steps(log)[0]
-        if _steps(older)[0] < start:
+def _joined(logs: "dict[Path, DataFrame]") -> TrainingLog:
+    """The newest log, which is the first, and of others that started before it the steps up to its start."""
+    (newest, log), *older = logs.items()
+    files = [newest]
+    for file, before in older:
+        if (start := _start(log)) > _start(before):
             files.insert(0, file)
-            log = log.combine_first(older[older.index < start])
+            log = log.combine_first(before[before.index < start])
     marks = [log[name].dropna().index[0] for name in SWITCH_MARKS if name in log]
     curves = {name: _thinned(log[name].dropna()) for name in CURVES if name in log}
     return TrainingLog(curves, min(map(int, marks), default=None), tuple(files))
 
 
+def _start(log: "DataFrame") -> int:
+    """The first step that was trained, as far as it was logged."""
+    return int((log[LOSS].dropna().index if LOSS in log else log.index[log.index > 0])[0])
+
+
 def _thinned(curve: "Series[float]") -> tuple[list[float], list[float]]:
     """Steps and values in order; of long curves the means of equal parts."""
-    points = np.column_stack([curve.index, curve])
-    size = math.ceil(len(points) / MOST_POINTS)
-    steps, values = np.transpose([part.mean(0) for part in np.split(points, range(size, len(points), size))]).tolist()
-    return steps, values
+    parts = np.arange(len(curve)) // math.ceil(len(curve) / MOST_POINTS)
+    means = curve.reset_index().groupby(parts).mean()
+    return means.iloc[:, 0].tolist(), means.iloc[:, 1].tolist()
 
 
 def _version(path: Path) -> tuple[float, str]:

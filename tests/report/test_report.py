@@ -193,10 +193,13 @@ def _edit(name: str, old: str, new: str) -> Callable[[Path], object]:
         (_edit("summary.json", '"settings"', '"things"'), "expected what `bpnp test` writes in .*KeyError: 'settings'"),
         (lambda folder: (folder / "summary.json").write_text('{"format": 2, '), r"expected JSON in .*summary\.json"),
         (lambda folder: (folder / "summary.json").write_text("[]"), "expected results of format 2 in .*, got None"),
-        (_edit("problems.csv", "inliers", "inlyers"), r"problems\.csv, got no column 'inliers' among index"),
-        (_edit("problems.csv", "True", "maybe"), r"expected the rows of a test in .*problems\.csv, got 'maybe'"),
+        (_edit("problems.csv", "inliers", "inlyers"), r"problems\.csv, got .*not found: \['inliers'\]"),
+        (
+            _edit("problems.csv", "True", "maybe"),
+            r"expected the rows of a test in .*problems\.csv, got cannot safely convert .*bool",
+        ),
         (_edit("problems.csv", ",10,12,", ",10,x,"), r"expected the rows of a test in .*problems\.csv, got .*'x'"),
-        (_edit("problems.csv", ",10,12,", ",10,"), r"problems\.csv, got invalid literal"),
+        (_edit("problems.csv", ",10,12,", ",10,"), r"problems\.csv, got cannot safely convert"),
         (lambda folder: (folder / "problems.csv").write_text(""), r"problems\.csv, got No columns"),
         (
             lambda folder: (folder / "problems.csv").write_bytes(

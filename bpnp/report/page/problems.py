@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.points import FEW, Array, ProblemPoints, spread_key, thin
+from bpnp.report.points import FEW, Array, ProblemPoints, spread_key, thin, utf8
 from bpnp.report.results import CAUSES, ProblemRow, Results
 from bpnp.report.runs import lines_of
 
@@ -27,8 +27,8 @@ def compressed(text: str) -> str:
 
 
 def shown_id(id: str) -> str:
-    """A problem's name with replacements for bytes that are no UTF-8."""
-    return id.encode("utf-8", "replace").decode() or "(no name)"
+    """A problem's name as the page has it."""
+    return utf8(id) or "(no name)"
 
 
 def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:

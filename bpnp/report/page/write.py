@@ -20,7 +20,7 @@ from bpnp.report.page.charts import CONFIG, SIZES, chart_text, figures, look, pa
 from bpnp.report.page.problems import compressed, page_numbers, page_points, shown_id
 from bpnp.report.palette import DASHES, INKS
 from bpnp.report.photos import PhotoFinder, page_photos
-from bpnp.report.points import read_points
+from bpnp.report.points import read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
 from bpnp.report.runs import Line, TrainingLog, lines_of, named_runs, read_training_log, trained_only
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
@@ -171,8 +171,7 @@ def _asset(name: str) -> str:
 
 
 def _utf8(value: Any) -> Any:
-    plain = isinstance(value, str) and not isinstance(value, Markup)
-    return value.encode("utf-8", "replace").decode() if plain else value
+    return utf8(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
