@@ -1,21 +1,19 @@
 """`bpnp localize`: where photos were taken, in a map of the place."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
 from bpnp.commands.output import console, progress, say
-from bpnp.files import claimed, interruptions_later
+from bpnp.files import claimed
 
 if TYPE_CHECKING:
-    from bpnp.maps.many_photos import PhotoTask, SolutionFolder
+    from bpnp.maps.many_photos import Outcome, SolutionFolder
     from bpnp.maps.scene_map import SceneMap
-    from bpnp.solving.solution import Solution
 
-CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 CAPTION = (
     "error px: mean distance between the keypoints of the matches and their points. log10 false: how many poses would "
     "fit as well by chance, as a power of ten; smaller is surer."
@@ -62,7 +60,7 @@ def localize(
         seed: of the search.
     """
     from bpnp.datamodules.colmap.model_files import model_format
-    from bpnp.maps.many_photos import SolutionFolder, content_of_map, read_views
+    from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
     from bpnp.solving.arguments import source_from
@@ -74,105 +72,48 @@ def localize(
     if keypoints is not None and not keypoints.is_file():
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would
-    options: dict[str, Any] = {"solver": solver, "seed": seed, "time_limit": time_limit, "keypoints": keypoints}
-    options |= {"views": None if views is None else read_views(views), "leave_one_out": leave_one_out}
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
-    options |= {"camera": None if camera is None else _camera(camera, map, scene), "map_content": content_of_map(map)}
-    with claimed(output):
-        run = _Run(scene, options, SolutionFolder(output, options["map_content"]), pictures=not no_pictures)
-        run.localize(files, _attempts(cluster))
-    run.report(files)
+    with claimed(output), progress() as shown:
+        folder, bar = SolutionFolder(output, content_of_map(map)), shown.add_task("localizing", total=len(files))
+        outcome = localize_photos(
+            scene,
+            files,
+            folder,
+            attempts=_attempts(cluster),
+            pictures=not no_pictures,
+            done=lambda name: shown.update(bar, description=f"localized {name}", advance=1),
+            camera=None if camera is None else _camera(camera, map, scene),
+            views=None if views is None else read_views(views),
+            keypoints=keypoints,
+            leave_one_out=leave_one_out,
+            solver=solver,
+            seed=seed,
+            time_limit=time_limit,
+        )
+    _report(files, folder, outcome, pictures=not no_pictures)
 
 
-class _Run:
-    """The photos of a call: which were kept or are solved again, and which could not be tried, and why."""
-
-    def __init__(self, scene: "SceneMap", options: dict[str, Any], folder: "SolutionFolder", *, pictures: bool) -> None:
-        self.scene, self.options, self.folder, self.pictures = scene, options, folder, pictures
-        self.kept: list[str] = []
-        self.again: dict[str, str] = {}
-        self.errors: dict[str, str] = {}
-
-    def localize(self, files: Mapping[str, Path], attempts: Callable[..., Any]) -> None:
-        with progress() as shown:
-            bar = shown.add_task("localizing", total=len(files))
-
-            def advance(name: str) -> None:
-                shown.update(bar, description=f"localized {name}", advance=1)
-
-            try:
-                for task, solution in attempts(self.scene, self.tasks(files, advance)):
-                    try:
-                        with interruptions_later():
-                            self.keep(task, solution)
-                    except (ValueError, OSError) as error:
-                        self.fail(task.name, task.photo, error)
-                    advance(task.name)
-            finally:
-                self.folder.write()
-
-    def tasks(self, files: Mapping[str, Path], advance: Callable[[str], None]) -> Iterator["PhotoTask"]:
-        """What is not solved yet, each made ready when its turn comes: a photo may be replaced in the meantime."""
-        from bpnp.maps.many_photos import photo_task
-
-        for name, photo in files.items():
-            try:
-                task = photo_task(self.scene, name, photo, **self.options)
-            except (ValueError, OSError) as error:
-                self.fail(name, photo, error)
-                advance(name)
-                continue
-            changes = self.folder.changes(task)
-            if changes is None or changes:
-                if changes:
-                    self.again[name] = ", ".join(dict.fromkeys(CHANGES.get(key, "other options") for key in changes))
-                yield task
-            else:
-                self.kept.append(name)
-                advance(name)
-
-    def keep(self, task: "PhotoTask", solution: "Solution | str") -> None:
-        """Write a solution and its picture. Raises ValueError with the reason if there is none."""
-        from bpnp.report.figures import save_figure
-        from bpnp.report.photos import read_photo
-        from bpnp.solving.pictures import solution_picture
-
-        if isinstance(solution, str):
-            raise ValueError(solution)
-        picture = self.folder.picture(task.name)
-        picture.unlink(missing_ok=True)
-        if self.pictures:
-            title = f"{task.name}: {solution.view}"
-            save_figure(solution_picture(solution, title=title, photo=read_photo(task.photo)), picture)
-        self.folder.keep(task, solution)
-
-    def fail(self, name: str, photo: Path, error: Exception) -> None:
-        self.errors[name] = str(error)
-        self.folder.forget_replaced(name, photo)
-
-    def report(self, files: Mapping[str, Path]) -> None:
-        """Say what was found, kept and written. Raises ValueError if some photos could not be tried."""
-        folder, out = self.folder, console()
-        records = {name: folder.records[name] for name in files if name in folder.records and name not in self.errors}
-        if records:
-            out.print(_table(records))
-            cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
-            say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
-        if self.kept:
-            say(
-                f"kept {len(self.kept)} of {len(files)} photos, solved before with the same content and options", to=out
-            )
-        for name, change in self.again.items():
-            say(f"solved again, with {change}: {name}", to=out)
-        if others := folder.of_other_maps():
-            say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
-        for name, reason in self.errors.items():
-            say(f"{name}: {reason}", to=out)
-        written = ", solutions/, pictures/" if self.pictures else ", solutions/"
-        say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)
-        if self.errors:
-            name, reason = next(iter(self.errors.items()))
-            raise ValueError(f"{len(self.errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
+def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outcome", *, pictures: bool) -> None:
+    """Say what was found, kept and written. Raises ValueError if some photos could not be tried."""
+    out, errors = console(), outcome.errors
+    records = {name: folder.records[name] for name in files if name in folder.records and name not in errors}
+    if records:
+        out.print(_table(records))
+        cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
+        say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
+    if count := len(outcome.kept):
+        say(f"kept {count} of {len(files)} photos, solved before with the same content and options", to=out)
+    for name, change in outcome.again.items():
+        say(f"solved again, with {change}: {name}", to=out)
+    if others := folder.of_other_maps():
+        say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
+    for name, reason in errors.items():
+        say(f"{name}: {reason}", to=out)
+    written = ", solutions/, pictures/" if pictures else ", solutions/"
+    say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)
+    if errors:
+        name, reason = next(iter(errors.items()))
+        raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
 
 
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:

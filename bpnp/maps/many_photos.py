@@ -7,7 +7,7 @@ was replaced under its name is another one.
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,12 +16,13 @@ import numpy as np
 
 from bpnp.cameras import camera_from, plain_camera
 from bpnp.datamodules.colmap.model_files import FILES, model_format
-from bpnp.files import fingerprint, write_text
+from bpnp.files import fingerprint, interruptions_later, write_text
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import SceneMap
-from bpnp.solving.pictures import pose_text
+from bpnp.solving.pictures import pose_text, save_over_photo
 from bpnp.solving.solution import Solution
 
+CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
 MADE_WITH = "made_with"  # beside the fields of a solution in its file
 REPORTED: tuple[str, ...] = ("verdict", "reason", "view", "inlier_count", "reprojection_error", "inlier_threshold")
 REPORTED += ("log10_false_alarms", "seconds", "rotation", "translation", "camera", MADE_WITH)
@@ -101,6 +102,66 @@ def attempts(scene: SceneMap, tasks: Iterable[PhotoTask]) -> Iterator[Attempt]:
     return ((task, attempt(scene, task)) for task in tasks)
 
 
+@dataclass
+class Outcome:
+    """Of the photos of a call: those kept as they were, why others were solved again, and why some were not tried."""
+
+    kept: list[str] = field(default_factory=list)
+    again: dict[str, str] = field(default_factory=dict)
+    errors: dict[str, str] = field(default_factory=dict)
+
+
+def localize_photos(
+    scene: SceneMap,
+    files: Mapping[str, Path],
+    folder: "SolutionFolder",
+    *,
+    attempts: Callable[[SceneMap, Iterable[PhotoTask]], Iterable[Attempt]] = attempts,
+    pictures: bool = True,
+    done: Callable[[str], None] = lambda name: None,
+    **options: Any,
+) -> Outcome:
+    """Localize photos, by name, into a folder; those that were solved there with the same content and options are kept.
+
+    attempts: what localises them, here or on a cluster. done: called with the name of each photo. options: as for
+    `photo_task`. Each task is made when its turn comes: a photo may be replaced in the meantime.
+    """
+    outcome = Outcome()
+
+    def failed(name: str, photo: Path, error: Exception) -> None:
+        outcome.errors[name] = str(error)
+        folder.forget_replaced(name, photo)
+        done(name)
+
+    def tasks() -> Iterator[PhotoTask]:
+        for name, photo in files.items():
+            try:
+                task = photo_task(scene, name, photo, map_content=folder.map_content, **options)
+            except (ValueError, OSError) as error:
+                failed(name, photo, error)
+                continue
+            changes = folder.changes(task)
+            if changes == []:
+                outcome.kept.append(name)
+                done(name)
+                continue
+            if changes:
+                outcome.again[name] = ", ".join(dict.fromkeys(CHANGES.get(key, "other options") for key in changes))
+            yield task
+
+    try:
+        for task, solution in attempts(scene, tasks()):
+            try:
+                with interruptions_later():
+                    folder.keep(task, solution, picture=pictures)
+                done(task.name)
+            except (ValueError, OSError) as error:
+                failed(task.name, task.photo, error)
+    finally:
+        folder.write()
+    return outcome
+
+
 def read_views(path: str | Path) -> dict[str, list[str]]:
     """The views to try for each photo, from a text file of lines `photo view`, as hloc's retrieval writes its pairs.
 
@@ -156,8 +217,14 @@ class SolutionFolder:
         before = self.records[task.name][MADE_WITH]
         return [key for key, value in task.made_with.items() if before.get(key) != value]
 
-    def keep(self, task: PhotoTask, solution: Solution) -> None:
-        """Write the solution of a photo, and what it was made with."""
+    def keep(self, task: PhotoTask, solution: Solution | str, *, picture: bool = False) -> None:
+        """Write the solution of a photo, what it was made with, and its picture. Raises ValueError with the reason if
+        there is none."""
+        if isinstance(solution, str):
+            raise ValueError(solution)
+        self.picture(task.name).unlink(missing_ok=True)
+        if picture:
+            save_over_photo(solution, task.photo, self.picture(task.name), title=f"{task.name}: {solution.view}")
         text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
         write_text(self._file("solutions", task.name, "json"), text + "\n")
         self._record(task.name, text)

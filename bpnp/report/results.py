@@ -81,6 +81,7 @@ class ProblemRow:
 
 
 TYPES: dict[str, Any] = {field.name: field.type for field in fields(ProblemRow)}
+PARSE: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
 
 
 @dataclass(frozen=True)
@@ -267,21 +268,18 @@ def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     from pandas import read_csv
 
     try:
-        frame = read_csv(
-            path,
-            dtype=TYPES | {name: object for name, kind in TYPES.items() if kind is str},
-            na_values={name: ["nan"] for name, kind in TYPES.items() if kind is float},
-            keep_default_na=False,
-            encoding_errors="surrogateescape",
-            index_col=False,
-            usecols=list(TYPES),
-            float_precision="round_trip",
-        )
-    except ValueError as error:
+        frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
+        missing = [name for name in TYPES if name not in frame]
+        if missing:
+            raise ValueError(f"no column {missing[0]!r} among {', '.join(frame)}")
+        if frame.isna().any(axis=None):
+            raise ValueError(f"too few columns in row {int(frame.isna().any(axis=1).argmax()) + 1}")
+        columns = [[PARSE[kind](text) for text in frame[name]] for name, kind in TYPES.items()]
+    except (ValueError, KeyError) as error:
         raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
     if frame.empty:
         raise ValueError(f"expected at least one row in {path}, got none")
-    return tuple(ProblemRow(*values) for values in frame[list(TYPES)].itertuples(index=False, name=None))
+    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
 
 
 def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
