@@ -1,5 +1,7 @@
 """`solve(..., at_infinity=True)`: planted rotations, laws, what is not believed, and what it says of bad input."""
 
+import math
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from bpnp.cameras import camera_from
 
 Array = NDArray[np.float64]
 SIZE = 2000.0  # pixels of a side
+look = partial(solve, at_infinity=True, time_limit=math.inf)
 
 
 def sphere(rng: np.random.Generator, count: int) -> Array:
@@ -63,7 +66,7 @@ def turned(one: Array, other: Array) -> float:
 def test_a_planted_rotation(field: float, count: int) -> None:
     for seed in range(3):
         image, directions, rotation, star = sky(seed, field=field, count=count)
-        solution = solve(image, directions, lens(field), at_infinity=True, seed=seed)
+        solution = look(image, directions, lens(field), seed=seed)
         assert solution.verdict == "confident", solution.reason
         assert turned(solution.rotation, rotation) < 0.05
         assert solution.translation.tolist() == [0, 0, 0]
@@ -79,7 +82,7 @@ def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
     image, directions, rotation, _ = sky(0)
     bearings = camera_from(lens(40.0)).bearings(image)
     for points in (bearings, bearings[:, :2] / bearings[:, 2:]):
-        solution = solve(points, directions, at_infinity=True)
+        solution = look(points, directions)
         assert solution.verdict == "confident"
         assert turned(solution.rotation, rotation) < 0.02
 
@@ -87,7 +90,7 @@ def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
 def test_the_answer_turns_with_the_catalogue() -> None:
     image, directions, _, _ = sky(1)
     turn = Rotation.random(random_state=3).as_matrix()
-    one, other = (solve(image, d, lens(40.0), at_infinity=True) for d in (directions, directions @ turn.T))
+    one, other = (look(image, d, lens(40.0)) for d in (directions, directions @ turn.T))
     assert np.allclose(other.rotation, one.rotation @ turn.T, atol=1e-7)
     assert np.array_equal(one.matches, other.matches)
     assert other.log10_false_alarms == pytest.approx(one.log10_false_alarms, abs=1e-3)
@@ -96,14 +99,14 @@ def test_the_answer_turns_with_the_catalogue() -> None:
 def test_order_and_seed_say_nothing() -> None:
     image, directions, _, _ = sky(2)
     before = image.copy(), directions.copy()
-    one = solve(image, directions, lens(40.0), at_infinity=True)
-    again = solve(image, directions, lens(40.0), at_infinity=True)
+    one = look(image, directions, lens(40.0))
+    again = look(image, directions, lens(40.0))
     assert np.array_equal(one.rotation, again.rotation)
     assert np.array_equal(image, before[0])
     assert np.array_equal(directions, before[1])
     rng = np.random.default_rng(0)
     rows, columns = rng.permutation(len(image)), rng.permutation(len(directions))
-    other = solve(image[rows], directions[columns], lens(40.0), at_infinity=True, seed=5)
+    other = look(image[rows], directions[columns], lens(40.0), seed=5)
     assert np.allclose(one.rotation, other.rotation, atol=1e-7)
     assert {(rows[i], columns[j]) for i, j in other.matches} == set(map(tuple, one.matches))
 
@@ -114,7 +117,7 @@ def test_what_is_no_sky_is_not_believed() -> None:
         image, directions, _, _ = sky(seed, count=300)
         noise = np.random.default_rng(seed).uniform(0, SIZE, image.shape)
         for points in (noise, [SIZE, 0] + image * [-1, 1]):
-            solution = solve(points, directions, lens(40.0), at_infinity=True)
+            solution = look(points, directions, lens(40.0))
             assert solution.verdict != "confident"
             assert solution.log10_false_alarms > -2
 
@@ -123,7 +126,7 @@ def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
     for seed in range(3):
         image, directions, rotation, star = sky(seed, count=300)
         part, turn = directions[star[star >= 0]], Rotation.random(random_state=seed).as_matrix()
-        solution = solve(image, np.concatenate([part, part @ turn.T]), lens(40.0), at_infinity=True)
+        solution = look(image, np.concatenate([part, part @ turn.T]), lens(40.0))
         assert solution.verdict == "ambiguous"
         assert "another rotation" in solution.reason
         either = [
@@ -142,13 +145,13 @@ def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float) -> N
             wrong = (
                 (factor * focal, *rest) if model == "SIMPLE_PINHOLE" else (factor * focal, factor * rest[0], *rest[1:])
             )
-            solution = solve(image, directions, (model, wrong), at_infinity=True)
+            solution = look(image, directions, (model, wrong))
             assert solution.verdict != "confident" or turned(solution.rotation, rotation) < 0.1
 
 
 def test_rougher_points_are_found_with_their_own_noise() -> None:
     image, directions, rotation, _ = sky(4, noise=1.5)
-    solution = solve(image, directions, lens(40.0), at_infinity=True)
+    solution = look(image, directions, lens(40.0))
     assert solution.verdict == "confident"
     assert turned(solution.rotation, rotation) < 0.3
     assert 3 < solution.inlier_threshold < 6  # three times the noise
@@ -158,7 +161,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
     sigmas = []
     for seed in range(40):
         image, directions, rotation, _ = sky(seed, field=30.0, count=400)
-        solution = solve(image, directions, lens(30.0), at_infinity=True)
+        solution = look(image, directions, lens(30.0))
         if solution.verdict != "confident":
             continue
         error = Rotation.from_matrix(rotation @ solution.rotation.T).as_rotvec()
@@ -173,7 +176,7 @@ def test_the_covariance_is_that_of_the_errors() -> None:
 def test_points_with_the_largest_scores_are_tried_first() -> None:
     image, directions, _, star = sky(5, false=0.6)
     good = np.where(star >= 0, 1.0, 0.1)
-    first, last = (solve(image, directions, lens(40.0), scores2d=s, at_infinity=True) for s in (good, 1.1 - good))
+    first, last = (look(image, directions, lens(40.0), scores2d=s) for s in (good, 1.1 - good))
     assert first.stats.iterations < last.stats.iterations
 
 
@@ -181,7 +184,7 @@ def test_matches_lie_within_the_threshold() -> None:
     image, directions, _, star = sky(6)
     counts = []
     for threshold in (0.3, 2.0):
-        solution = solve(image, directions, lens(40.0), inlier_threshold=threshold, at_infinity=True)
+        solution = look(image, directions, lens(40.0), inlier_threshold=threshold)
         assert solution.inlier_threshold == threshold
         counts.append(solution.inlier_count)
     assert counts[0] < counts[1] == (star >= 0).sum()
@@ -189,7 +192,7 @@ def test_matches_lie_within_the_threshold() -> None:
 
 def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
     image, directions, _, _ = sky(0, field=180.0, count=300)
-    solution = solve(image, directions, lens(180.0), at_infinity=True)
+    solution = look(image, directions, lens(180.0))
     read = Solution.from_json(solution.to_json())
     assert np.array_equal(read.covariance, solution.covariance)
     assert read.rotation_std_deg == solution.rotation_std_deg
@@ -199,7 +202,7 @@ def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
 
 def test_no_time_ends_at_once() -> None:
     image, directions, _, _ = sky(0)
-    assert solve(image, directions, lens(40.0), at_infinity=True, time_limit=1e-6).stats.iterations <= 3
+    assert look(image, directions, lens(40.0), time_limit=1e-6).stats.iterations <= 3
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from bpnp.search.kernels.neighbours import HashedPoints
 Array = NDArray[np.float64]
 DENSITIES = (8, 32)  # neighbours from whose distance the density around a direction is taken; the larger one counts
 KEPT = 4  # catalogues whose pairs are remembered: a camera looks at one sky again and again
-ANGLES = np.geomspace(1e-3, 2.0, 200)  # chords among which the longest one of the table is chosen
+SAMPLED = 200  # directions from which it is estimated up to which angle there are so many pairs
 
 
 class Catalogue(NamedTuple):
@@ -47,8 +47,9 @@ def _catalogue(content: bytes, most_pairs: int) -> Catalogue:
         k = min(k, count - 1)
         distance = np.maximum(tree.query(directions, [k + 1])[0][:, 0], 1e-9)
         density = np.maximum(density, k / (math.pi * distance**2))
-    within = (tree.count_neighbors(tree, ANGLES) - count) // 2
-    widest = float(ANGLES[max(int(np.searchsorted(within, most_pairs)) - 1, 0)])
+    some = directions[:: max(count // SAMPLED, 1)]
+    chords = np.sqrt(np.maximum(2 - 2 * some @ directions.T, 0.0))
+    widest = float(np.quantile(chords, min(2 * most_pairs / count**2, 1.0)))
     pairs = tree.query_pairs(widest, output_type="ndarray")
     pairs = pairs[np.lexsort(pairs.T[::-1])]
     chord = np.linalg.norm(directions[pairs[:, 0]] - directions[pairs[:, 1]], axis=-1)

@@ -35,25 +35,24 @@ class Pairs(NamedTuple):
 
 class Patch(NamedTuple):
     """Image points around a pair (k, 3) in the frame of its sum and difference, and the squared chord (k,) within which
-    each has its match; the focal length of this frame, where it is unknown."""
+    each has its match."""
 
     points: Array
     squared: Array
 
 
 class Image(NamedTuple):
-    """Image points: rays (m, 3) with a focal length of one, and the angle of a pixel (m,) there, radians."""
+    """Image points: unit bearings (m, 3), and the angle of a pixel at each (m,), radians."""
 
-    rays: Array
+    bearings: Array
     pixel: Array
 
 
 class Fit(NamedTuple):
-    """A rotation (3, 3), logarithm of the focal length (1,), normal matrix (4, 4) and matches of the m points: place of
-    the direction, -1 for none, and squared chord in squared pixels."""
+    """A rotation (3, 3), normal matrix (3, 3) and matches of the m points: place of the direction, -1 for none, and
+    squared chord in squared pixels."""
 
     rotation: Array
-    log_focal: Array
     normal: Array
     match: NDArray[np.int64]
     squared: Array
@@ -133,60 +132,36 @@ def _invert(matrix: Any) -> None:
                     matrix[r, k] -= factor * matrix[c, k]
 
 
-@part
-def _derivative(image: Any, i: int, focal: float, free: bool, jacobian: Any) -> Any:
-    """Bearing of point i; its derivative (3, 4) by a turn against the scene's, and by the logarithm of the
-    focal length if that is free."""
-    x, y, z = image.rays[i, 0], image.rays[i, 1], image.rays[i, 2] * focal
-    scale = 1 / math.sqrt(x * x + y * y + z * z)
-    x, y, z = scale * x, scale * y, scale * z
-    jacobian[0, 0] = jacobian[1, 1] = jacobian[2, 2] = 0.0
-    jacobian[0, 1], jacobian[1, 0] = -z, z
-    jacobian[0, 2], jacobian[2, 0] = y, -y
-    jacobian[1, 2], jacobian[2, 1] = -x, x
-    if free:
-        jacobian[0, 3], jacobian[1, 3], jacobian[2, 3] = -x * z * z, -y * z * z, z - z * z * z
-    return x, y, z
-
-
 @compiled
-def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, free: bool, result: Any, scratch: Any) -> float:
+def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: Any, scratch: Any) -> float:
     """Gauss-Newton steps on the nearest directions within `reach` pixels, and as much more as the fit is uncertain.
 
-    chosen (k,): the image points that take part. free: whether the focal length is fitted. result: `Fit`, in place; its
-    normal matrix is that of what is known before. scratch (9, 4). Returns the nats by which the matches are likelier
-    than by chance.
+    chosen (k,): the image points that take part. result: `Fit`, in place; its normal matrix is that of what is known
+    before. scratch (4, 3). Returns the nats by which the matches are likelier than by chance.
+
+    For the turn w of a direction v seen at f, (I - f f^T) summed is the normal matrix and v x f the gradient.
     """
-    covariance, jacobian, gradient = scratch[:4], scratch[4:7], scratch[7]
-    for c in range(3):
-        jacobian[c, 3] = 0.0
+    covariance, step, turned, normal = scratch[:3], scratch[3], result.rotation, result.normal
     total = 0.0
     for _ in range(rounds):
-        focal = math.exp(result.log_focal[0])
-        for r in range(4):
-            gradient[r] = 0.0
-            for c in range(4):
-                covariance[r, c] = result.normal[r, c]
-                result.normal[r, c] = 0.0
-            covariance[r, r] *= 1 + 1e-9
+        for r in range(3):
+            step[r] = 0.0
+            for c in range(3):
+                covariance[r, c] = normal[r, c]
+                normal[r, c] = 0.0
+            covariance[r, r] += 1e-9 * covariance[r, r] + 1e-30
         _invert(covariance)
-        total = 0.0
+        trace = covariance[0, 0] + covariance[1, 1] + covariance[2, 2]
+        total = gx = gy = gz = 0.0
         for c in range(len(chosen)):
             i = chosen[c]
-            x, y, z = _derivative(image, i, focal, free, jacobian)
-            variance = 0.0
-            for r in range(4):
-                for c in range(4):
-                    product = 0.0
-                    for e in range(3):
-                        product += jacobian[e, r] * jacobian[e, c]
-                    variance += 0.5 * product * covariance[r, c]
-            pixel = image.pixel[i] / focal
-            squared = reach * reach * (pixel * pixel + variance)
+            x, y, z = image.bearings[i, 0], image.bearings[i, 1], image.bearings[i, 2]
+            cx, cy, cz = rotated(covariance, x, y, z)
+            variance = image.pixel[i] ** 2 + 0.5 * (trace - x * cx - y * cy - z * cz)
+            squared = reach * reach * variance
             result.match[i] = -1
             if squared > sky.reach * sky.reach:
                 continue
-            turned = result.rotation
             place, distance = _nearest(
                 sky,
                 turned[0, 0] * x + turned[1, 0] * y + turned[2, 0] * z,
@@ -201,31 +176,20 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, free: bool
             if likely > CROWDED:
                 continue
             total += LOG_HALF - math.log(likely)
-            result.match[i], result.squared[i] = place, distance / (pixel * pixel)
+            result.match[i], result.squared[i] = place, distance / image.pixel[i] ** 2
             vx, vy, vz = rotated(turned, sky.directions[place, 0], sky.directions[place, 1], sky.directions[place, 2])
-            weight = 1 / (pixel * pixel + variance)
-            for r in range(4):
-                gradient[r] += weight * (
-                    jacobian[0, r] * (vx - x) + jacobian[1, r] * (vy - y) + jacobian[2, r] * (vz - z)
-                )
-                for c in range(4):
-                    product = 0.0
-                    for e in range(3):
-                        product += jacobian[e, r] * jacobian[e, c]
-                    result.normal[r, c] += weight * product
-        if not free:
-            result.normal[3, 3] = 1.0
-        for r in range(4):
-            for c in range(4):
-                covariance[r, c] = result.normal[r, c]
-            covariance[r, r] = covariance[r, r] * (1 + 1e-9) + 1e-30
+            sx, sy, sz = cross(vx, vy, vz, x, y, z)
+            weight = 1 / variance
+            gx, gy, gz = gx + weight * sx, gy + weight * sy, gz + weight * sz
+            for r in range(3):
+                normal[r, r] += weight
+                for e in range(3):
+                    normal[r, e] -= weight * image.bearings[i, r] * image.bearings[i, e]
+        for r in range(3):
+            for c in range(3):
+                covariance[r, c] = normal[r, c]
+            covariance[r, r] += 1e-9 * covariance[r, r] + 1e-30
         _invert(covariance)
-        step = scratch[8]
-        for r in range(4):
-            step[r] = 0.0
-            for c in range(4):
-                step[r] += covariance[r, c] * gradient[c]
-            step[r] = step[r] if abs(step[r]) < 0.5 else 0.0
-        turn(result.rotation, step)
-        result.log_focal[0] += step[3]
+        step[0], step[1], step[2] = rotated(covariance, gx, gy, gz)
+        turn(turned, step)
     return total

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import betaln
 
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence.alternatives import number
@@ -32,10 +33,9 @@ Labels = NDArray[np.int64]
 @dataclass(frozen=True, eq=False)
 class Rotated:
     """A rotation (3, 3), camera = R d, and how it explains m image points: place of each one's direction, -1 for none,
-    squared distance in squared pixels, decades of evidence; log10 of its false alarms; focal length, 1 if known."""
+    squared distance in squared pixels, decades of evidence; log10 of its false alarms."""
 
     rotation: Array
-    focal: float
     match: Labels
     squared: Array
     decades: Array
@@ -59,12 +59,10 @@ class Sight(NamedTuple):
     """One problem at one noise: what is looked for where."""
 
     image: Image
-    bearings: Array
     catalogue: Catalogue
     sky: Sky
     known: Background
     reach: float
-    focal: bool
     sample: Labels
 
 
@@ -80,22 +78,23 @@ class Enumerated:
     used: set[int] = field(default_factory=set)
 
     def log10_missed(self, count: int, least: int, power: float) -> float:
-        """Of the probability that a rotation that explains `least` of `count` points was not met: no pair of which both
-        are explained was tried. Exact for the pairs of the first points, in whatever order the image has them; of pairs
-        apart each point is one of them with its share."""
-        if self.every or self.first > count - least + 1:
+        """Of the probability that a rotation that explains `least` of `count` points was not met, which a tried pair of
+        them does but with 1 - power. The first points have h of them (hypergeometric) and so h (h - 1) / 2 pairs; of
+        pairs apart each point is one of them with its share."""
+        if self.every:
             return -math.inf
-        share = least / count
-        rows, inside = self.first, 0.0
-        if rows:
-            none = _log_choose(count - least, rows)
-            one = math.log(least) + _log_choose(count - least, rows - 1)
-            inside = float(np.logaddexp(none, one) - _log_choose(count, rows)) / math.log(10)
-        return min(inside, self.apart * math.log10(1 - power * share**2))
+        inside = 0.0
+        if self.first:
+            hit = np.arange(self.first + 1)
+            chosen = _log_choose(least, hit) + _log_choose(count - least, self.first - hit)
+            unmet = chosen - _log_choose(count, np.array([self.first])) + hit * (hit - 1) / 2 * math.log(1 - power)
+            inside = float(np.logaddexp.reduce(unmet)) / math.log(10)
+        return min(inside, self.apart * math.log10(1 - power * (least / count) ** 2))
 
 
-def _log_choose(n: int, k: int) -> float:
-    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if 0 <= k <= n else -math.inf
+def _log_choose(n: int, k: Labels) -> Array:
+    inside = np.clip(k, 0, n)
+    return np.where(inside == k, -np.log(n + 1) - betaln(n - inside + 1, inside + 1), -np.inf)
 
 
 def search_rotation(
@@ -139,18 +138,16 @@ def _is_rougher(
 
 
 def _information(image: Image, places: Labels) -> Array:
-    """Normal matrix (4, 4) of a turn by image points of one pixel's noise; of a known focal length."""
-    bearings, weight = image.rays[places], image.pixel[places] ** -2.0
-    result = np.eye(4)
-    result[:3, :3] = weight.sum() * np.eye(3) - (weight[:, None] * bearings).T @ bearings
-    return result
+    """Normal matrix (3, 3) of a turn by image points of one pixel's noise."""
+    bearings, weight = image.bearings[places], image.pixel[places] ** -2.0
+    return np.asarray(weight.sum() * np.eye(3) - (weight[:, None] * bearings).T @ bearings)
 
 
 def _fitted(sight: Sight, rotation: Array, weight: Array, settings: InfinitySettings) -> Rotated:
-    m = len(sight.bearings)
-    state = Fit(rotation.copy(), np.zeros(1), weight, np.empty(m, np.int64), np.full(m, np.inf))
-    rounds, scratch = settings.rounds, np.empty((9, 4))
-    fit(sight.image, np.arange(m), sight.sky, sight.reach, rounds, sight.focal, state, scratch)
+    m = len(sight.image.bearings)
+    state = Fit(rotation.copy(), weight, np.empty(m, np.int64), np.full(m, np.inf))
+    rounds, scratch = settings.rounds, np.empty((4, 3))
+    fit(sight.image, np.arange(m), sight.sky, sight.reach, rounds, state, scratch)
     return _weighed(sight, state)
 
 
@@ -158,9 +155,9 @@ def _sight(image: Image, catalogue: Catalogue, noise: float, seed: int, settings
     """What is looked for at a noise of so many pixels."""
     reach = settings.reach * noise
     cell = settings.cell * reach * float(np.median(image.pixel))
-    background = background_of(image.rays, image.pixel, len(catalogue.directions), 2 * noise)
-    sample = np.random.default_rng(seed).permutation(len(image.rays))[: settings.sample]
-    return Sight(image, image.rays, catalogue, catalogue.sky(cell), background, reach, False, sample)
+    background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise)
+    sample = np.random.default_rng(seed).permutation(len(image.bearings))[: settings.sample]
+    return Sight(image, catalogue, catalogue.sky(cell), background, reach, sample)
 
 
 def _search(
@@ -172,7 +169,7 @@ def _search(
     deadline: Deadline,
     settings: InfinitySettings,
 ) -> RotationResult:
-    sight, bearings = _sight(image, catalogue, noise, seed, settings), image.rays
+    sight, bearings = _sight(image, catalogue, noise, seed, settings), image.bearings
     found: list[Rotated] = []
     tried = Enumerated()
     result = _judged(found, sight, tried, settings)
@@ -201,7 +198,7 @@ def _image_pairs(
 ) -> Iterator[tuple[int, int, bool]]:
     """Pairs of image points, and whether the verdict is to be asked: of few points all pairs of the first ones, of more
     each one with a near partner."""
-    bearings, rng = sight.bearings, np.random.default_rng(seed)
+    bearings, rng = sight.image.bearings, np.random.default_rng(seed)
     order = rng.permutation(len(bearings))
     if scores is not None:
         order = order[np.argsort(-scores[order], kind="stable")]
@@ -231,7 +228,7 @@ def _image_pairs(
 
 def _rotations(sight: Sight, i: int, k: int, found: list[Rotated], settings: InfinitySettings) -> Iterator[Rotated]:
     """The fitted rotations that a pair of image points gives and that could contest the best one found."""
-    bearings, pixel = sight.bearings, sight.image.pixel
+    bearings, pixel = sight.image.bearings, sight.image.pixel
     one, other = bearings[i], bearings[k]
     chord = float(np.linalg.norm(one - other))
     slack = sight.reach * math.hypot(pixel[i], pixel[k])
@@ -248,14 +245,14 @@ def _rotations(sight: Sight, i: int, k: int, found: list[Rotated], settings: Inf
     kept, value = np.empty((settings.refined, 3, 3)), np.full(settings.refined, -math.inf)
     propose(sight.sky, sight.catalogue.pairs, int(low), int(high), patch, settings.abandoned, kept, value)
     weight = _information(sight.image, np.array([i, k]))
-    m, scratch = len(bearings), np.empty((9, 4))
+    m, scratch = len(bearings), np.empty((4, 3))
     some, every = np.union1d(np.r_[near, i, k], sight.sample), np.arange(m)
     for frame in kept[np.isfinite(value)]:
-        state = Fit(axes.T @ frame, np.zeros(1), weight.copy(), np.empty(m, np.int64), np.full(m, np.inf))
-        nats = fit(sight.image, some, sight.sky, sight.reach, settings.rounds, sight.focal, state, scratch)
+        state = Fit(axes.T @ frame, weight.copy(), np.empty(m, np.int64), np.full(m, np.inf))
+        nats = fit(sight.image, some, sight.sky, sight.reach, settings.rounds, state, scratch)
         best = found[0].decades.sum() * math.log(10) if found else 0.0
         if nats > best * len(some) / m - settings.margin:
-            fit(sight.image, every, sight.sky, sight.reach, settings.last_rounds, sight.focal, state, scratch)
+            fit(sight.image, every, sight.sky, sight.reach, settings.last_rounds, state, scratch)
             yield _weighed(sight, state)
 
 
@@ -264,7 +261,7 @@ def _weighed(sight: Sight, state: Fit) -> Rotated:
     squared = np.where(state.match >= 0, state.squared, np.inf)
     density = sight.catalogue.density[state.match]
     alarms, decades = log10_false_alarms(squared, density, sight.known)
-    return Rotated(left @ right, math.exp(state.log_focal[0]), state.match, squared, decades, alarms)
+    return Rotated(left @ right, state.match, squared, decades, alarms)
 
 
 def _merged(found: list[Rotated], new: Rotated, sight: Sight) -> list[Rotated]:
@@ -272,7 +269,7 @@ def _merged(found: list[Rotated], new: Rotated, sight: Sight) -> list[Rotated]:
     limit = sight.reach * float(np.median(sight.image.pixel))
 
     def same(one: Rotated) -> bool:
-        return bool((np.linalg.norm(sight.bearings @ (one.rotation - new.rotation), axis=-1) < limit).all())
+        return bool((np.linalg.norm(sight.image.bearings @ (one.rotation - new.rotation), axis=-1) < limit).all())
 
     alike = [one for one in found if same(one)]
     if any(one.log10_false_alarms <= new.log10_false_alarms for one in alike):
@@ -295,7 +292,7 @@ def _judged(found: list[Rotated], sight: Sight, tried: Enumerated, settings: Inf
     worth = best.decades[hit]
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
     least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING + 1)
-    missed = tried.log10_missed(len(sight.bearings), min(least, len(sight.bearings)), settings.power)
+    missed = tried.log10_missed(len(sight.image.bearings), min(least, len(sight.image.bearings)), settings.power)
     lead = found[1].log10_false_alarms - alarms if len(found) > 1 else math.inf
     doubt = known = None
     if alarms > rule.false_alarms:
@@ -306,7 +303,7 @@ def _judged(found: list[Rotated], sight: Sight, tried: Enumerated, settings: Inf
         doubt = f", but a better rotation was missed with a probability of up to {number(missed)}"
     else:  # what costs more is asked only where the verdict depends on it
         seen = sight.catalogue.directions[best.match[hit]] @ best.rotation.T
-        known = how_well_known(seen, sight.bearings[hit], sight.image.pixel[hit], sight.bearings)
+        known = how_well_known(seen, sight.image.bearings[hit], sight.image.pixel[hit], sight.image.bearings)
         if known.strain > sight.reach:
             doubt = f", but a camera other than the given one, by {known.strain:.2g} pixels, explains the points better"
         elif not math.isfinite(known.bound):

@@ -20,8 +20,6 @@ class InfinitySettings:
     power: share of the pairs of true matches that give their rotation. turns: pairs, at most.
     least_share: of the image points that a rotation explains, for which the pairs have to be enough where chance
         explains all that was found.
-    focal: factors of the longer side of the image between which an unknown focal length lies, field of view 127 to 3
-        degrees.
     """
 
     noise: tuple[float, ...] = (0.35, 1.4)
@@ -40,7 +38,6 @@ class InfinitySettings:
     power: float = 0.9
     turns: int = 400
     least_share: float = 0.25
-    focal: tuple[float, float] = (0.25, 20.0)
 
 
 DEFAULT = InfinitySettings()

@@ -1,0 +1,186 @@
+"""Stars: which way a camera looks; fields of 5 to 180 degrees, 30 % false stars, 20 % missing, 0.3 pixels of noise.
+
+    python -m benchmarks stars --limit 250 --only "2000, 20 deg" noise
+
+Right is a rotation within 0.2 degrees. Every tenth frame has a new catalogue, which is why p50 is without its index.
+noise, mirror: images of no sky, where every confident answer is wrong. wrong focal: off by 0.3 to 20 %. --peers:
+tetra3rs too, where it is installed.
+"""
+
+import struct
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from record import Array, Outcome, degrees, measured, parser, solved
+from scipy.spatial.transform import Rotation
+
+import bpnp
+
+RIGHT_DEG = 0.2
+SIZE = 2000.0  # pixels of a side
+FALSE, MISSING, NOISE_PX, LEAST = 0.3, 0.2, 0.3, 8
+CATALOGUES, FIELDS = (2000, 5000, 10_000), (5.0, 20.0, 60.0, 180.0)
+WIDE = 100.0  # degrees from which the camera is a fisheye
+NARROW, IN_VIEW = (
+    5.0,
+    15.0,
+)  # degrees up to which a catalogue covers a belt of the sky in which a field has so many stars
+FOCAL = (0.8, 0.95, 0.98, 1.003, 1.02, 1.05, 1.2)
+
+
+class Frame(NamedTuple):
+    """Pixels (m, 2) of stars and others, directions (n, 3), rotation, field of view in degrees."""
+
+    pixels: Array
+    directions: Array
+    rotation: Array
+    field: float
+
+
+def focal(field: float) -> float:
+    half = np.radians(field / 2)
+    return float(SIZE / 2 / (half if field > WIDE else np.tan(half)))
+
+
+def camera(field: float, factor: float = 1.0) -> tuple[str, tuple[float, ...]]:
+    f, c = factor * focal(field), SIZE / 2
+    return ("OPENCV_FISHEYE", (f, f, c, c, 0, 0, 0, 0)) if field > WIDE else ("SIMPLE_PINHOLE", (f, c, c))
+
+
+def project(seen: Array, field: float) -> Array:
+    """Pixels (k, 2) of directions in the camera, NaN outside the image."""
+    angle = np.arctan2(np.linalg.norm(seen[:, :2], axis=-1), seen[:, 2])
+    radius = focal(field) * (angle if field > WIDE else np.tan(np.minimum(angle, 1.5)))
+    pixels = radius[:, None] * seen[:, :2] / np.sin(np.maximum(angle, 1e-12))[:, None] + SIZE / 2
+    widest = np.radians(field / 2 if field > WIDE else 80.0)
+    inside = (np.abs(pixels - SIZE / 2) < SIZE / 2).all(-1) & (angle < widest)
+    return np.where(inside[:, None], pixels, np.nan)
+
+
+def anywhere(rng: np.random.Generator, count: int, field: float) -> Array:
+    """Pixels, evenly in the image, which is round for a fisheye."""
+    if field < WIDE:
+        return rng.uniform(0, SIZE, (count, 2))
+    radius, around = SIZE / 2 * np.sqrt(rng.random(count)), rng.uniform(0, 2 * np.pi, count)
+    return SIZE / 2 + radius[:, None] * np.stack([np.cos(around), np.sin(around)], -1)
+
+
+@lru_cache(2)
+def catalogue(count: int, field: float, seed: int) -> Array:
+    """Directions (count, 3), evenly on the sphere or, for narrow fields, in a belt."""
+    rng = np.random.default_rng([seed, count])
+    area = count / (IN_VIEW / field**2) * np.radians(1) ** 2
+    height = rng.uniform(-1, 1, count) * (min(1.0, area / (4 * np.pi)) if field <= NARROW else 1.0)
+    around = rng.uniform(0, 2 * np.pi, count)
+    aside = np.sqrt(1 - height**2)
+    return np.stack([aside * np.cos(around), aside * np.sin(around), height], -1)
+
+
+def frame(count: int, field: float, seed: int, i: int) -> Frame:
+    """A field around a star with LEAST stars or more that are detected."""
+    rng, directions = (
+        np.random.default_rng([seed, count, int(field), i]),
+        catalogue(count, field, 1000 * seed + i // 10),
+    )
+    while True:
+        to_middle, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], directions[rng.integers(count)][None])
+        rotation = (Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]) * to_middle).as_matrix()
+        pixels = project(directions @ rotation.T, field)
+        found = pixels[np.isfinite(pixels[:, 0]) & (rng.random(count) > MISSING)]
+        if len(found) >= LEAST:
+            break
+    others = anywhere(rng, round(len(found) * FALSE / (1 - FALSE)), field)
+    found = found + NOISE_PX * rng.standard_normal(found.shape)
+    return Frame(rng.permutation(np.concatenate([found, others])), directions, rotation, field)
+
+
+def by_search(shown: Frame, seed: int, factor: float = 1.0) -> bpnp.Solution:
+    return bpnp.solve(
+        shown.pixels, shown.directions, camera(shown.field, factor), at_infinity=True, seed=seed, time_limit=60
+    )
+
+
+def outcomes(count: int, field: float, limit: int, seed: int, kind: str = "") -> list[Outcome]:
+    """Of true fields, or of what a confident answer to is wrong: nothing is right there."""
+    rows = []
+    for i in range(limit):
+        shown, factor = frame(count, field, seed, i), 1.0
+        if kind == "noise":
+            places = anywhere(np.random.default_rng([seed, i]), len(shown.pixels), field)
+            shown = shown._replace(pixels=places, rotation=np.full((3, 3), np.nan))
+        elif kind == "mirror":
+            mirrored = [SIZE, 0] + shown.pixels * [-1, 1]
+            shown = shown._replace(pixels=mirrored, rotation=np.full((3, 3), np.nan))
+        elif kind == "wrong focal":
+            factor = FOCAL[i % len(FOCAL)]
+        rows.append(solved(f"{i}", shown.rotation, np.zeros(3), partial(by_search, shown, i, factor)))
+    times = [row.cpu_seconds for row in rows]
+    print(f"p50 {1000 * np.median(times):.0f} ms, p95 {1000 * np.percentile(times, 95):.0f} ms", end="; ")
+    return rows
+
+
+@lru_cache(2)
+def tetra_database(count: int, field: float, seed: int) -> Any:
+    """tetra3rs's index of a catalogue, in its own file format; all stars are equally bright."""
+    import tetra3rs
+
+    directions = catalogue(count, field, seed)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "stars.bin"
+        records = [
+            struct.pack(
+                "<qddfff", j, np.degrees(np.arctan2(y, x)) % 360, np.degrees(np.arcsin(z)), 5 + j / count, 0.0, 0.0
+            )
+            for j, (x, y, z) in enumerate(directions.tolist())
+        ]
+        path.write_bytes(b"GDR3" + struct.pack("<IQ", 1, count) + b"".join(records))
+        return tetra3rs.SolverDatabase.generate_from_gaia(
+            catalog_path=str(path), max_fov_deg=1.4 * field, epoch_proper_motion_year=2016.0
+        )
+
+
+def by_tetra(count: int, field: float, limit: int, seed: int) -> list[Outcome]:
+    """tetra3rs on the same frames; it believes what it returns."""
+    rows = []
+    for i in range(limit):
+        shown = frame(count, field, seed, i)
+        database = tetra_database(count, field, 1000 * seed + i // 10)
+        start = time.process_time()
+        found = database.solve_from_centroids(
+            shown.pixels - SIZE / 2, fov_estimate_deg=field, image_width=int(SIZE), image_height=int(SIZE),
+            match_radius=0.002,
+        )  # fmt: skip
+        seconds = time.process_time() - start
+        turned = np.asarray(found.rotation_matrix_icrs_to_camera) if found else np.full((3, 3), np.nan)
+        rows.append(Outcome("", degrees(turned, shown.rotation), 0.0, "confident" if found else "failed", seconds))
+    print(f"p50 {1000 * np.median([row.cpu_seconds for row in rows]):.1f} ms", end="; ")
+    return rows
+
+
+def rows(limit: int, seed: int, *, peers: bool) -> Iterator[tuple[str, Callable[[], list[Outcome]]]]:
+    for count in CATALOGUES:
+        for field in FIELDS:
+            yield f"{count}, {field:.0f} deg", partial(outcomes, count, field, limit, seed)
+            if peers and field < WIDE:
+                yield f"tetra3rs: {count}, {field:.0f} deg", partial(by_tetra, count, field, limit, seed)
+    for kind in ("noise", "mirror", "wrong focal"):
+        for field in FIELDS:
+            yield f"{kind}, {field:.0f} deg", partial(outcomes, CATALOGUES[0], field, limit, seed, kind)
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
+    options.add_argument("--peers", action="store_true", help="tetra3rs too")
+    chosen = options.parse_args()
+    every = rows(chosen.limit, chosen.seed, peers=chosen.peers)
+    measured(((name, run()) for name, run in every if any(p in name for p in chosen.only)), chosen, RIGHT_DEG)
+
+
+if __name__ == "__main__":
+    main()
