@@ -31,19 +31,32 @@ from bpnp.solving.matches import count_one_to_one
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Candidate, Solution
 
-# Of the image points that a pose explains few are outliers beside a twin, so that fewer starts, smoothed more, do: of
-# 11 photos of boxes with two faces alike that were taken for the other face 10 are put right, the last one with four
-# times the starts.
-LOOK = RasterSearch(
-    Draws(2**14, least_starts=2**14),
-    Screens((100, 300), (2**10, 2**8)),
-    Narrowing(0.08, 0.02, steps=3, copies=8, points=300),
-    annealed=6,
-)
-LOOKS = 8  # views at most: about a tenth of the time that a photo takes
-UNSEEN = 0.5  # share of a view's points that the pose does not see
-FEWEST = 12  # such points, and image points that a pose explains
-TWIN_DEGREES, TWIN_SHARE = 4.0, 0.04  # of the prior of a search about a twin
+
+@dataclass(frozen=True)
+class TwinSettings:
+    """Constants of the looks at views of other points.
+
+    look: a search near each. Of the image points that a pose explains few are outliers beside a twin, so that fewer
+    starts, smoothed more, do: of 11 photos of boxes with two faces alike that were taken for the other face 10 are put
+    right, the last one with four times the starts. looks: views at most, a tenth of the time that a photo takes.
+    unseen: share of a view's points that the pose does not see. fewest: such points, and image points that a pose
+    explains. degrees, share: of the prior of a search about a twin.
+    """
+
+    look: RasterSearch = RasterSearch(
+        Draws(2**14, least_starts=2**14),
+        Screens((100, 300), (2**10, 2**8)),
+        Narrowing(0.08, 0.02, steps=3, copies=8, points=300),
+        annealed=6,
+    )
+    looks: int = 8
+    unseen: float = 0.5
+    fewest: int = 12
+    degrees: float = 4.0
+    share: float = 0.04
+
+
+TWINS = TwinSettings()
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,11 +118,11 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
     explained = np.isin(problem.usable, solution.matches[:, 0])
     seen, looks = _seen(photo, problem, solution), 0
     rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
-    for region in photo.regions() if explained.sum() >= FEWEST else ():
-        if looks == LOOKS or photo.deadline.passed():
+    for region in photo.regions() if explained.sum() >= TWINS.fewest else ():
+        if looks == TWINS.looks or photo.deadline.passed():
             return
         unseen = ~np.isin(region.point_ids, seen)
-        if unseen.sum() < FEWEST or unseen.mean() < UNSEEN:
+        if unseen.sum() < TWINS.fewest or unseen.mean() < TWINS.unseen:
             continue
         looks += 1
         near = problem_near(region, photo.keypoints, photo.camera, region.prior())
@@ -117,7 +130,7 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
         scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
         scene.rasters, known = rasters, scene.enter_prior(sets.prior or region.prior())
         assert isinstance(known, PosePrior)
-        found = with_false_alarms(in_user_frame(search_near(scene, known, LOOK)[:1], scene), sets)
+        found = with_false_alarms(in_user_frame(search_near(scene, known, TWINS.look)[:1], scene), sets)
         for k in np.flatnonzero(found.log10_false_alarms < 0):
             yield found.rotation[k], found.translation[k] + found.rotation[k] @ (problem.origin - near.origin)
 
@@ -140,7 +153,7 @@ def without_twins(
         seen = _seen(photo, problem_near(photo.place, photo.keypoints, photo.camera, None), twin)
         region = max(photo.regions(), key=lambda one: int(np.isin(one.point_ids, seen).sum()))
         distance = float(np.linalg.norm(twin.rotation @ np.median(region.points3d, 0) + twin.translation))
-        better = search(region, PosePrior(twin.rotation, twin.translation, TWIN_DEGREES, TWIN_SHARE * distance))
+        better = search(region, PosePrior(twin.rotation, twin.translation, TWINS.degrees, TWINS.share * distance))
         if better.verdict == "confident":
             return without_twins(photo, better, [*met, solution], search, again=False)
     off = math.degrees(turned_by(solution.rotation, twin.rotation))

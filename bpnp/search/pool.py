@@ -156,7 +156,7 @@ def against_repetitions(
     if not len(repeated[0]):
         return result
     rivals = with_false_alarms(polished(entered(), *repeated, scale), sets)
-    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale)
+    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale, rule.repetitions)
     behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])

@@ -21,11 +21,6 @@ from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
-NEAR = 3.0  # scales of the residuals within which an image point has a partner, and two partners are in one place
-FAR = 5.0  # times as far as a different pose: nearer ones slide along the same lines and surfaces
-MOST = 13.0  # nats of evidence of an image point: what 100 scene points leave to one that is met to the finest scale
-OWN = 0.5  # of the points that the first pose alone explains: a pose that explains so many alone is no repetition of it
-SAME = 0.5  # share of a pose's partners in the places of those of another from which both say the same of the scene
 
 
 class Alternative(NamedTuple):
@@ -93,34 +88,34 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
 
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
-    poses = candidates.rotation, candidates.translation
-    others = np.flatnonzero(~sets.same_pose(*poses, FAR * rule.other_deg, FAR * rule.other_shift))
+    poses, limits = (candidates.rotation, candidates.translation), rule.contested
+    others = np.flatnonzero(~sets.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
     least = 2 * math.log(10) * rule.lead
     if not len(others) or len(sets.image.chosen) < least:
         return None
     scales = np.maximum(candidates.scale, sets.image.scales[0])
     # A lead that would be no chance if all gaps were as large as they can be needs no second look.
-    decisive = MOST * math.sqrt(least * len(sets.image.chosen)) / math.log(10)
+    decisive = limits.most * math.sqrt(least * len(sets.image.chosen)) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
         return None
     best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
-    first = _partners(sets, *(x[0] for x in (*poses, scales)))
+    first = _partners(sets, limits.near, *(x[0] for x in (*poses, scales)))
     places = sets.bearings[sets.image.chosen] @ sets.image.axes
-    blocks = observations(places, NEAR * float(scales[0]))
+    blocks = observations(places, limits.near * float(scales[0]))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
         if float(np.abs(gap).sum()) ** 2 < least * float((gap**2).sum()):
             continue
         sums = np.bincount(blocks, gap)
         squared = float((sums**2).sum())
-        other = _partners(sets, *(x[k] for x in (*poses, scales)))
-        reach = NEAR * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
+        other = _partners(sets, limits.near, *(x[k] for x in (*poses, scales)))
+        reach = limits.near * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
-        apart = others_alone >= OWN * alone and alone + others_alone >= least
+        apart = others_alone >= limits.alone * alone and alone + others_alone >= least
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
-        if decades < rule.lead and (apart or (same & first.near & other.near).sum() < SAME * other.near.sum()):
+        if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
             degrees = _degrees(candidates, k)
             what = f"a pose {degrees:.0f} deg away explains so many other points that both may be chance"
             return Alternative(decades, what)
@@ -145,13 +140,13 @@ class _Partners(NamedTuple):
     near: NDArray[np.bool_]
 
 
-def _partners(sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
+def _partners(sets: PointSets, near: float, rotation: Array, translation: Array, scale: float) -> _Partners:
     seen, chosen = directions_of(sets, rotation, translation), sets.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
     for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, len(seen)):
         ahead = columns[np.isfinite(seen[columns, 0])]
         if len(ahead):
             bearings = sets.bearings[chosen[rows]]
-            chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=NEAR * scale)
+            chord[rows], nearest = cKDTree(seen[ahead]).query(bearings, distance_upper_bound=near * scale)
             points[rows] = np.r_[ahead, -1][nearest]
     return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))

@@ -10,17 +10,12 @@ from scipy.spatial import cKDTree
 from scipy.special import bdtrc
 
 from bpnp.search.kernels.neighbours import sums_near
+from bpnp.search.settings import ImagePoints
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-SCALE_STEP = 2.0  # from one scale of the residuals to the next
-COARSEST = 0.5  # largest scale, in spacings sqrt(A / m) of the image points: beyond, only the outline fits
-FLOOR = 2e-4  # smallest scale in spreads of the bearings: some hundredths of a pixel of an ordinary camera
-TOGETHER = 2.0  # distance in scales below which image points are one observation
-CROWDED = 2.0  # standard deviations by which the points around one exceed those of an even spread before it is a clump
-MOST_POINTS = 2000  # image points that are looked at, evenly spread over the given ones
-LINES = 2000  # pairs of points whose line is tried
+DEFAULT = ImagePoints()
 
 
 class ImageStatistics:
@@ -30,12 +25,12 @@ class ImageStatistics:
     plane, half_widths: (2,) of the rectangle with their standard deviations, solid_angle: its area, steradians, at
     most 4 pi.
     scales: (S,) of residuals, radians, from the smallest that is believed to the largest that is no mere outline.
-    chosen: (k,) places of the image points that are looked at. together: (k, S) how many of them lie within `TOGETHER`
-    scales.
+    chosen: (k,) places of the image points that are looked at. together: (k, S) how many of them lie within
+    `rule.together` scales.
     weights: (k, S, S) of the evidence, see `_weights`.
     """
 
-    def __init__(self, bearings: Array, floor: float | None) -> None:
+    def __init__(self, bearings: Array, floor: float | None, rule: ImagePoints = DEFAULT) -> None:
         m = len(bearings)
         self.centre = bearings.mean(0)
         centred = bearings - self.centre
@@ -44,20 +39,20 @@ class ImageStatistics:
         self.half_widths, self.axes = np.sqrt(3 * np.maximum(variance[1:], 1e-24)), axes[:, 1:]
         area = 12 * math.sqrt(max(float(variance[1:].prod()), 0.0))
         self.solid_angle = float(np.clip(area, 1e-24, 4 * math.pi))
-        smallest = max(floor or 0.0, FLOOR * self.spread)
-        largest = max(COARSEST * math.sqrt(self.solid_angle / m), 2 * smallest)
-        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(SCALE_STEP)))
+        smallest = max(floor or 0.0, rule.floor * self.spread)
+        largest = max(rule.coarsest * math.sqrt(self.solid_angle / m), 2 * smallest)
+        steps = max(3, 1 + math.ceil(math.log(largest / smallest) / math.log(rule.scale_step)))
         self.scales = np.geomspace(smallest, largest, steps)
-        self.chosen = np.arange(m) if m <= MOST_POINTS else np.linspace(0, m - 1, MOST_POINTS).astype(np.int64)
-        within = TOGETHER * self.scales
+        self.chosen = np.arange(m) if m <= rule.most else np.linspace(0, m - 1, rule.most).astype(np.int64)
+        within = rule.together * self.scales
         looked_at = bearings[self.chosen]
         together = sums_near(looked_at, looked_at, self.axes, within, np.zeros(steps))
         self.together = together.astype(np.int64)
         expected = 1 + (len(looked_at) - 1) * math.pi * within**2 / self.solid_angle
-        self.weights = _weights(self.together, expected)
+        self.weights = _weights(self.together, expected, rule.crowded)
 
 
-def _weights(together: NDArray[np.int64], expected: Array) -> Array:
+def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float) -> Array:
     """(k, S, S): weight of log x_i at the scale s_q in the evidence of image point i at the scale s_r.
 
     log x_i at s_r is a sum of steps, from the largest scale to s_r. A step from 2 s to s counts with 1 / c_i(s), and
@@ -65,16 +60,17 @@ def _weights(together: NDArray[np.int64], expected: Array) -> Array:
     even spread explains: over their expected number. So the place of a clump of points is one observation, and where
     each of them lies within it one each.
 
-    together: (k, S) image points within TOGETHER scales of each. expected: (S,) of them, spread evenly over the view.
+    together: (k, S) image points within `ImagePoints.together` scales of each. expected: (S,) of them, spread evenly
+    over the view. crowded_sigmas: standard deviations above it from which they are a clump.
     """
-    clump = together > expected + CROWDED * np.sqrt(expected)
+    clump = together > expected + crowded_sigmas * np.sqrt(expected)
     crowded = np.where(clump, together / expected, 1.0)
     steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
     steps[:, :, 1:] -= steps[:, :, :-1]
     return np.asarray(steps)
 
 
-def observations(places: Array, reach: float) -> Labels:
+def observations(places: Array, reach: float, rule: ImagePoints = DEFAULT) -> Labels:
     """Which of the image points (k, 2) are one observation, (k,): those of a straight line, and of a clump.
 
     A line: through two points drawn at random, one after the other those with the most points that are left within
@@ -93,7 +89,7 @@ def observations(places: Array, reach: float) -> Labels:
     links = [near]
     if k > 2:
         rng = np.random.default_rng(0)
-        first, step = rng.integers(k, size=LINES), rng.integers(1, k, size=LINES)
+        first, step = rng.integers(k, size=rule.lines), rng.integers(1, k, size=rule.lines)
         along = places[(first + step) % k] - places[first]
         across = np.stack([-along[:, 1], along[:, 0]], -1) / np.maximum(np.linalg.norm(along, axis=-1), 1e-300)[:, None]
         on_line = np.abs(across @ places.T - (across * places[first]).sum(-1, keepdims=True)) < reach
@@ -101,7 +97,7 @@ def observations(places: Array, reach: float) -> Labels:
         while True:
             counts = on_line.sum(1)
             best = int(counts.argmax())
-            if counts[best] < 3 or LINES * bdtrc(counts[best] - 3, k - 2, chance) >= 1:
+            if counts[best] < 3 or rule.lines * bdtrc(counts[best] - 3, k - 2, chance) >= 1:
                 break
             members = np.flatnonzero(on_line[best])
             links.append(np.stack([members[:-1], members[1:]], -1))

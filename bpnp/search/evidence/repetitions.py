@@ -9,32 +9,24 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.kernels.neighbours import HashedPoints
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Evidence
+from bpnp.search.settings import Evidence, Repetitions
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
-NEAR = 3.0  # scales of the residuals within which an image point has a partner, and a moved point lies on another
-SHARE = 0.5  # of the points with a partner that must come to lie on others
-FEWEST = 6  # points with a partner; of fewer, three that fix a pose are too large a part
-REFERENCES = 3  # points that are laid onto every other one; a motion may leave one of them without a counterpart
-AROUND = 4096  # scene points that they are laid onto
-FIRST, MOST = 4, 48  # points that are moved to find motions, and to confirm them
-CONFIRMED, WEIGHED, KEPT = 512, 24, 4  # motions, best first, that are confirmed, whose poses are weighed, and returned
-COMPARED = 400  # motions of a structure beyond which a few cannot stand for all: some of them fits as well
-MOST_MISSING = 1 / 3  # share of its points that a map may lack, at most
+DEFAULT = Repetitions()
 
 
 def repeated_poses(
     sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence
-) -> tuple[Pose, bool]:  # fmt: skip
+) -> tuple[Pose, bool]:
     """Poses (c, 3, 3), (c, 3) that see other scene points where this one sees those that have a partner in the image.
 
     If a motion p -> Q p + d takes these points onto other scene points, the pose (R Q^T, t - R Q^T d) sees the latter
     in the same directions. Q: none and, unless a prior excludes them, half turns about the axes of the points, and
-    quarter turns where they repeat. d:
-    from one of three points in their middle to any of the 4096 nearest scene points. scale: of the residuals, radians.
-    Only poses that a verdict takes for different from this one (`Evidence.other_deg`), the four with the fewest false
-    alarms; and whether there are so few motions that these stand for all.
+    quarter turns where they repeat. d: from one of three points in their middle to any of the scene points nearest to
+    them. scale: of the residuals, radians. Only poses that a verdict takes for different from this one
+    (`Evidence.other_deg`), the few with the fewest false alarms; and whether there are so few motions that these stand
+    for all.
 
     >>> import numpy as np
     >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
@@ -45,38 +37,41 @@ def repeated_poses(
     >>> sorted(translations[:, 0].round(6).tolist())
     [-4.0, -2.0]
     """
-    none = (np.empty((0, 3, 3)), np.empty((0, 3))), True
+    none, limits = ((np.empty((0, 3, 3)), np.empty((0, 3))), True), rule.repetitions
     points = sets.points3d
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     seen = camera / np.maximum(depth, 1e-300)[:, None]
     away, nearest = cKDTree(seen).query(sets.bearings)
-    matched = np.unique(nearest[away < NEAR * scale])
-    if len(matched) < FEWEST:
+    matched = np.unique(nearest[away < limits.near * scale])
+    if len(matched) < limits.fewest:
         return none
-    tolerance = NEAR * scale * float(np.median(depth[matched]))
+    tolerance = limits.near * scale * float(np.median(depth[matched]))
     own = points[matched]
     own = own[np.argsort(np.linalg.norm(own - np.median(own, 0), axis=-1), kind="stable")]
-    own = own[np.unique(np.r_[:REFERENCES, np.linspace(REFERENCES, len(own) - 1, MOST).astype(int)])]
-    around = points[np.argsort(np.linalg.norm(points - own[0], axis=-1), kind="stable")[:AROUND]]
+    some = np.linspace(limits.references, len(own) - 1, limits.most).astype(int)
+    own = own[np.unique(np.r_[: limits.references, some])]
+    around = points[np.argsort(np.linalg.norm(points - own[0], axis=-1), kind="stable")[: limits.around]]
     scene = HashedPoints(points, tolerance)
-    found = [(share, np.eye(3), shift) for share, shift in _shifts(scene, around, own, np.eye(3))]
+    found = [(share, np.eye(3), shift) for share, shift in _shifts(scene, around, own, np.eye(3), limits)]
     turns = [] if sets.knows_rotation else _turns(own, found[0][2] if found else None)
     for turn in turns:
-        found += [(share, turn, shift) for share, shift in _shifts(scene, around, own, turn)]
+        found += [(share, turn, shift) for share, shift in _shifts(scene, around, own, turn, limits)]
     found = sorted(found, key=lambda motion: -motion[0])
     if not found:
         return none
     rotations = np.array([rotation, *(rotation @ turn.T for _, turn, _ in found)])
     translations = np.array([translation, *(translation - rotation @ turn.T @ shift for _, turn, shift in found)])
     other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
-    rotations, translations = rotations[other[:WEIGHED]], translations[other[:WEIGHED]]
+    rotations, translations = rotations[other[: limits.weighed]], translations[other[: limits.weighed]]
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
-    best = np.argsort(alarms, kind="stable")[:KEPT]
-    return (rotations[best], translations[best]), len(other) <= COMPARED
+    best = np.argsort(alarms, kind="stable")[: limits.kept]
+    return (rotations[best], translations[best]), len(other) <= limits.compared
 
 
-def decades_behind(sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, scale: float) -> Array:
+def decades_behind(
+    sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, scale: float, limits: Repetitions = DEFAULT
+) -> Array:
     """Decades (c,) by which the poses `rivals` (c, 3, 3), (c, 3) explain the image points worse than the best one.
 
     All at one scale of the residuals, radians, and against scene points that are evenly spread: their density does not
@@ -87,20 +82,21 @@ def decades_behind(sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, sc
     """
     seen = [directions_of(sets, *best), *(directions_of(sets, r, t) for r, t in zip(*rivals, strict=True))]
     logs = np.stack([point_evidence(sets, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
-    missing = min((int((logs[0] < 0).sum()) + 1) / (logs.shape[1] + 2), MOST_MISSING)
+    missing = min((int((logs[0] < 0).sum()) + 1) / (logs.shape[1] + 2), limits.most_missing)
     most = math.log((1 - missing) / missing)
-    counted = np.stack([_among(sets, one) for one in seen[1:]]) | ~_is_repeated(sets, best, repeated, scale)
+    is_repeated = _is_repeated(sets, best, repeated, limits.near * scale)
+    counted = np.stack([_among(sets, one) for one in seen[1:]]) | ~is_repeated
     return np.asarray(np.where(counted, np.clip(logs[0] - logs[1:], -most, most), 0).sum(-1) / math.log(10))
 
 
-def _is_repeated(sets: PointSets, best: Pose, repeated: Pose, scale: float) -> NDArray[np.bool_]:
+def _is_repeated(sets: PointSets, best: Pose, repeated: Pose, reach: float) -> NDArray[np.bool_]:
     """Of which of the chosen image points (k,) a motion p -> Q p + d, or its inverse, takes the scene point onto
     another one; Q p + d is the point that a repeated pose sees where the best one sees p."""
     points, (rotation, translation) = sets.points3d, best
     camera = points @ rotation.T + translation
     depth = np.linalg.norm(camera, axis=-1)
     _, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(sets.bearings[sets.image.chosen])
-    own, reach = points[nearest], NEAR * scale * float(np.median(depth[nearest]))
+    own, reach = points[nearest], reach * float(np.median(depth[nearest]))
     moved = [
         target
         for r, t in zip(*repeated, strict=True)
@@ -138,24 +134,27 @@ def _turns(points: Array, shift: Array | None) -> list[Array]:
     return turns
 
 
-def _shifts(scene: HashedPoints, around: Array, points: Array, turn: Array) -> list[tuple[float, Array]]:
+def _shifts(
+    scene: HashedPoints, around: Array, points: Array, turn: Array, limits: Repetitions
+) -> list[tuple[float, Array]]:
     """Shifts (3,) that take the turned points (k, 3) onto points of the scene, and the share that comes to lie on one;
     those with the largest share first. around: scene points that the first ones are laid onto."""
     turned = points @ turn.T
-    shifts = (around - turned[:REFERENCES, None]).reshape(-1, 3)
+    shifts = (around - turned[: limits.references, None]).reshape(-1, 3)
     if np.array_equal(turn, np.eye(3)):
         shifts = shifts[np.linalg.norm(shifts, axis=-1) > 2 * scene.tolerance]
-    shifts, _ = _lying_on(scene, turned[np.linspace(0, len(turned) - 1, FIRST).astype(int)], shifts)
+    first = turned[np.linspace(0, len(turned) - 1, limits.first).astype(int)]
+    shifts, _ = _lying_on(scene, first, shifts, limits.share)
     if not len(shifts):
         return []
-    shifts, share = _lying_on(scene, turned, _apart(shifts[:CONFIRMED], scene.tolerance))
+    shifts, share = _lying_on(scene, turned, _apart(shifts[: limits.confirmed], scene.tolerance), limits.share)
     return list(zip(share.tolist(), shifts, strict=True))
 
 
-def _lying_on(scene: HashedPoints, points: Array, shifts: Array) -> tuple[Array, Array]:
-    """The shifts (s, 3) that take `SHARE` of the points (k, 3) or more to within the tolerance of one of the scene, and
-    these shares (s,); the largest first."""
-    least = math.ceil(SHARE * len(points))
+def _lying_on(scene: HashedPoints, points: Array, shifts: Array, share: float) -> tuple[Array, Array]:
+    """The shifts (s, 3) that take such a share of the points (k, 3) or more to within the tolerance of one of the
+    scene, and these shares (s,); the largest first."""
+    least = math.ceil(share * len(points))
     counts = scene.count_on(points, shifts, least)
     best = np.argsort(-counts, kind="stable")[: int((counts >= least).sum())]
     return shifts[best], counts[best] / len(points)
