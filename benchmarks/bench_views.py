@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from record import DATA, TIME_LIMIT, Outcome, measured, parser, solved
-from view_pairs import MOST_POINTS, ViewPair, scene_pairs
+from view_problems import MOST_POINTS, ViewProblem, scene_problems
 
 from bpnp import PosePrior, Solution, solve
 from bpnp.maps.localize import VIEW_DEGREES, VIEW_SHARE
@@ -28,88 +28,88 @@ REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough
 RIGHT_DEG = 1.0
 
 
-def by_search(pair: ViewPair, seed: int, **options: Any) -> Solution:
-    camera = np.diag([pair.focal, pair.focal, 1.0])
+def by_search(problem: ViewProblem, seed: int, **options: Any) -> Solution:
+    camera = np.diag([problem.focal, problem.focal, 1.0])
     return solve(
-        pair.focal * pair.points2d, pair.points3d, camera, seed=seed, time_limit=TIME_LIMIT, **options
+        problem.focal * problem.points2d, problem.points3d, camera, seed=seed, time_limit=TIME_LIMIT, **options
     )  # fmt: skip
 
 
-def by_view(pair: ViewPair, seed: int, **options: Any) -> Solution:
-    return by_search(pair, seed, prior=prior_of_view(pair), **options)
+def by_view(problem: ViewProblem, seed: int, **options: Any) -> Solution:
+    return by_search(problem, seed, prior=prior_of_view(problem), **options)
 
 
-def in_map(pair: ViewPair, seed: int) -> Solution:
-    camera = np.diag([pair.focal, pair.focal, 1.0])
-    return pair.scene.localize(
-        pair.focal * pair.points2d, camera, views=pair.views or None, seed=seed, time_limit=TIME_LIMIT
+def in_map(problem: ViewProblem, seed: int) -> Solution:
+    camera = np.diag([problem.focal, problem.focal, 1.0])
+    return problem.scene.localize(
+        problem.focal * problem.points2d, camera, views=problem.views or None, seed=seed, time_limit=TIME_LIMIT
     )  # fmt: skip
 
 
-def prior_of_view(pair: ViewPair) -> PosePrior:
+def prior_of_view(problem: ViewProblem) -> PosePrior:
     """The first view's pose, with the uncertainty that a map assumes of a photo beside a view."""
-    (view,) = pair.scene.named(pair.views[:1])
-    distance = np.median(np.linalg.norm(pair.points3d @ view.rotation.T + view.translation, axis=-1))
+    (view,) = problem.scene.named(problem.views[:1])
+    distance = np.median(np.linalg.norm(problem.points3d @ view.rotation.T + view.translation, axis=-1))
     return PosePrior(view.rotation, view.translation, VIEW_DEGREES, VIEW_SHARE * float(distance))
 
 
-def by_network(weights: str) -> Callable[[ViewPair, int], Solution]:
+def by_network(weights: str) -> Callable[[ViewProblem, int], Solution]:
     @cache
     def net() -> TrainedNet:
         return TrainedNet.from_pretrained(weights).eval()
 
-    def solve_with(pair: ViewPair, seed: int) -> Solution:
+    def solve_with(problem: ViewProblem, seed: int) -> Solution:
         search = by_view if getattr(net(), "frame", "any") == "view" else by_search
-        return search(pair, seed, solver=net())
+        return search(problem, seed, solver=net())
 
     return solve_with
 
 
-METHODS: dict[str, Callable[[ViewPair, int], Solution]] = {
+METHODS: dict[str, Callable[[ViewProblem, int], Solution]] = {
     "solve": by_search, "view-prior": by_view, "localize": in_map,
     **{name: by_network(name) for name in pretrained_names()},
 }  # fmt: skip
 
 
-def outcomes(pairs: Sequence[ViewPair], method: str, seed: int) -> list[Outcome]:
+def outcomes(problems: Sequence[ViewProblem], method: str, seed: int) -> list[Outcome]:
     """What a method finds of the photos; the error of a centre in distances of the median point."""
     return [
         solved(
-            pair.name, pair.rotation, pair.translation,
-            lambda pair=pair: METHODS[method](pair, seed),  # type: ignore[misc]
-            distance=float(np.median(np.linalg.norm(pair.points3d @ pair.rotation.T + pair.translation, axis=-1))),
+            problem.name, problem.rotation, problem.translation,
+            lambda problem=problem: METHODS[method](problem, seed),  # type: ignore[misc]
+            distance=problem.distance,
         )
-        for pair in pairs
+        for problem in problems
     ]  # fmt: skip
 
 
-def elsewhere(pairs: Sequence[ViewPair]) -> list[ViewPair]:
-    """The views of each pair with the photo of the pair that comes half of them later."""
-    others = [*pairs[len(pairs) // 2 :], *pairs[: len(pairs) // 2]]
+def elsewhere(problems: Sequence[ViewProblem]) -> list[ViewProblem]:
+    """The views of each problem with the photo of the problem that comes half of them later."""
+    others = [*problems[len(problems) // 2 :], *problems[: len(problems) // 2]]
     return [
-        replace(pair, points2d=other.points2d, focal=other.focal, match3d=np.full_like(pair.match3d, -1))
-        for pair, other in zip(pairs, others, strict=True)
+        replace(problem, points2d=other.points2d, focal=other.focal, match3d=np.full_like(problem.match3d, -1))
+        for problem, other in zip(problems, others, strict=True)
     ]
 
 
 def photos(
     limit: int, seed: int, *, scenes: Sequence[str] = REPORTED, data: Path = DATA, apart: bool = False, **chosen: Any
-) -> list[ViewPair]:
-    """At most `limit` photos of the scenes together. chosen: options of `view_pair`."""
+) -> list[ViewProblem]:
+    """At most `limit` photos of the scenes together. chosen: options of `view_problem`."""
     each = -(-limit // len(scenes))
-    pairs = [pair for name in scenes for pair in scene_pairs(data, name, limit=each, seed=seed, **chosen)]
-    return (elsewhere(pairs) if apart else pairs)[:limit]
+    problems = [problem for name in scenes for problem in scene_problems(data, name, limit=each, seed=seed, **chosen)]
+    return (elsewhere(problems) if apart else problems)[:limit]
 
 
 def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
     for outliers in options.outliers:
-        pairs = photos(
+        problems = photos(
             options.limit * len(options.scenes), options.seed, scenes=options.scenes, data=options.data,
             apart=options.elsewhere, views=options.views, outliers=outliers, best=options.best,
             most=None if options.all_points else MOST_POINTS,
         )  # fmt: skip
         for method in options.methods:
-            yield f"{method}, {options.views} views, outliers {outliers:.0%}", outcomes(pairs, method, options.seed)
+            yield f"{method}, {options.views} views, outliers {outliers:.0%}", outcomes(problems, method, options.seed)
 
 
 def main() -> None:

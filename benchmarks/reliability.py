@@ -29,7 +29,7 @@ from hard_scenes import CAMERA, SCENES, wrong_focal_plane
 from matplotlib.figure import Figure
 from record import TIME_LIMIT, Array, beyond_bound, degrees, parser
 from scipy.stats import binomtest
-from view_pairs import LEAST_PAIRS, scene_pairs
+from view_problems import LEAST_MATCHES, scene_problems
 
 from bpnp import Solution, solve, warm_up
 from bpnp.cameras import camera_from
@@ -115,9 +115,9 @@ FAMILIES = {"leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "
 def _pairs(options: Any, outliers: float, views: int) -> Iterator[Any]:
     """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true pairs."""
     known = {"limit": options.limit, "views": views, "outliers": outliers, "seed": options.seed}
-    turns = [scene_pairs(options.data, scene, most=1024 if views else None, **known) for scene in options.scenes]
+    turns = [scene_problems(options.data, scene, most=1024 if views else None, **known) for scene in options.scenes]
     for pairs in zip(*turns, strict=False):
-        yield from (pair for pair in pairs if pair.true_pairs >= LEAST_PAIRS)
+        yield from (pair for pair in pairs if pair.matches >= LEAST_MATCHES)
 
 
 def _with_camera(name: str, pair: Any, factor: float, options: Any) -> Problem:

@@ -10,26 +10,23 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.maps.scene_map import SceneMap
-from bpnp.maps.views import Cones, View
+from bpnp.maps.views import View
 
 LEAST_OVERLAP = 0.35
 MOST_POINTS = 1024
-HALF_TRACK = 6.0  # views that see a point of which half of the photos of its place see it too
-LEAST_PAIRS = 10  # fewer true pairs count as a failure
+LEAST_MATCHES = 10  # fewer matches count as a failure
 Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class ViewPair:
+class ViewProblem:
     """A photo's keypoints (m, 2), normalised, and the points (n, 3) of its views; match3d (n,), -1 for no partner.
 
     rotation, translation: of the photo. views: names of the k views in `scene`, most overlap first. focal: pixels.
-    outliers: share of the points without a partner, of the 2D and of the 3D side.
     scene: the map without the photo, of these points alone, in this order.
     """
 
@@ -44,33 +41,13 @@ class ViewPair:
     scene: SceneMap
 
     @property
-    def true_pairs(self) -> int:
+    def matches(self) -> int:
         return int((self.match3d >= 0).sum())
 
     @property
-    def outliers(self) -> tuple[float, float]:
-        return 1 - self.true_pairs / len(self.points2d), 1 - self.true_pairs / len(self.points3d)
-
-    @property
-    def cones(self) -> Cones:
-        return self.scene.cones
-
-    @property
-    def scores3d(self) -> Array:
-        """Probability that another photo of the place sees a point that l views see: l / (l + 6).
-
-        Of points of a view that overlaps by a third or more: 0.25 to 0.45 of those in 3 views, 0.6 to 0.85 in 16.
-        """
-        return np.asarray(self.scene.track_lengths / (self.scene.track_lengths + HALF_TRACK))
-
-    def reprojection_error(self, rotation: Array, translation: Array) -> float:
-        """Mean error of the true points, pixels; infinite for no pose, points behind it, or too few true pairs."""
-        seen = self.match3d >= 0
-        camera = self.points3d[seen] @ rotation.T + translation
-        if self.true_pairs < LEAST_PAIRS or not np.isfinite(camera).all() or not (camera[:, 2] > 0).all():
-            return np.inf
-        error = camera[:, :2] / camera[:, 2:] - self.points2d[self.match3d[seen]]
-        return float(self.focal * np.linalg.norm(error, axis=-1).mean())
+    def distance(self) -> float:
+        """Of the median point from the photo."""
+        return float(np.median(np.linalg.norm(self.points3d @ self.rotation.T + self.translation, axis=-1)))
 
 
 def photos(scene: Reconstruction, limit: int) -> list[ImagePoints]:
@@ -89,7 +66,7 @@ def overlapping(scene: Reconstruction, query: ImagePoints) -> list[tuple[float, 
     return sorted((pair for pair in shares if pair[0] >= LEAST_OVERLAP), key=lambda pair: -pair[0])
 
 
-def view_pair(
+def view_problem(
     scene: Reconstruction,
     query: ImagePoints,
     *,
@@ -98,11 +75,11 @@ def view_pair(
     seed: int = 0,
     most: int | None = MOST_POINTS,
     best: bool = False,
-) -> ViewPair:
+) -> ViewProblem:
     """One photo against the points that `views` views see, or, for 0, all points of the map.
 
     outliers: of each side at most this share of all points is without a partner; 1 for all that there are.
-    most: keypoints, and points that one view sees; true pairs and outliers are thinned alike, so that their ratio
+    most: keypoints, and points that one view sees; matches and outliers are thinned alike, so that their ratio
     stays. None for all.
     For one view it is drawn among those that overlap enough; for more, and if `best`, they are the ones that overlap
     most.
@@ -133,7 +110,7 @@ def view_pair(
     order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
     match3d = np.full(len(index3d), -1)
     match3d[:kept] = np.argsort(order2d)[:kept]
-    return ViewPair(
+    return ViewProblem(
         name=f"{scene.name}/{query.name}",
         points2d=points2d[order2d],
         points3d=scene.points3d[index3d[order3d]],
@@ -161,17 +138,8 @@ def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64])
     return SceneMap(scene.points3d[points], points, np.zeros(len(points), np.int32), views).seen_by(1)
 
 
-def scene_pairs(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewPair]:
-    """Pairs of at most `limit` photos of a scene. chosen: options of `view_pair`."""
+def scene_problems(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewProblem]:
+    """Problems of at most `limit` photos of a scene. chosen: options of `view_problem`."""
     scene = read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
     for query in photos(scene, limit):
-        yield view_pair(scene, query, **chosen)
-
-
-def disturbed(pair: ViewPair, degrees: float, share: float, rng: np.random.Generator) -> tuple[Array, Array]:
-    """The true pose, turned by `degrees` about a random axis and its camera moved by `share` of the distance."""
-    axis, shift = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
-    rotation = Rotation.from_rotvec(np.radians(degrees) * axis).as_matrix() @ pair.rotation
-    centre = -pair.rotation.T @ pair.translation
-    distance = np.median(np.linalg.norm(pair.points3d - centre, axis=-1))
-    return rotation, -rotation @ (centre + share * distance * shift)
+        yield view_problem(scene, query, **chosen)
