@@ -6,7 +6,7 @@ import os
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, lru_cache
 from pathlib import Path
@@ -61,8 +61,13 @@ def read_mesh(path: Path) -> Mesh:
     Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
     vertices.
     """
+    return _of_file(path, parse_mesh)
+
+
+def _of_file(path: Path, parse: Callable[[bytes, str], Any]) -> Any:
+    """What `parse` makes of the bytes and the suffix of a file; its errors name the file."""
     try:
-        return parse_mesh(path.read_bytes(), path.suffix)
+        return parse(path.read_bytes(), path.suffix.lower())
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
 
@@ -82,13 +87,7 @@ def read_vertices(path: Path) -> NDArray[np.float64]:
 
     Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
     """
-    content = path.read_bytes()
-    try:
-        if path.suffix.lower() == ".off":
-            return _different(_parse_off(content).vertices)
-        return _vertices(content, path.suffix.lower())
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from error
+    return _of_file(path, _vertices)
 
 
 def _parse_off(content: bytes) -> Mesh:
@@ -131,6 +130,8 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
 
 
 def _vertices(content: bytes, suffix: str) -> NDArray[np.float64]:
+    if suffix == ".off":
+        return _different(_parse_off(content).vertices)
     vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
     if not len(vertices):  # as a mesh, a cloud of points is empty
         vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64).reshape(-1, 3)

@@ -14,10 +14,9 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from bpnp.report.points import ProblemPoints, points_from, select_points, thin, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import report
-from bpnp.types import Batch
+from bpnp.training.task import NUMBER, number_globally
 
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
-NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
 class ResultsWriter(Callback):
@@ -47,7 +46,7 @@ class ResultsWriter(Callback):
     ) -> None:
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # of a task of the user's own
-        self._note_numbers(batch)
+        number_globally(batch, self.numbers, processes=trainer.world_size)
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
         points = points_from(outputs["prediction"], batch)
         self.chosen = select_points([*self.chosen, *points])
@@ -98,13 +97,6 @@ class ResultsWriter(Callback):
                     f"expected --ckpt_path, since {summary.parent} has the results of {checkpoint}, got none, which "
                     "would replace them; try --ckpt_path last, or --results.folder for another folder"
                 )
-
-    def _note_numbers(self, batch: Batch) -> None:
-        """Raises ValueError for a number that another problem had: of the two only one would be in the results."""
-        for number in batch.index.tolist():
-            if number in self.numbers:
-                raise ValueError(f"expected one number in `Batch.index` for each problem, got {number} again; {NUMBER}")
-            self.numbers.add(number)
 
     def _folder(self, trainer: Trainer) -> Path:
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"

@@ -29,6 +29,7 @@ Stage = Literal["val", "test"]
 DECAYED = 0.02  # of the learning rate, after its fall
 CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
 MOST_SKIPPED = 20  # steps in a row without a finite loss and gradient, which end the run
+NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
 class TrainingDivergedError(RuntimeError):
@@ -294,8 +295,7 @@ def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
     if len(set(index)) < len(index) or not numbers.isdisjoint(index):
         if processes > 1:
             raise ValueError(
-                f"expected one number in `Batch.index` for each problem, got some of {index} again; try "
-                "Batch.from_arrays(..., index=...) with the position of each problem in its data set"
+                f"expected one number in `Batch.index` for each problem, got some of {index} again; {NUMBER}"
             )
         first = max(numbers, default=-1) + 1
         unnamed = [name == str(number) for name, number in zip(batch.ids, index, strict=True)]

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.checks import check_positive
@@ -101,8 +101,7 @@ def maximise_inliers(
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
     """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
     count = count_inliers(rays, points, rotation, place, angle)
-    directions = torch.nn.functional.normalize(points - place, dim=-1)
-    weights = ((rays @ rotation) @ directions.mT >= math.cos(angle)).to(rays)
+    weights = within(rays, points, rotation, place, math.cos(angle)).to(rays)
     start = (rotation, -rotation @ place)
     turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in (weights, rays, points, *start)))
     if bool(stats.converged[0]):
@@ -157,13 +156,11 @@ def best_rotation(
     return Found(rotation, place, count, max(count, left), boxes, count >= left)
 
 
-def count_inliers(
-    rays: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
-    rotation: Float[Tensor, "3 3"],
-    place: Float[Tensor, "3"],
-    angle: float,
-) -> int:
+def count_inliers(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> int:
     """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
-    directions = torch.nn.functional.normalize(points - place, dim=-1)
-    return int(((rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING).any(-1).sum())
+    return int(within(rays, points, rotation, place, math.cos(angle) - ROUNDING).any(-1).sum())
+
+
+def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, cosine: float) -> Bool[Tensor, "m n"]:
+    """[cos angle(f_i, R (p_j - c)) >= cosine]."""
+    return (rays @ rotation) @ torch.nn.functional.normalize(points - place, dim=-1).mT >= cosine
