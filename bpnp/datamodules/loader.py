@@ -290,14 +290,15 @@ class ProblemDataModule(LightningDataModule):
         self.datasets: dict[str, ProblemDataset] = {}
 
     @abstractmethod
-    def _source(self, part: str, seed: tuple[int, int]) -> ProblemSource | None:
-        """The problems of a part; None if there are none and the stage can do without them."""
+    def _source(self, split: str, seed: tuple[int, int]) -> ProblemSource | None:
+        """The problems to train, val or test on; None if there are none and the stage can do without them."""
 
     def setup(self, stage: str | None = None) -> None:
         """Open the problems of a stage (fit, validate, test, predict; none for all). Raises ValueError for bad data."""
         for part in STAGES[stage]:
-            seed = (self.seed, min(PARTS.index(part), PARTS.index("test")))  # prediction has the problems of testing
-            if (source := self._source(part, seed)) is not None:
+            split = "test" if part == "predict" else part  # prediction has the problems of testing
+            seed = (self.seed, PARTS.index(split))
+            if (source := self._source(split, seed)) is not None:
                 fresh = self.fresh and part == "train"
                 augmentation = replace(self.augmentations.get(part, Augmentation()), outliers=self.outliers[part])
                 self.datasets[part] = ProblemDataset(source, augmentation, seed=seed, fresh=fresh)

@@ -264,8 +264,7 @@ class MeshDataModule(ProblemDataModule):
         if "train" in self.datasets and isinstance(source := self.datasets["train"].source, MeshSource):
             source.free()
 
-    def _source(self, part: str, seed: tuple[int, int]) -> MeshSource:
-        split = "test" if part == "predict" else part
+    def _source(self, split: str, seed: tuple[int, int]) -> MeshSource:
         store = self._store(split)
         return MeshSource(
             store,

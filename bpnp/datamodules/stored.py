@@ -152,9 +152,9 @@ class StoredDataModule(ProblemDataModule):
                 "*_scenes arguments, or other fractions"
             )
 
-    def _source(self, part: str, seed: tuple[int, int]) -> ProblemSource | None:
-        """The problems of a part's scenes; None if it has no scenes."""
-        scenes = [self.scenes[scene] for scene in self.split["test" if part == "predict" else part]]
+    def _source(self, split: str, seed: tuple[int, int]) -> ProblemSource | None:
+        """The problems of a split's scenes; None if it has no scenes."""
+        scenes = [self.scenes[scene] for scene in self.split[split]]
         return self._problems(scenes, seed) if scenes else None
 
     def _open(self) -> dict[str, Any]:

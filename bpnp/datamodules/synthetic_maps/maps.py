@@ -333,6 +333,5 @@ class SyntheticMapDataModule(ProblemDataModule):
         self.fresh = fresh_views
         self.augmentations = dict.fromkeys(PARTS, Augmentation(rotate=frame == "any"))
 
-    def _source(self, part: str, seed: tuple[int, int]) -> MapSource:
-        split = "test" if part == "predict" else part
+    def _source(self, split: str, seed: tuple[int, int]) -> MapSource:
         return MapSource(self.options, count=self.problems[split], seed=seed, label=split)
