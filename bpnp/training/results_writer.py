@@ -15,6 +15,7 @@ from bpnp.report.points import ProblemPoints, points_from, select_points, thin, 
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import report
 from bpnp.training.task import NUMBER, number_globally
+from bpnp.types import Batch
 
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
 
@@ -41,12 +42,17 @@ class ResultsWriter(Callback):
         self.rows, self.losses, self.chosen, self.points, self.numbers = [], {}, (), [], set()
         self._check_replaced(trainer)
 
+    def on_test_batch_start(
+        self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        if isinstance(batch, Batch):  # else of a task of the user's own
+            number_globally(batch, self.numbers, processes=trainer.world_size)
+
     def on_test_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # of a task of the user's own
-        number_globally(batch, self.numbers, processes=trainer.world_size)
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
         points = points_from(outputs["prediction"], batch)
         self.chosen = select_points([*self.chosen, *points])

@@ -243,7 +243,9 @@ class Unnumbered(BlindPnPTask):
 
 def test_the_results_of_any_task_have_every_problem(tmp_path: Path) -> None:
     run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
-    run.test(Unnumbered(small_net()), datamodule=OwnData(), verbose=False)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message="expected one problem per")
+        run.test(Unnumbered(small_net()), datamodule=OwnData(), verbose=False)
     rows = read_results(tmp_path / "test").of("ransac")
     assert [(row.index, row.id) for row in rows] == [(i, str(i)) for i in range(10)]
 
