@@ -125,7 +125,7 @@ def _with_camera(name: str, pair: Any, factor: float, options: Any) -> Problem:
 
     def run() -> Solution:
         camera = camera_from(np.diag([factor * pair.focal, factor * pair.focal, 1.0]))
-        cones = {"normals3d": pair.cones.axes, "cosines3d": pair.cones.cosines}
+        cones = {"normals3d": pair.scene.cones.axes, "cosines3d": pair.scene.cones.cosines}
         problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, **cones)
         return solutions_of({0: problem}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
 
