@@ -129,7 +129,8 @@ def _with_camera(name: str, pair: Any, factor: float, options: Any) -> Problem:
         problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, **cones)
         return solutions_of({0: problem}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
 
-    return Problem(name, run, [(pair.rotation, pair.translation)], pair.points3d)
+    points3d = pair.points3d if factor == 1 else pair.points3d[pair.match3d >= 0]  # the depth of what is seen
+    return Problem(name, run, [(pair.rotation, pair.translation)], points3d)
 
 
 def row_of(family: str, problem: Problem) -> dict[str, Any]:
