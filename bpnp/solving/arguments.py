@@ -249,8 +249,8 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where:
         if values is None:
             raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
     if max(getattr(values, "ndim", 1) for values in (labels2d, labels3d)) < 2:
-        given = ("labels2d", labels2d, counts[0]), ("labels3d", labels3d, counts[1])
-        return KnownLabels(*(_labels(*each, where) for each in given))
+        known2d = _labels("labels2d", labels2d, counts[0], where)
+        return KnownLabels(known2d, _labels("labels3d", labels3d, counts[1], where))
     image, scene = _classes("labels2d", labels2d, counts[0], where), _classes("labels3d", labels3d, counts[1], where)
     if image.shape[1] != scene.shape[1]:
         raise ValueError(
@@ -258,8 +258,8 @@ def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where:
         )
     odds = image / np.maximum(image.mean(0), 1e-12)
     odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
-    sure = (np.where(each.max(1) >= SURE, each.argmax(1), -1) for each in (image, scene))
-    return KnownLabels(*sure, odds, scene)
+    sure2d, sure3d = (np.where(each.max(1) >= SURE, each.argmax(1), -1) for each in (image, scene))
+    return KnownLabels(sure2d, sure3d, odds, scene)
 
 
 def _classes(name: str, values: Any, count: int, where: str) -> Array:

@@ -1,5 +1,6 @@
 import dataclasses
 import io
+import json
 import math
 from pathlib import Path
 
@@ -8,8 +9,9 @@ from report_data import row
 from rich.console import Console
 from rich.table import Table
 
-from bpnp.report import Results, learning_table, recall_table, report, results_table, write_results
+from bpnp.report import Results, learning_table, read_results, recall_table, report, results_table, write_results
 from bpnp.report.page.write import quartile_rows
+from bpnp.report.tables import RECALL_COLUMNS, RESULT_COLUMNS, run_rows
 from bpnp.report.terminal import SplitTable, number
 
 
@@ -137,3 +139,14 @@ def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Pat
     best = {value for row in quartile_rows(other, None) for _, value, best in row.cells if best}
     assert 1.0 in best
     assert 0.1 not in best
+
+
+def test_tables_show_the_figures_of_the_summary_and_compute_none_again(tmp_path: Path) -> None:
+    write_results(tmp_path, [row(i) for i in range(4)])
+    summary = tmp_path / "summary.json"
+    content = json.loads(summary.read_text())
+    content["estimates"]["pnp"] = dict.fromkeys(content["estimates"]["pnp"], 42.0)
+    summary.write_text(json.dumps(content))
+    (shown,) = run_rows({"run": read_results(tmp_path)})
+    columns = {column.key for column in (*RESULT_COLUMNS, *RECALL_COLUMNS)}
+    assert {shown.values[key] for key in columns} == {42.0}
