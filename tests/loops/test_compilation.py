@@ -64,33 +64,6 @@ def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(
     assert list(cache.rglob("*.nbi"))
 
 
-NOTE_STATE = """
-import atexit, gc
-from numba.core import event
-from numba.core.types import BaseFunction
-def note():
-    print(gc.isenabled(), BaseFunction.get_call_type.__module__)
-class Listener(event.Listener):
-    def on_start(self, event):
-        note()
-    def on_end(self, event):
-        pass
-event.register("numba:compile", Listener())
-atexit.register(note)
-"""
-
-
-@pytest.mark.parametrize(("before", "collects"), [("", True), ("gc.disable()\n", False)])
-def test_what_rests_while_a_loop_is_compiled_goes_on_afterwards(
-    before: str, collects: bool, package: Path, tmp_path: Path
-) -> None:
-    """Python's collector, and numba's own way to resolve the types of a call."""
-    printed, _ = started(package, str(tmp_path / "cache"), NOTE_STATE + before).communicate(timeout=120)
-    compiling, called, values, last = printed.splitlines()
-    assert (compiling, called, values) == ("False bpnp.loops.shortcuts", "False bpnp.loops.shortcuts", "8 10")
-    assert last == f"{collects} numba.core.types.functions"
-
-
 def test_a_change_of_a_file_with_a_called_function_compiles_again(package: Path, tmp_path: Path) -> None:
     cache = str(tmp_path / "cache")
     assert doubled(package, cache)[0] == "8 10\n"

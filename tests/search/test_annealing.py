@@ -2,7 +2,6 @@
 
 import time
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +10,6 @@ from planted import plant
 from bpnp.loops.parallel import Deadline
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, run_batch
 from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.dense import descend
 from bpnp.search.kernels.sides import lloyd
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
@@ -37,40 +35,6 @@ def coarse(scene: Scene, begin: Candidates) -> Candidates:
     """The ends of starts after the coarse stage."""
     sides = scene.clusters([stage.clusters for stage in DEFAULT.coarse])
     return anneal_on_clusters(scene, begin, DEFAULT.coarse, sides, DEFAULT.starts)
-
-
-def test_halving_keeps_the_likeliest_ends_and_anneals_fewer(scene: Scene, monkeypatch) -> None:
-    (stage,), sides = DEFAULT.coarse, scene.clusters([DEFAULT.coarse[0].clusters])
-    begin, steps = starts(scene, 1200), []
-
-    def counted(*arguments) -> None:
-        steps.append(len(arguments[2]) * len(arguments[4]))
-        descend(*arguments)
-
-    monkeypatch.setattr("bpnp.search.annealing.descend", counted)
-    ends = [
-        anneal_on_clusters(scene, begin, (replace(stage, halvings=halvings),), sides, DEFAULT.starts)
-        for halvings in ((), stage.halvings)
-    ]
-    assert steps[0] == 1200 * stage.iterations
-    assert sum(steps[1:]) < 0.8 * steps[0]
-    np.testing.assert_array_equal(ends[1].rotation[:10], ends[0].rotation[:10])
-    np.testing.assert_array_equal(ends[1].score[:10], ends[0].score[:10])
-
-
-def test_of_the_half_that_goes_on_the_likeliest_are_annealed_after_the_deadline(scene: Scene, monkeypatch) -> None:
-    calls = []
-
-    def until_late(*arguments) -> None:
-        begin = arguments[2].copy()
-        descend(*arguments)
-        calls.append((begin, arguments[2], arguments[6]))
-        scene.deadline = PASSED
-
-    monkeypatch.setattr("bpnp.search.annealing.descend", until_late)
-    coarse(scene, starts(scene, 500))
-    (_, rotation, score), (goes_on, *_), *_ = calls
-    np.testing.assert_array_equal(goes_on, rotation[np.argsort(-score)[: DEFAULT.starts_a_check]])
 
 
 def test_clusters_of_each_count_have_the_weight_of_all_points(scene: Scene) -> None:

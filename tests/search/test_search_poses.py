@@ -55,16 +55,6 @@ def test_search_finds_planted_poses(problem):
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=1e-5, rtol=0)
 
 
-def test_batches_grow_until_they_are_full():
-    sizes = [DEFAULT.batch(number) for number in (*range(7), 10**6)]
-    assert sizes == [48, 96, 192, 384, 768, 1200, 1200, 1200]
-    for stage in (*DEFAULT.coarse, *DEFAULT.middle):
-        kept = [DEFAULT.kept_by(stage, starts) for starts in sizes]
-        assert kept == sorted(kept)
-        assert kept[0] >= DEFAULT.least_kept
-        assert kept[-1] == stage.kept
-
-
 def test_the_budget_counts_turns_and_an_easy_problem_needs_few(problem):
     settings = SearchSettings(Schedule(turns=2), starts=96, first_starts=24)
     rng, seen = np.random.default_rng(0), []

@@ -121,7 +121,8 @@ def _log_likelihood(
         facing = -(cones[:, :3] @ rotation.transpose(0, 2, 1) * seen).sum(-1) - cones[:, 3]
         weight3d = weight3d * np.clip(0.5 + facing / (2 * settings.facing.softness), settings.facing.unseen, 1)
     variance = (scale**2)[:, None, None]
-    kernel = fits * np.exp((sets.bearings @ seen.transpose(0, 2, 1) - 1) / variance) / variance
+    cosine = np.minimum(sets.bearings @ seen.transpose(0, 2, 1), 1)  # beyond 1 where bearings are units in float32 only
+    kernel = fits * np.exp((cosine - 1) / variance) / variance
     explained = (kernel @ (weight3d / weight3d.sum(-1, keepdims=True))[..., None])[..., 0]
     outliers = 2 * math.pi * settings.outliers / sets.image.solid_angle * np.maximum(odds, 1e-6)
     return np.asarray(np.log((1 - settings.outliers) * explained + outliers) @ weight2d / weight2d.sum())

@@ -1,0 +1,100 @@
+"""Laws that every solver keeps, whatever the problem: order of the points, batch and padding, unit and origin."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from planted import Planted, degrees_between
+from planted_strategies import FEW, problems
+from small_data import small_net
+
+from bpnp import Batch, solve
+from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
+from bpnp.models import Search
+from bpnp.types import Pose
+
+Solver = Callable[[Batch], dict[str, Pose]]
+
+
+def by_module(module: torch.nn.Module) -> Solver:
+    def solved(batch: Batch) -> dict[str, Pose]:
+        with torch.no_grad():
+            return dict(module.eval()(batch).poses)
+
+    return solved
+
+
+SOLVERS = {"search": by_module(Search()), "net": by_module(small_net())}
+
+
+def batch_of(planted: Planted, image: torch.Tensor | None = None, scene: torch.Tensor | None = None) -> Batch:
+    """The first problem, its points in this order, in float32."""
+    points2d, points3d = planted.points2d[0].float(), planted.points3d[0].float()
+    return Batch.from_arrays(
+        [points2d if image is None else points2d[image]], [points3d if scene is None else points3d[scene]]
+    )
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+@FEW
+@given(planted=problems(outliers=0.0), others=problems(outliers=0.0))
+def test_neighbours_and_padding_do_not_matter(name: str, planted: Planted, others: Planted) -> None:
+    first, second = ([p.points2d[0].float(), p.points3d[0].float()] for p in (planted, others))
+    together = Batch.from_arrays([first[0], second[0]], [first[1], second[1]])
+    both, alone = SOLVERS[name](together), SOLVERS[name](batch_of(planted))
+    for estimate, pose in alone.items():
+        exact = {"rtol": 0, "atol": 0 if name != "net" else 1e-4, "equal_nan": True}
+        torch.testing.assert_close(both[estimate].rotation[:1], pose.rotation, **exact)
+        torch.testing.assert_close(both[estimate].translation[:1], pose.translation, **exact)
+
+
+@FEW
+@given(planted=problems(noise=0.0, least=20), seed=st.integers(0, 100))
+def test_the_order_of_the_points_changes_the_places_of_matches_alone(planted: Planted, seed: int) -> None:
+    points2d, points3d = planted.points2d[0].numpy(), planted.points3d[0].numpy()
+    rng = np.random.default_rng(seed)
+    image, scene = rng.permutation(len(points2d)), rng.permutation(len(points3d))
+    plain, shuffled = solve(points2d, points3d), solve(points2d[image], points3d[scene])
+    assert plain.verdict == shuffled.verdict == "confident"
+    assert degrees_between(plain.rotation, shuffled.rotation) < 1e-3
+    places = np.column_stack([image[shuffled.matches[:, 0]], scene[shuffled.matches[:, 1]]])
+    assert set(map(tuple, places.tolist())) == set(map(tuple, plain.matches.tolist()))
+
+
+@FEW
+@given(
+    planted=problems(noise=0.0, least=20),
+    unit=st.sampled_from([1e-3, 1.0, 250.0]),
+    origin=st.tuples(*3 * [st.floats(-100, 100)]),
+)
+def test_unit_and_origin_of_the_scene_change_the_translation_alone(
+    planted: Planted, unit: float, origin: tuple[float, float, float]
+) -> None:
+    points2d, points3d = planted.points2d[0].numpy(), planted.points3d[0].numpy()
+    plain, moved = solve(points2d, points3d), solve(points2d, unit * (points3d + origin))
+    assert plain.verdict == moved.verdict == "confident"
+    assert degrees_between(plain.rotation, moved.rotation) < 0.01
+    np.testing.assert_allclose(moved.centre / unit - origin, plain.centre, atol=2e-3)
+
+
+@FEW
+@given(planted=problems(size=2, least=6, most=20), seed=st.integers(0, 100))
+def test_layers_keep_the_order_and_the_unit(planted: Planted, seed: int) -> None:
+    """Sinkhorn's assignment is permuted with its cost; a pose's translation has the unit of the points."""
+    generator = torch.Generator().manual_seed(seed)
+    m, n = planted.points2d.shape[1], planted.points3d.shape[1]
+    rows, cols = torch.randperm(m, generator=generator), torch.randperm(n, generator=generator)
+    cost = torch.rand(2, m, n, generator=generator, dtype=torch.float64)
+    plan, permuted = (sinkhorn(c, tolerance=1e-12)[0] for c in (cost, cost[:, rows][:, :, cols]))
+    torch.testing.assert_close(permuted, plan[:, rows][:, :, cols], atol=1e-12, rtol=1e-9)
+    assignment, near = planted.permutation(), planted.near(0.02)
+    pose = weighted_pnp(assignment, planted.bearings, planted.points3d, *near)[:2]
+    tenfold = weighted_pnp(assignment, planted.bearings, 10 * planted.points3d, near[0], 10 * near[1])[:2]
+    torch.testing.assert_close(tenfold[0], pose[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(tenfold[1], 10 * pose[1], atol=1e-4, rtol=1e-5)
+    shuffled = ransac_pnp(assignment[:, rows][:, :, cols], planted.points2d[:, rows], planted.points3d[:, cols])
+    plain = ransac_pnp(assignment, planted.points2d, planted.points3d)
+    torch.testing.assert_close(shuffled[0], plain[0], atol=0.02, rtol=0)
