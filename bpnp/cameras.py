@@ -27,6 +27,7 @@ FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from t
     "OPENCV_FISHEYE": (2, 4),
 }
 BISECTIONS = 54  # of an angle, to the last digit
+CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
 MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
 
@@ -189,6 +190,22 @@ def scaled_camera(camera: Camera, size: tuple[int, int]) -> Camera:
     assert isinstance(scaled, Lens)
     scaled.camera.rescale(*size)
     return scaled
+
+
+def zoomed_camera(camera: Camera, zoom: float) -> Camera:
+    """The camera with so many times the focal length.
+
+    >>> zoomed_camera(camera_from(("SIMPLE_RADIAL", 1000, 800, [900, 500, 400, 0.1])), 2.0).focal
+    1800.0
+    """
+    if isinstance(camera, Pinhole):
+        return Pinhole(camera.matrix * [[zoom, zoom, 1.0], [zoom, zoom, 1.0], [1.0, 1.0, 1.0]])
+    zoomed = camera_from(plain_camera(camera))
+    assert isinstance(zoomed, Lens)
+    params = zoomed.camera.params
+    params[list(zoomed.camera.focal_length_idxs())] *= zoom
+    zoomed.camera.params = params
+    return zoomed
 
 
 def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:

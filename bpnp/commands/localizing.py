@@ -46,8 +46,8 @@ def localize(
         map: COLMAP model of the place, such as sparse/0.
         photos: photos, or folders of them; a photo in a folder has its path within it as its name, as in hloc.
         camera: of the photos, a file with a 3x3 matrix or COLMAP's MODEL,PARAMETERS; or a COLMAP model, such as MAP
-            itself, for that of its images, scaled to the photo's size. By default that of EXIF, else of images of the
-            map that have the photo's size.
+            itself, for that of its images, scaled to the photo's size; or unknown, to find the focal length with the
+            pose. By default that of EXIF, else of images of the map that have the photo's size, else unknown.
         views: text file of lines "photo view", the views of the map to try; the whole map by default.
         keypoints: hloc's HDF5 file of features or COLMAP's database; SIFT is detected by default.
         leave_one_out: the photos are views of the map, and each is taken out of it first.
@@ -119,10 +119,12 @@ def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outco
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
     """The camera of all photos, or the map whose cameras are scaled to each."""
     from bpnp.cameras import camera_from
-    from bpnp.maps.scene_map import SceneMap
-    from bpnp.solving.point_files import COLMAP_CAMERAS, read_camera
+    from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
+    from bpnp.maps.scene_map import UNKNOWN, SceneMap
 
     path = Path(text)
+    if text == UNKNOWN:
+        return UNKNOWN
     if path.is_file() and path.stem == COLMAP_CAMERAS:
         path = path.parent
     if text in ("map", "MAP") or (text and path.is_dir()):

@@ -22,6 +22,9 @@ def solve(
     *,
     camera: str | None = None,
     image: str | None = None,
+    image_size: str | None = None,
+    focal_error: float | None = None,
+    distortion: bool = False,
     output: Path | None = None,
     picture: Path | None = None,
     photo: Path | None = None,
@@ -48,12 +51,15 @@ def solve(
     Files: docs/solve.md.
 
     Args:
-        points2d: .npy, .csv or .txt; pixels with --camera, else x/z y/z; a column named label.
+        points2d: .npy, .csv or .txt; pixels with --camera or --image_size, else x/z y/z; a column named label.
         points3d: .npy, .csv, .txt, .ply, or a mesh (.obj, .off, .stl, .glb); columns x y z, nx ny nz, label; or a
             COLMAP model (its folder, or points3D.bin or .txt).
         camera: file with a 3x3 matrix, COLMAP's MODEL,PARAMETERS such as SIMPLE_PINHOLE,f,cx,cy, or a COLMAP model with
             one camera (its folder, or cameras.bin or .txt).
         image: name of the image whose camera to take, where the --camera model has several.
+        image_size: WIDTH,HEIGHT of the image in pixels, where its focal length is unknown: it is found with the pose.
+        focal_error: standard deviation of the focal length of --camera where that is rough, as a share of it.
+        distortion: find a radial coefficient too, with --image_size.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
         photo: the photo, of the size of the --camera or smaller, under the points of --picture.
@@ -76,8 +82,8 @@ def solve(
         device: such as cuda; cpu by default.
     """
     from bpnp.cameras import camera_from
+    from bpnp.commands.point_files import read_camera, read_points2d, read_points3d, read_prior
     from bpnp.search.starts import GravityPrior
-    from bpnp.solving.point_files import read_camera, read_points2d, read_points3d, read_prior
     from bpnp.solving.solve import solve as find_pose
 
     if (up_camera is None) != (up_scene is None):
@@ -101,6 +107,7 @@ def solve(
     image_points, labels2d = read_points2d(points2d)
     scene_points, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
     lens = None if camera is None else read_camera(camera, image)
+    size = None if image_size is None else _size(image_size)
     under = None if photo is None or picture is None else read_photo(photo)
     if under is not None:
         size_in_camera(under, camera_from(lens))
@@ -113,6 +120,9 @@ def solve(
             image_points,
             scene_points,
             lens,
+            image_size=size,
+            focal_error=focal_error,
+            distortion=distortion,
             normals3d=normals3d,
             labels2d=labels2d,
             labels3d=labels3d,
@@ -182,7 +192,7 @@ def verify(
         time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search around the pose.
     """
-    from bpnp.solving.point_files import read_camera, read_pairs, read_points2d, read_points3d, read_pose
+    from bpnp.commands.point_files import read_camera, read_pairs, read_points2d, read_points3d, read_pose
     from bpnp.solving.verify import verify as judge_pose
 
     given: tuple[Any, Any]
@@ -233,6 +243,8 @@ def solution_table(solution: "Solution") -> Table:
             table.add_row(name, _numbers(row))
         table.add_row("translation", _numbers(solution.translation))
         table.add_row("camera centre", _numbers(solution.centre))
+        if solution.focal_length_std:
+            table.add_row("focal length", f"{solution.focal_length:.6g} +- {solution.focal_length_std:.2g} px, found")
         smaller = min(len(solution.points2d), len(solution.points3d))
         table.add_row("inliers", f"{solution.inlier_count} of {smaller} ({100 * solution.inlier_ratio:.1f} %)")
         table.add_row(
@@ -246,6 +258,14 @@ def solution_table(solution: "Solution") -> Table:
         table.add_row("left out", f"{solution.stats.dropped2d} 2D points that could not be undistorted")
     table.add_row("seconds", f"{solution.seconds:.2f}")
     return table
+
+
+def _size(text: str) -> tuple[int, int]:
+    try:
+        width, height = (int(side) for side in text.split(","))
+        return width, height
+    except ValueError as error:
+        raise ValueError(f"expected --image_size as WIDTH,HEIGHT in pixels, such as 640,480, got {text!r}") from error
 
 
 def _numbers(values: Any) -> str:

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from bpnp.cameras import camera_from
 from bpnp.maps.views import Cones, View
+from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import checked_prior
+from bpnp.solving.focal_length import UnknownCamera, solved_with_focal_length
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
@@ -45,16 +47,23 @@ class Region:
         return PosePrior(self.view.rotation, self.view.translation, VIEW_DEGREES, VIEW_SHARE * self.distance)
 
 
-def problem_near(region: Region, keypoints: Any, camera: Any, prior: Any) -> Problem:
+def problem_near(region: Region, keypoints: Any, camera: Any, prior: Any, focal: UnknownFocal | None = None) -> Problem:
     """A photo's keypoints and the points of one region, with their cones."""
     lens, (axes, cosines) = camera_from(camera), region.cones
-    return problem_from(keypoints, region.points3d, lens, normals3d=axes, cosines3d=cosines, prior=prior)
+    return problem_from(keypoints, region.points3d, lens, normals3d=axes, cosines3d=cosines, prior=prior, focal=focal)
 
 
 def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | None, options: Options) -> Solution:
     """The best pose of a photo among the points of one region; its matches have their ids in the map."""
-    problem = problem_near(region, keypoints, camera, checked_prior(region.prior() if prior is None else prior))
-    solution = solutions_of({0: problem}, options)[0]
+    expected = checked_prior(region.prior() if prior is None else prior)
+    if isinstance(camera, UnknownCamera):
+
+        def problem_at(lens: Any, focal: UnknownFocal) -> Problem:
+            return problem_near(region, keypoints, lens, expected, focal)
+
+        solution = solved_with_focal_length(problem_at, camera, options)
+    else:
+        solution = solutions_of({0: problem_near(region, keypoints, camera, expected)}, options)[0]
     matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
     return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)
 
@@ -75,11 +84,11 @@ def counted(solution: Solution, tries: int) -> Solution:
     return replace(solution, log10_false_alarms=alarms, verdict="ambiguous", reason=reason)
 
 
-def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any, camera: Any) -> Solution:
+def among_all(solution: Solution, used: NDArray[np.int64], keypoints: Any) -> Solution:
     """The solution of some keypoints with its matches and points among all of them."""
     matches = np.column_stack([used[solution.matches[:, 0]], solution.matches[:, 1]])
-    lens = camera_from(camera)
-    return replace(solution, matches=matches, points2d=lens.normalise(np.asarray(keypoints, np.float64)))
+    points2d = camera_from(solution.camera).normalise(np.asarray(keypoints, np.float64))
+    return replace(solution, matches=matches, points2d=points2d)
 
 
 def rank(solution: Solution) -> tuple[int, float]:

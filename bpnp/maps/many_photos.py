@@ -18,7 +18,7 @@ from bpnp.cameras import camera_from, plain_camera
 from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import fingerprint, interruptions_later, write_text
 from bpnp.maps.photos import photo_keypoints
-from bpnp.maps.scene_map import SceneMap
+from bpnp.maps.scene_map import UNKNOWN, SceneMap
 from bpnp.solving.pictures import pose_text, save_over_photo
 from bpnp.solving.solution import Solution
 
@@ -66,6 +66,7 @@ def photo_task(
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
         camera, source = (camera or scene).camera_for(photo, exif=camera is None)
+        camera = UNKNOWN if camera is None else camera
     shown = None if views is None else list(views.get(name, ()))
     if shown is not None and not shown:
         raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
@@ -74,7 +75,8 @@ def photo_task(
         keypoints = keypoints.absolute()
         points = photo_keypoints(photo, keypoints, name)
         points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
-    lens, shared = plain_camera(camera_from(camera)), {"views": shown, **search}
+    lens = UNKNOWN if camera == UNKNOWN else plain_camera(camera_from(camera))
+    shared = {"views": shown, **search}
     made_with = {
         "photo": photo_content,
         "map": map_content,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import is_opencv, same_shape
+from bpnp.cameras import CENTRE, same_shape
 
 Array = NDArray[np.float64]
 Size = tuple[int, int]  # width and height, pixels
@@ -23,7 +23,6 @@ RESOLUTION_X, RESOLUTION_UNIT = 0xA20E, 0xA210
 PIXELS_X, PIXELS_Y = 0xA002, 0xA003
 DIAGONAL_35MM = 43.2666  # of a frame of 36 x 24 mm; equivalent focal lengths are by the diagonal (CIPA DCG-001)
 MILLIMETRES = {2: 25.4, 3: 10.0}  # of the resolution's unit, by its EXIF number: inch, centimetre
-CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
 MOST_DETECTED = 8192
 CONTRAST = 0.02  # of three layers together, of 1: COLMAP's peak_threshold of 0.02 / 3; half of OpenCV's default
 SQLITE = b"SQLite format 3\0"
@@ -101,13 +100,6 @@ def _opened(photo: Path) -> tuple[Size, dict[int, Any]]:
             return image.size, image.getexif().get_ifd(IFD_EXIF)
     except OSError as error:
         raise ValueError(f"expected a photo that can be read, got {photo}: {error}; try a JPEG or PNG file") from error
-
-
-def pixels_from(keypoints: Any, camera: Any) -> Any:
-    """The pixels (m, 2) of a list of cv2.KeyPoint as their camera counts them; anything else as it is."""
-    if not isinstance(keypoints, (list, tuple)) or not all(hasattr(point, "pt") for point in keypoints):
-        return keypoints
-    return np.array([point.pt for point in keypoints]).reshape(-1, 2) + (0.0 if is_opencv(camera) else CENTRE)
 
 
 def photo_keypoints(photo: Path, file: str | Path | None, name: str) -> Keypoints:

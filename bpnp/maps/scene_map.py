@@ -12,21 +12,24 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from torch import nn
 
-from bpnp.cameras import Camera, camera_from, image_size, is_opencv, same_shape, scaled_camera
+from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, same_shape, scaled_camera
+from bpnp.cameras import image_size as image_size_of
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
-from bpnp.maps.photos import CENTRE, focal_from_exif, photo_keypoints, photo_size, pixels_from
+from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
 from bpnp.maps.twins import Photo, without_twins
 from bpnp.maps.views import Array, Cones, View, covering_order, viewing_cones
 from bpnp.search.starts import PosePrior
-from bpnp.solving.arguments import source_from
+from bpnp.solving.arguments import check_inside, pixels_from, source_from
+from bpnp.solving.focal_length import UnknownCamera, unknown_camera
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options
 
 LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
+UNKNOWN = "unknown"  # focal length
 SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera is taken for that of a photo
 
 
@@ -143,8 +146,11 @@ class SceneMap:
     def localize(
         self,
         keypoints: Any,
-        camera: Any,
+        camera: Any = None,
         *,
+        image_size: Any = None,
+        focal_error: float | int | None = None,
+        distortion: bool = False,
         views: Iterable[str] | None = None,
         scores: Any = None,
         prior: PosePrior | None = None,
@@ -157,6 +163,8 @@ class SceneMap:
         keypoints: (m, 2) pixels, COLMAP's: (0.5, 0.5) is the centre of the first one; or a list of cv2.KeyPoint, which
             OpenCV counts from (0, 0).
         camera: as for `bpnp.solve`. With OpenCV's (K, distortion) pixels count as OpenCV's do, those in an array too.
+        image_size, focal_error, distortion: as for `bpnp.solve`, where the focal length is unknown or rough. It is
+            looked for where those of the views are too.
         views: names of views of the map that may show the same place, best first, from any image retrieval: the points
             that any of them sees are used near each; None to try the points of one view of the whole map after the
             other, those first that together see most of it.
@@ -175,7 +183,13 @@ class SceneMap:
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
-        start, pixels, best = Clock.now(), pixels_from(keypoints, camera), list[tuple[Region, Solution]]()
+        start, best = Clock.now(), list[tuple[Region, Solution]]()
+        pixels, lens = (
+            pixels_from(keypoints, image_size or camera),
+            self._lens(camera, image_size, focal_error, distortion),
+        )
+        if image_size is not None:
+            check_inside(pixels, image_size)
         views = None if views is None else list(views)
         if time_limit is not None and not 0 < time_limit < math.inf:
             raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
@@ -183,9 +197,9 @@ class SceneMap:
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
         module, regions, tries, over = source_from(solver), self.regions(views), 0, False
         deadline = Deadline(math.inf if time_limit is None else start + time_limit)
-        met = list[Solution]()
+        met, fewest = list[Solution](), 0.0
 
-        def near(options: Options, tries: int, region: Region, expected: PosePrior | None) -> Solution:
+        def near(camera: Any, options: Options, tries: int, region: Region, expected: PosePrior | None) -> Solution:
             return counted(near_view(region, used, camera, expected, options), tries)
 
         for settings in (BRIEF, LONGER):
@@ -197,21 +211,40 @@ class SceneMap:
                 limit = None if remaining is None else max(remaining, 1e-3)
                 asks = solver == "auto" and settings is LONGER  # not of every view of the map
                 options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
-                solution = near(options, tries, region, prior)
+                solution = near(lens, options, tries, region, prior)
                 if over := solution.verdict == "confident":
                     if prior is None:  # which would tell twins apart
                         place = self._region(region.view, np.arange(len(self.points3d))) if views is None else region
-                        photo = Photo(used, camera, place, partial(self.regions, views), seed, deadline)
-                        solution = without_twins(photo, solution, met, partial(near, options, tries))
+                        photo = Photo(used, solution.camera, place, partial(self.regions, views), seed, deadline)
+                        search = partial(near, solution.camera, options, tries)
+                        solution = without_twins(photo, solution, met, search)
                     best = [(region, solution)]
                     break
+                if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < fewest:
+                    fewest, lens = solution.log10_false_alarms, lens.near(camera_from(solution.camera))
                 met.append(solution)
                 best = sorted([*best, (region, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
             regions = iter([region for region, _ in best])
+            lens = lens._replace(alone=fewest < 0) if isinstance(lens, UnknownCamera) else lens
         if not best:
             raise ValueError("expected a map with views that see 4 or more points, got none")
-        solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels, camera)
+        solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels)
         return replace(solution, seconds=Clock.now() - start)
+
+    def _lens(
+        self, camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool
+    ) -> Camera | UnknownCamera:
+        """The camera of a photo, or what is known of it."""
+        if camera is None and image_size is None:
+            raise ValueError("expected a `camera`, or `image_size` where the focal length is unknown, got neither")
+        if image_size is None and focal_error is None and not distortion:
+            return camera_from(camera)
+        unknown = unknown_camera(camera, image_size, focal_error, distortion)
+        if camera is not None:
+            return unknown
+        known = [view.camera.focal / max(size) for view in self.views if (size := image_size_of(view.camera))]
+        smallest, largest = min([unknown.smallest, *known]), max([unknown.largest, *known])
+        return unknown._replace(smallest=smallest, largest=largest)
 
     def localize_photo(
         self,
@@ -229,7 +262,8 @@ class SceneMap:
         """The pose of a photo from its file, as `bpnp localize` finds it.
 
         camera: as for `localize`; None for the one that `camera_for` finds, that of the EXIF data, else of views of the
-            photo's size; a SceneMap for that of its views, scaled to the photo's size.
+            photo's size, else with an unknown focal length; a SceneMap for that of its views, scaled to the photo's
+            size; "unknown" for an unknown focal length whatever EXIF says.
         keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
             that of the file; None to detect SIFT keypoints.
         views, prior, solver, seed, time_limit: as for `localize`.
@@ -239,8 +273,8 @@ class SceneMap:
         path = Path(photo)
         if camera is None or isinstance(camera, SceneMap):
             camera = (camera or self).camera_for(path, exif=camera is None)[0]
-        size = photo_size(path)
-        if (known := image_size(camera_from(camera))) not in (None, size):
+        lens, size = None if camera in (None, UNKNOWN) else camera_from(camera), photo_size(path)
+        if lens is not None and (known := image_size_of(lens)) not in (None, size):
             raise ValueError(
                 f"expected photos of {known[0]} x {known[1]} pixels as the camera has, got {path.name} of {size[0]} x "
                 f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
@@ -249,7 +283,8 @@ class SceneMap:
         pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
         return self.localize(
             pixels,
-            camera,
+            lens,
+            image_size=size if lens is None else None,
             views=views,
             scores=points.scores,
             prior=prior,
@@ -258,38 +293,37 @@ class SceneMap:
             time_limit=time_limit,
         )
 
-    def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera, str]:
+    def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera | None, str]:
         """The camera of a photo, and in words where it is from.
 
         With the focal length of its EXIF data, the principal point in the middle; else that of views with images of its
-        size. Without `exif` that of views with images of its shape, scaled to its size.
-        Raises ValueError if there is none, or the focal lengths of such views differ by more than a twentieth.
+        size; None if there is none, or the focal lengths of such views differ by more than a twentieth. Without `exif`
+        that of views with images of its shape, scaled to its size: raises ValueError where that would be None.
         """
         size = width, height = photo_size(photo)
         if exif and (focal := focal_from_exif(photo)) is not None:
             return camera_from(("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))), "EXIF"
         owners = {id(view.camera): view for view in reversed(self.views)}
-        sizes = {key: image_size(view.camera) for key, view in owners.items()}
+        sizes = {key: image_size_of(view.camera) for key, view in owners.items()}
         fitting = [
             (scaled_camera(owners[key].camera, size), owners[key].name)
             for key, known in sizes.items()
             if known == size or (not exif and known is not None and same_shape(known, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
+        low, high = (fitting[k][0].focal if fitting else math.inf for k in (0, -1))
+        if exif and not high <= SAME_FOCAL * low < math.inf:
+            return None, "unknown focal length"
         if not fitting:
             others = ", ".join(sorted({"{} x {}".format(*known) for known in sizes.values() if known})[:4])
-            scalable = exif and any(known and same_shape(known, size) for known in sizes.values())
-            wanted = "a focal length in the EXIF data" if exif else "views of the shape"
             raise ValueError(
-                f"expected {wanted} of {photo} of {width} x {height} pixels{', or views of this size' * exif}, got "
-                f"{'neither' if exif else 'none'}: the map's are of {others}; try --camera with the camera of the photo"
-                f"{', or MAP for that of the views, scaled' * scalable}"
+                f"expected views of the shape of {photo} of {width} x {height} pixels, got none: the map's are of "
+                f"{others}; try --camera with the camera of the photo, or unknown"
             )
-        low, high = fitting[0][0].focal, fitting[-1][0].focal
         if high > SAME_FOCAL * low:
             raise ValueError(
-                f"expected views of {width} x {height} pixels with one focal length, as {photo} has none in its EXIF "
-                f"data, got {len(fitting)} of {low:.0f} to {high:.0f} pixels; try --camera with the camera of the photo"
+                f"expected views of the shape of {photo} with one focal length, got {len(fitting)} of {low:.0f} to "
+                f"{high:.0f} pixels; try --camera with the camera of the photo, or unknown"
             )
         camera, name = fitting[len(fitting) // 2]
         return camera, f"view {name} of the map"

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,18 @@ SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
 LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
 
 
+class UnknownFocal(NamedTuple):
+    """What is known of a focal length that is fitted with the pose.
+
+    log_range: logarithm of the largest over the smallest that was possible. sigma: standard deviation of its logarithm,
+    infinite where nothing is expected. offset: logarithm of that of these bearings over the expected one.
+    """
+
+    log_range: float
+    sigma: float = math.inf
+    offset: float = 0.0
+
+
 @dataclass(frozen=True, eq=False)
 class PointSets:
     """One pair.
@@ -31,7 +44,7 @@ class PointSets:
     one; the labels are then those of points that are sure of theirs, for searching.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
     prior: what is known of the pose. log10_tried: of the number of poses that were tried; None for as many as triples
-    of matches give.
+    of matches give. focal: what is known of the focal length with which the bearings were made; None if it is given.
     """
 
     bearings: Array
@@ -47,6 +60,7 @@ class PointSets:
     log10_tried: float | None = None
     odds2d: Array | None = None
     classes3d: Array | None = None
+    focal: UnknownFocal | None = None
 
     @property
     def cones3d(self) -> Array | None:
@@ -81,6 +95,11 @@ class PointSets:
     def pairs_that_fix(self) -> int:
         """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
         return 2 if self.knows_rotation or isinstance(self.prior, GravityPrior) else 3
+
+    @property
+    def fitted(self) -> int:
+        """Numbers that are fitted to the image points."""
+        return 2 * self.pairs_that_fix + (self.focal is not None)
 
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.

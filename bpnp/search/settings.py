@@ -272,6 +272,7 @@ class Evidence:
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
         tenth wrong is believed half as often again.
     contested, repetitions: constants of these alternatives.
+    focal: share by which a focal length that is fitted may be off, once in a thousand.
     """
 
     false_alarms: float = -2.0
@@ -285,6 +286,7 @@ class Evidence:
     focal_chance: float = 0.01
     contested: Contested = Contested()
     repetitions: Repetitions = Repetitions()
+    focal: float = 0.2
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.alternatives import contesting, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.uncertainty import linearised, rotation_bound
+from bpnp.search.evidence.uncertainty import focal_bound, linearised, rotation_bound
 from bpnp.search.evidence.unseen import log10_missed
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT, Evidence
@@ -134,6 +134,11 @@ def judged(
         off = math.degrees(rotation_bound(sets, linear, count))
         if not math.isfinite(off):
             reason = f"{chance}, but its {count:.0f} matches do not fix its rotation"
+            return SearchResult(candidates, "ambiguous", reason, batches, settled)
+        if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:
+            reason = (
+                f"{chance}, but focal length and distance cannot be told apart: both may be {100 * share:.0f} % off"
+            )
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         known = f"; its rotation is known to {off:.1g} deg, but for one case in a thousand"
         against += [misfit(linear, count, rule), contesting(candidates, sets, rule)]

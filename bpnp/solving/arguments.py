@@ -13,7 +13,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from torch import nn
 
-from bpnp.cameras import Camera, camera_from
+from bpnp.cameras import CENTRE, Camera, is_opencv
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = npt.NDArray[np.float64]
@@ -81,14 +81,14 @@ def each_of(name: str, value: Any, count: int) -> list[Any]:
     return value
 
 
-def each_camera(value: Any, count: int) -> list[Camera | None]:
-    """One camera for all, or a list or stack of them. A 3x3 matrix as a list of lists is one camera."""
+def each_camera(value: Any, count: int) -> list[Any]:
+    """One camera for all, or a list or stack of them, as they are. A 3x3 matrix as a list of lists is one camera."""
     if getattr(value, "ndim", 2) == 3:
         value = list(value)
     elif isinstance(value, list) and value and not isinstance(value[0], tuple):
         rows = isinstance(value[0], str) or np.ndim(value[0]) == 1  # (model, parameters), or the rows of one matrix
         value = tuple(value) if rows else value
-    return [None if one is None else camera_from(one) for one in each_of("camera", value, count)]
+    return each_of("camera", value, count)
 
 
 def positive(name: str, value: float | int | None, *, finite: bool = False) -> float | None:
@@ -156,11 +156,44 @@ def numbers(name: str, values: Any, where: str) -> Array:
         raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
 
 
+def pixels_from(values: Any, camera: Any) -> Any:
+    """The pixels (m, 2) of a list of cv2.KeyPoint as their camera, as a user gives it, counts them; anything else as it
+    is."""
+    if not isinstance(values, (list, tuple)) or not len(values) or not all(hasattr(value, "pt") for value in values):
+        return values
+    return np.array([value.pt for value in values]) + (0.0 if camera is None or is_opencv(camera) else CENTRE)
+
+
+def checked_size(image_size: Any) -> tuple[int, int]:
+    """Width and height of images in pixels. Raises ValueError for anything else."""
+    try:
+        width, height = (int(side) for side in image_size)
+        whole = (width, height) == tuple(image_size)
+    except (TypeError, ValueError):
+        whole = False
+    if not whole or min(width, height) < 1:
+        raise ValueError(f"expected `image_size` as (width, height) in whole pixels, got {image_size!r:.60}")
+    return width, height
+
+
+def check_inside(points2d: Any, size: Any) -> None:
+    """Pixels (m, 2) within an image of this width and height, to a pixel."""
+    pixels, sides = keypoints(points2d, ""), np.array(checked_size(size))
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise ValueError(f"expected pixels `points2d` of shape (m, 2) with an `image_size`, got {pixels.shape}")
+    outside = ~((pixels >= -1) & (pixels <= sides + 1) | ~np.isfinite(pixels)).all(-1)
+    if outside.any():
+        fits_swapped = (pixels <= sides[::-1] + 1).all()
+        hint = "are width and height swapped?" if fits_swapped else "try the size of the image in which they are"
+        raise ValueError(
+            f"expected `points2d` inside the {sides[0]} x {sides[1]} pixels of `image_size`, got "
+            f"{pixels[outside][0].round(1).tolist()}; {hint}"
+        )
+
+
 def keypoints(values: Any, where: str) -> Array:
-    """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays or lists of cv2.KeyPoint, and
-    rows of four or more numbers that begin with x and y (scale, orientation, strength)."""
-    if isinstance(values, (list, tuple)) and len(values) and all(hasattr(value, "pt") for value in values):
-        values = [value.pt for value in values]
+    """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays, and rows of four or more
+    numbers that begin with x and y (scale, orientation, strength)."""
     points = one_row_each(numbers("points2d", values, where))
     return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
 

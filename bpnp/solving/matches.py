@@ -65,7 +65,7 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         reprojection_error=float(errors.mean()) if len(matches) else math.nan,
         reprojection_error_deg=float(angles.mean()) if len(matches) else math.nan,
         unit=problem.unit,
-        covariance=np.full((6, 6), math.nan) if covariance is None else covariance,
+        covariance=_of_pixels(problem, covariance),
         candidates=candidates,
         verdict=result.verdict,
         reason=result.reason,
@@ -83,6 +83,7 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, 
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         unit=problem.unit,
+        covariance=_of_pixels(problem, None),
         verdict="failed",
         reason=reason,
         stats=SolutionStats(dropped2d=dropped, taken2d=taken),
@@ -91,6 +92,15 @@ def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, 
         points3d=problem.points3d,
         camera=problem.camera,
     )
+
+
+def _of_pixels(problem: Problem, covariance: Array | None) -> Array:
+    """A covariance with the focal length in pixels instead of its logarithm, NaN for none."""
+    size = 6 if problem.sets.focal is None else 7
+    if covariance is None or problem.camera is None:
+        return np.full((size, size), math.nan) if covariance is None else covariance
+    unit = np.where(np.arange(size) < 6, 1.0, problem.camera.focal)
+    return np.asarray(covariance * np.outer(unit, unit))
 
 
 def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: float) -> tuple[Array, Array]:

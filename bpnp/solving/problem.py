@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from bpnp.cameras import Camera, in_front
 from bpnp.geometry import MIN_POINTS
-from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.point_sets import PointSets, UnknownFocal, faces
 from bpnp.search.starts import GravityPrior, PosePrior
 from bpnp.solving.arguments import (
     Array,
@@ -126,14 +126,15 @@ def problem_from(
     scores3d: Any = None,
     cosines3d: Array | None = None,
     prior: Prior | None = None,
+    focal: UnknownFocal | None = None,
     where: str = "",
 ) -> Problem:
     """Check the arrays of one problem; they are as for `bpnp.solve`, camera and prior are checked.
 
-    cosines3d: as in `PointSets`, not checked. where: added to the errors, to name the problem. Pixels that cannot be
-    undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape, swapped, fewer points
-    than fix a pose (3 where gravity is known, else 4), NaN, pixels without a camera or the reverse, normals, labels or
-    scores that do not go with the points.
+    cosines3d, focal: as in `PointSets`, not checked. where: added to the errors, to name the problem. Pixels that
+    cannot be undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape, swapped,
+    fewer points than fix a pose (3 where gravity is known, else 4), NaN, pixels without a camera or the reverse,
+    normals, labels or scores that do not go with the points.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
     image, scene = keypoints(points2d, where), one_row_each(numbers("points3d", points3d, where))
@@ -174,6 +175,7 @@ def problem_from(
         prior=known,
         odds2d=None if labels is None or labels.odds2d is None else labels.odds2d[usable],
         classes3d=None if labels is None else labels.classes3d,
+        focal=focal,
     )
     degenerate = degenerate_points(sets.bearings, scene, fewest)
     return Problem(sets, usable, image[usable], unit, plane, scene, origin, camera, degenerate, prior)

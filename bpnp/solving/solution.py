@@ -76,7 +76,7 @@ class Solution:
 
         with the gradients g_i of each image point's log-likelihood, its partner unknown (Louis 1982, White 1982;
         docs/verdict.md). NaN if the verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at
-        infinity.
+        infinity; (7, 7) where the focal length was not known: the last row and column are its error, pixels.
     candidates: the distinct poses that were found, best first; the first is this one.
     verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits
         better than chance, and this one, if there is one, is a guess. reason: why, in words.
@@ -86,7 +86,7 @@ class Solution:
     view, point_ids: of a photo in a `SceneMap`: the view whose points gave the pose, and the ids (n,) of `points3d` in
         the map, to which `matches` then refer; `match_places` are their places. None for points without a map.
     points2d: (m, 2) normalised image coordinates, NaN where a given point has none. points3d: (n, 3) as given.
-    camera: that of the pixels that were given, None for normalised coordinates and bearings.
+    camera: that of the pixels that were given, or was found; None for normalised coordinates and bearings.
     """
 
     rotation: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
@@ -136,6 +136,16 @@ class Solution:
         if len(self.covariance) == ROTATION:
             return math.nan
         return _largest(centre_covariance(self.covariance, self.translation))
+
+    @property
+    def focal_length(self) -> float:
+        """Of the camera, pixels: given, or found; NaN without a camera."""
+        return math.nan if self.camera is None else self.camera.focal
+
+    @property
+    def focal_length_std(self) -> float:
+        """Standard deviation of a focal length that was found, pixels; 0 for one that was given."""
+        return math.sqrt(self.covariance[6, 6]) if len(self.covariance) == 7 else 0.0
 
     @property
     def found(self) -> bool:
@@ -194,6 +204,7 @@ class Solution:
         pose = {name: getattr(self, name) if self.found else None for name in ("rotation", "translation", "centre")}
         content = {"format": FORMAT} | vars(self) | pose
         content |= {"rotation_std_deg": self.rotation_std_deg, "centre_std": self.centre_std}
+        content |= {"focal_length": self.focal_length, "focal_length_std": self.focal_length_std}
         content |= {"candidates": [vars(candidate) for candidate in self.candidates], "stats": vars(self.stats)}
         return json.dumps(_plain(content), allow_nan=False)
 

@@ -1,6 +1,7 @@
 """Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,18 +9,23 @@ import numpy as np
 import torch
 from torch import nn
 
+from bpnp.cameras import Camera, camera_from
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.point_sets import UnknownFocal
 from bpnp.solving.arguments import (
     Prior,
+    check_inside,
     checked_prior,
     device_from,
     each_camera,
     each_of,
     each_set,
+    pixels_from,
     positive,
     source_from,
 )
+from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
 from bpnp.solving.infinity import refuse_at_infinity, solve_directions
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Solution
@@ -33,6 +39,9 @@ def solve(
     points3d: Any,
     camera: Any = None,
     *,
+    image_size: Any = None,
+    focal_error: float | int | None = None,
+    distortion: bool = False,
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
@@ -51,10 +60,17 @@ def solve(
     """Camera pose from 2D and 3D points that nobody has matched.
 
     points2d: (m, 2) pixels with a `camera`; without one normalised image coordinates, or (m, 3) unit bearings. numpy or
-        torch; also OpenCV's (m, 1, 2) arrays and keypoints, and rows of four or more numbers that begin with x and y.
+        torch; also OpenCV's (m, 1, 2) arrays, rows of four or more numbers that begin with x and y, and lists of
+        cv2.KeyPoint, which get their half pixel but with OpenCV's (K, distortion): elsewhere (0.5, 0.5) is the centre
+        of the first pixel, as in COLMAP.
     points3d: (n, 3) points of the scene, in any unit.
-    camera: 3x3 matrix K; (COLMAP model, parameters) or (model, width, height, parameters); or a pycolmap.Camera.
+    camera: 3x3 matrix K; OpenCV's (K, distortion); (COLMAP model, parameters) or (model, width, height, parameters); or
+        a pycolmap.Camera.
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
+    image_size: width and height of the image, pixels, where the focal length is unknown: it is found with the pose, the
+        principal point taken to be in the middle. `Solution.camera` is what was found. focal_error: standard deviation
+        of the focal length of `camera` where that is rough, as a share of it, such as 0.1. distortion: whether a radial
+        coefficient is found too, where the points support one.
     normals3d: (n, 3) outward unit normals: a point that faces away from the camera is not seen.
     labels2d, labels3d: (m,) and (n,) integers, such as colours, classes or identities: only points of one label are
         matched; -1 fits any. Or probabilities (m, c) and (n, c) of c classes, whose rows add up to 1, such as a
@@ -97,6 +113,9 @@ def solve(
     if at_infinity:
         module = None if solver in ("auto", "search") else solver
         refuse_at_infinity(
+            image_size=image_size,
+            focal_error=focal_error,
+            distortion=distortion or None,
             normals3d=normals3d,
             labels2d=labels2d,
             labels3d=labels3d,
@@ -107,7 +126,7 @@ def solve(
             device=device,
         )
         return solve_directions(
-            points2d,
+            pixels_from(points2d, camera),
             points3d,
             camera,
             scores2d=scores2d,
@@ -119,6 +138,9 @@ def solve(
         [points2d],
         [points3d],
         camera,
+        image_size=image_size,
+        focal_error=focal_error,
+        distortion=distortion,
         normals3d=[normals3d],
         labels2d=[labels2d],
         labels3d=[labels3d],
@@ -140,6 +162,9 @@ def solve_many(
     points3d: Any,
     camera: Any = None,
     *,
+    image_size: Any = None,
+    focal_error: float | int | None = None,
+    distortion: bool = False,
     normals3d: Any = None,
     labels2d: Any = None,
     labels3d: Any = None,
@@ -196,17 +221,25 @@ def solve_many(
     }
     sets3d, cameras = each_set("points3d", points3d, count), each_camera(camera, count)
     priors = [checked_prior(each) for each in each_of("prior", prior, count)]
-    problems = {
-        i: problem_from(
-            sets2d[i],
+
+    def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
+        return problem_from(
+            pixels[i],
             sets3d[i],
-            cameras[i],
+            lens,
             **{name: values[i] for name, values in known.items()},
             prior=priors[i],
+            focal=focal,
             where=f" in problem {i}" if count > 1 else "",
         )
-        for i in range(count)
-    }
+
+    pixels = [pixels_from(points, image_size or one) for points, one in zip(sets2d, cameras, strict=True)]
+    if distortion or (image_size or focal_error) is not None:
+        unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
+        for points in pixels if image_size is not None else ():
+            check_inside(points, image_size)
+        return [solved_with_focal_length(partial(problem, i), one, options) for i, one in enumerate(unknown)]
+    problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
     solutions = solutions_of(problems, options)
     shared_lights(problems, solutions, lambda i, problem: solutions_of({i: problem}, options)[i])
     return [solutions[i] for i in range(count)]

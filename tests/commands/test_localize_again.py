@@ -205,10 +205,20 @@ def test_the_camera_of_views_of_the_same_size_is_taken_and_named(
     np.testing.assert_allclose(solution.rotation, place.poses()["a.png"], atol=1e-12)
     assert solution.camera.focal == 520
     Image.new("L", (WIDTH // 2, HEIGHT // 2)).save(place.folder / "half.png")
-    error = fails(*place.command("half.png"))
-    assert "or views of this size, got neither: the map's are of 800 x 600; try --camera with the camera" in error
-    assert error.rstrip().endswith("of the photo, or MAP for that of the views, scaled")
+    assert scene.camera_for(place.folder / "half.png") == (None, "unknown focal length")
+    assert "expected keypoints of half.png" in fails(*place.command("half.png"))
     for given in ("MAP", str(place.folder / "map"), str(place.folder / "map/cameras.bin")):
         camera, source = scene.camera_for(place.folder / "half.png", exif=False)
         assert (camera.focal, source) == (260, "view photo 0.jpg of the map")
         assert "expected keypoints of half.png" in fails(*place.command("half.png", more=("--camera", given)))
+
+
+def test_a_focal_length_is_found_with_the_pose(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a photo whose camera is unknown; the map's views, which have its size, tell the answer."""
+    place.run("a.png")
+    before = place.poses()["a.png"]
+    place.run("a.png", more=("--camera", "unknown"))
+    assert "solved again, with other options: a.png" in capsys.readouterr().out
+    np.testing.assert_allclose(place.poses()["a.png"], before, atol=2e-3)
+    solution = Solution.from_json(place.folder / "out/solutions/a.png.json")
+    assert abs(solution.focal_length - 520) < 4 * solution.focal_length_std < 50

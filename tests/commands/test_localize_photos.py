@@ -94,8 +94,8 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         assert error.rstrip().endswith(f"got {swapped}; are MAP and PHOTO swapped?")
     assert f"folder of a COLMAP model, got {plain[2]}\n" in fails("localize", plain[2], plain[2], *out)
     error = fails(*plain, *out)
-    assert "focal length in the EXIF data" in error
-    assert "or views of this size, got neither: the map's are of 3072 x 2048; try --camera with the camera" in error
+    assert "expected a photo with keypoints, got none" in error
+    assert "views of the shape of" in fails(*plain, "--camera", str(model), *out)
     for size, parameters in (("128 x 96", "128,96,80,64,48"), ("64 x 36", "64,36,80,32,18")):
         error = fails(*plain, "--camera", f"SIMPLE_PINHOLE,{parameters}", *out)
         assert f"expected photos of {size} pixels as the camera has, got plain.jpg of 64 x 48" in error

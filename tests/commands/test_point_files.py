@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from bpnp.solving.point_files import read_camera, read_points2d, read_points3d
+from bpnp.commands.point_files import read_camera, read_points2d, read_points3d
 
 POINTS = np.random.default_rng(0).normal(size=(20, 3))
 

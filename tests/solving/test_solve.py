@@ -391,6 +391,18 @@ def test_the_seed_decides() -> None:
     assert replace(first, seconds=0.0).to_json() == replace(second, seconds=0.0).to_json()
 
 
+def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel() -> None:
+    """With a camera of COLMAP's they get half a pixel; with OpenCV's (K, distortion) they have it."""
+    planted = plant(1, 40)
+    pixels = 500 * planted.points2d[0].numpy() + [400, 300]
+    points = [cv2.KeyPoint(float(x - 0.5), float(y - 0.5), 3.0) for x, y in pixels]
+    opencv = (np.array([[500, 0, 399.5], [0, 500, 299.5], [0, 0, 1.0]]), np.zeros(5))
+    for camera in (("SIMPLE_PINHOLE", (500, 400, 300)), opencv):
+        solution = solve(points, planted.points3d[0], camera)
+        assert solution.reprojection_error < 1e-3
+        np.testing.assert_allclose(solution.rotation, planted.rotation[0], atol=1e-5)
+
+
 @pytest.mark.parametrize("form", ["opencv", "keypoints", "rows"])
 def test_what_detectors_return_is_taken(form: str) -> None:
     example = load("mesh")

@@ -22,6 +22,9 @@ one scale to the next finer one s' counts with 1 / c_i(s'), over its expected va
 than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was looked at.
 A prior reduces T to the share of the poses that it allows.
 
+Where the focal length is fitted too, four pairs fix the seven unknowns: T = 2 (m)_4 (n)_4 / 4!, or that of a pose times
+the focal lengths that can be told apart, if these are fewer; and the four largest x_i are left out.
+
 A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
 factor of two of it count; the terms from four times it on say how well a rougher alignment explains the image.
 
@@ -44,7 +47,7 @@ from bpnp.search.point_sets import PointSets, faces
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-FIXING = 3  # pairs that fix a pose
+FIXING = 3  # pairs that fix a pose; one more fixes a focal length too
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
@@ -81,14 +84,15 @@ def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array, sca
 
 def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
     """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None."""
-    tests, cells = log10_tests(sets), np.minimum(log10_cells(sets.image), log10_tests(sets))
+    tests = log10_tests(sets)
+    cells = np.minimum(log10_cells(sets.image) + log10_focal_lengths(sets), tests)
     share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
     none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
-    if len(sets.bearings) > FIXING:
+    if len(sets.bearings) > _fixing(sets):
         for k in range(len(none)):
             seen = directions_of(sets, rotations[k], translations[k])
-            if int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
+            if int(np.isfinite(seen[:, 0]).sum()) <= _fixing(sets):
                 continue
             ratio = np.ones(len(sets.image.scales)) if scales is None else _ratio(sets.image, float(scales[k]))
             own, rough = _is_own(ratio), ratio >= ROUGH
@@ -107,12 +111,31 @@ def log10_tests(sets: PointSets) -> float:
     """
     if sets.log10_tried is not None:
         return sets.log10_tried
+    tests = _log10_choices(sets, FIXING)
+    if sets.focal is None:
+        return tests
+    return min(_log10_choices(sets, FIXING + 1), tests + float(log10_focal_lengths(sets)[0]))
+
+
+def _log10_choices(sets: PointSets, pairs: int) -> float:
     m, n = len(sets.bearings), len(sets.points3d)
-    choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(FIXING))
+    choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
     if sets.labels2d is not None and sets.labels3d is not None:
         groups = label_groups(np.arange(m), sets.labels2d, sets.labels3d, n)
-        choices = min(choices, float(math.comb(sum(len(rows) * len(columns) for rows, columns in groups), FIXING)))
+        choices = min(choices, float(math.comb(sum(len(rows) * len(columns) for rows, columns in groups), pairs)))
     return math.log10(2 * max(choices, 1.0))
+
+
+def _fixing(sets: PointSets) -> int:
+    return FIXING + (sets.focal is not None)
+
+
+def log10_focal_lengths(sets: PointSets) -> Array:
+    """log10 (S,) of the number of focal lengths that differ at each scale of the image: steps of s / h; 0 of a known
+    one."""
+    if sets.focal is None:
+        return np.zeros(len(sets.image.scales))
+    return np.asarray(np.log10(np.maximum(sets.focal.log_range * sets.image.spread / sets.image.scales, 1.0)))
 
 
 def log10_cells(image: ImageStatistics) -> Array:
@@ -173,7 +196,8 @@ def _log_evidence(sets: PointSets, seen: Array, finest: int) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
     points seen in directions (n, 3); -inf at the scales before the finest one, which are not looked at."""
     image, terms = sets.image, _terms(sets, seen, finest)
-    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - FIXING, 0)[-FIXING:]
+    count = _fixing(sets)
+    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - count, 0)[-count:]
     evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
     total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
     return np.r_[np.full(finest, -math.inf), total]

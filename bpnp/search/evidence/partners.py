@@ -81,6 +81,11 @@ def partners(
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 
+def by_focal_length(seen: Array) -> Array:
+    """Derivatives (k, 3, 1) of directions (k, 3) by the logarithm of the focal length."""
+    return np.asarray(across(seen) @ (seen * (1, 1, 0))[..., None])
+
+
 class Zoomed(NamedTuple):
     """A pose with a focal length, `zoom` over the given one, that some image points are compared with.
 
@@ -167,8 +172,13 @@ def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: fl
 
 def _stepped(sets: PointSets, chosen: Labels, scale: float, at: Zoomed) -> Zoomed | None:
     """After a Gauss-Newton step of pose and focal length, with the matches of some scale."""
-    damped = at.products + np.diag(1e-6 * np.diag(at.products) + 1e-15)
-    step = np.linalg.solve(damped, at.gradient)
+    products, gradient = at.products, at.gradient
+    if sets.focal is not None and math.isfinite(sets.focal.sigma):
+        products, gradient = products.copy(), gradient.copy()
+        products[-1, -1] += (scale / sets.focal.sigma) ** 2
+        gradient[-1] -= (scale / sets.focal.sigma) ** 2 * (sets.focal.offset + math.log(at.zoom))
+    damped = products + np.diag(1e-6 * np.diag(products) + 1e-15)
+    step = np.linalg.solve(damped, gradient)
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))
     return _zoomed(sets, chosen, scale, turn @ at.rotation, at.middle + step[3:6], zoom)

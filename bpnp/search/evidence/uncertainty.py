@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.partners import Zoomed, across, at_other_focal_length, facing, partners, with_focal_length
+from bpnp.search.evidence.partners import (
+    Zoomed,
+    across,
+    at_other_focal_length,
+    by_focal_length,
+    facing,
+    partners,
+    with_focal_length,
+)
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT, Evidence
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -52,7 +60,7 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     [7.8, 0.7]
     """
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else _bound(covariance[:3, :3], 2 * count - 2 * sets.pairs_that_fix)
+    return math.inf if covariance is None else _bound(covariance[:3, :3], 2 * count - sets.fitted)
 
 
 def centre_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
@@ -60,7 +68,13 @@ def centre_bound(sets: PointSets, linear: "Linearised | None", count: float) -> 
     covariance = local_covariance(linear)
     if covariance is None or linear is None:
         return math.inf
-    return _bound(centre_covariance(covariance, linear.middle), 2 * count - 2 * sets.pairs_that_fix)
+    return _bound(centre_covariance(covariance, linear.middle), 2 * count - sets.fitted)
+
+
+def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
+    """Share by which the focal length may be wrong, exceeded once in a thousand; see `_bound`."""
+    covariance = local_covariance(linear)
+    return math.inf if covariance is None else math.expm1(_bound(covariance[POSE:, POSE:], 2 * count - sets.fitted))
 
 
 def _bound(covariance: Array, free: float) -> float:
@@ -77,7 +91,8 @@ def _bound(covariance: Array, free: float) -> float:
 
 
 def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, origin: Array) -> Array | None:
-    """Covariance (6, 6) of a pose, None where the points do not fix it.
+    """Covariance (6, 6) of a pose, None where the points do not fix it; (7, 7) with the logarithm of a focal length
+    that is fitted.
 
     Of (w, v): the true pose is R' = exp([w]x) R, t' = t + v, w in radians in the camera's axes, v in scene units; of a
     scene whose points are `sets.points3d` plus `origin`. `local_covariance`, times the square of the quantile of
@@ -86,24 +101,25 @@ def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, 
     covariance = local_covariance(linear)
     if covariance is None or linear is None:
         return None
-    free = max(2 * count - 2 * sets.pairs_that_fix, 1.0)
-    moved = np.eye(6)  # the shift of the middle, as that of the origin: v = s + (R m) x w
-    moved[3:, :3] = _crossed(linear.rotation @ (sets.middle + origin))
+    free = max(2 * count - sets.fitted, 1.0)
+    moved = np.eye(len(covariance))  # the shift of the middle, as that of the origin: v = s + (R m) x w
+    moved[3:POSE, :3] = _crossed(linear.rotation @ (sets.middle + origin))
     return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
 
 
 def centre_covariance(covariance: Array, translation: Array) -> Array:
-    """Covariance (3, 3), in the camera's axes, of the centre of the camera, -R' (v + t x w) for a pose's (w, v).
+    """Covariance (3, 3), in the camera's axes, of the centre of the camera, -R' (v + t x w) for a pose's (w, v); what
+    else is in `covariance` is left aside.
 
     translation: of the point about which the pose turns: t for the scene's origin.
     """
     moved = np.concatenate([_crossed(translation), np.eye(3)], 1)
-    return np.asarray(moved @ covariance @ moved.T)
+    return np.asarray(moved @ covariance[:POSE, :POSE] @ moved.T)
 
 
 def local_covariance(linear: "Linearised | None") -> Array | None:
     """Covariance (6, 6) of the turn w and the shift of the middle of the scene, from noise of `linear.scale`; None if
-    the points do not fix the pose.
+    the points do not fix the pose. (7, 7) with the logarithm of a focal length that is fitted.
 
     Image point i has scene point j as its partner with the probability p_ij. With J_ij the derivative of the direction
     u_j by the turn and the shift, and the scores g_ij = J_ij^T (f_i - u_j) / s^2, g_i = sum_j p_ij g_ij, the observed
@@ -123,9 +139,9 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
         return None
     sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
-    rows = (np.sqrt(probability)[:, None, None] * linear.jacobian).reshape(-1, POSE)
+    rows = (np.sqrt(probability)[:, None, None] * linear.jacobian).reshape(-1, linear.jacobian.shape[-1])
     complete = rows.T @ rows
-    expected = np.zeros((len(chosen), POSE))
+    expected = np.zeros((len(chosen), len(complete)))
     np.add.at(expected, linear.image, probability[:, None] * score)
     between = expected.T @ expected
     share = len(sets.bearings) / len(chosen)
@@ -147,7 +163,8 @@ class Linearised(NamedTuple):
 
     image: (k,) places among the chosen image points. probability: (k,) of the match. seen: (k, 3) direction in which
     the pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from the middle of the scene.
-    residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle; in scales.
+    residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle, (k, 3, 7) by
+    the logarithm of a focal length that is fitted too; in scales.
     scale: standard deviation of the residuals, radians.
     """
 
@@ -182,14 +199,20 @@ def linearised(sets: PointSets, rotation: Array, translation: Array, scale: floa
         return None
     p, u = camera[j] - rotation @ sets.middle - translation, seen[j]
     by_shift = across(u) / depth[j, None]
-    jacobian = np.concatenate([np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift], -1) / scale
+    columns = [np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift]
+    if sets.focal is not None:
+        columns.append(by_focal_length(u))
+    jacobian = np.concatenate(columns, -1) / scale
     residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
     return Linearised(sets, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
 
 
 def _known(linear: Linearised) -> Array:
-    """The information (6, 6) that a prior has about turn and shift."""
-    information, prior = np.zeros((POSE, POSE)), linear.sets.prior
+    """The information (6, 6) that a prior has about turn and shift, (7, 7) with that about the focal length."""
+    focal, prior = linear.sets.focal, linear.sets.prior
+    information = np.zeros((POSE, POSE) if focal is None else (POSE + 1, POSE + 1))
+    if focal is not None:
+        information[POSE, POSE] = 1 / focal.sigma**2
     if isinstance(prior, GravityPrior):
         up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
         information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
@@ -197,7 +220,7 @@ def _known(linear: Linearised) -> Array:
         information[:3, :3] = np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
         if prior.translation is not None:
             moved = np.concatenate([_crossed(linear.rotation @ linear.sets.middle), np.eye(3)], 1)
-            information += moved.T @ moved / prior.translation_sigma**2
+            information[:POSE, :POSE] += moved.T @ moved / prior.translation_sigma**2
     return information
 
 
@@ -241,9 +264,9 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     if linear is None:
         return Misfit(0.0, 0.0)
     free = 2 * min(count, float(linear.probability.sum())) - POSE
-    zoomed = (across(linear.seen) @ (linear.seen * (1, 1, 0))[..., None]) / linear.scale
-    strained = linear.jacobian[:, :, 3:] @ (linear.points @ STRAINS).transpose(1, 2, 0)
-    columns = np.concatenate([linear.jacobian, zoomed, strained, linear.residual[..., None]], -1)
+    zoomed = by_focal_length(linear.seen) / linear.scale
+    strained = linear.jacobian[:, :, 3:POSE] @ (linear.points @ STRAINS).transpose(1, 2, 0)
+    columns = np.concatenate([linear.jacobian[:, :, :POSE], zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
     products = weighed.T @ weighed
     pose = np.linalg.pinv(products[:POSE, :POSE], hermitian=True)

@@ -1,0 +1,157 @@
+"""Pose and focal length together, on planted points and cameras."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted_model import HEIGHT, WIDTH, plant_model
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap, Solution, solve
+from bpnp.cameras import camera_from
+from bpnp.cli import main
+from bpnp.search.evidence.partners import by_focal_length
+from bpnp.search.point_sets import UnknownFocal
+from bpnp.solving.focal_length import unknown_camera
+
+Array = NDArray[np.float64]
+SIZE = (640, 480)
+LIMIT = 300.0  # seconds, more than any of them takes
+
+
+def planted(
+    focal: float, *, points: int = 60, depth: float = 1.0, distance: float = 4.0, radial: float = 0.0, seed: int = 0
+) -> tuple[Array, Array, Array]:
+    """Pixels of points in random order, with half a pixel of noise, the points, and the rotation."""
+    rng = np.random.default_rng(seed)
+    scene = rng.uniform(-1, 1, (points, 3)) * [1, 1, depth]
+    rotation = Rotation.from_rotvec([0.2, -0.3, 0.4]).as_matrix() if depth else np.eye(3)
+    translation = np.array([0.1, -0.1, distance * focal / 600])
+    camera = camera_from(("SIMPLE_RADIAL", (focal, 320.0, 240.0, radial)))
+    pixels = camera.project(scene @ rotation.T + translation) + 0.5 * rng.standard_normal((points, 2))
+    order = rng.permutation(np.flatnonzero(((pixels >= 0) & (pixels <= SIZE)).all(1)))
+    return pixels[order], scene, rotation
+
+
+def turned(one: Array, other: Array) -> float:
+    return math.degrees(2 * math.asin(min(1.0, float(np.linalg.norm(one - other)) / math.sqrt(8))))
+
+
+@pytest.fixture(scope="module")
+def found() -> tuple[Solution, Array]:
+    pixels, scene, rotation = planted(900.0)
+    return solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT), rotation
+
+
+def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array]) -> None:
+    solution, rotation = found
+    assert turned(solution.rotation, rotation) < 0.5
+    assert abs(solution.focal_length - 900) < 4 * solution.focal_length_std < 120
+    assert solution.verdict == "confident"
+    assert solution.covariance.shape == (7, 7)
+    again = Solution.from_json(solution.to_json())
+    np.testing.assert_array_equal(again.covariance, solution.covariance)
+    assert again.focal_length == solution.focal_length
+
+
+def test_the_verdict_pays_for_the_focal_length(found: tuple[Solution, Array]) -> None:
+    pixels, scene, _ = planted(900.0)
+    known = solve(pixels, scene, found[0].camera, solver="search", time_limit=LIMIT)
+    assert known.log10_false_alarms < found[0].log10_false_alarms - 1
+    assert known.covariance.shape == (6, 6)
+    assert known.focal_length_std == 0
+    assert known.centre_std < found[0].centre_std
+
+
+def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:
+    pixels, scene, rotation = planted(700.0, depth=0.0)
+    solution = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
+    assert turned(solution.rotation, rotation) < 10
+    assert solution.verdict == "ambiguous"
+    assert not solution.focal_length_std < 0.05 * solution.focal_length
+
+
+def test_a_rough_focal_length_is_a_prior() -> None:
+    """Far away perspective says little of the focal length, so that what is told of it counts."""
+    pixels, scene, rotation = planted(700.0, distance=12.0)
+    camera = ("SIMPLE_PINHOLE", (735.0, 320.0, 240.0))
+    stds = []
+    for error in (0.02, 0.2):
+        solution = solve(pixels, scene, camera, focal_error=error, solver="search", time_limit=LIMIT)
+        assert turned(solution.rotation, rotation) < 3
+        stds.append(solution.focal_length_std / solution.focal_length)
+    assert stds[0] < 0.021
+    assert stds[1] > stds[0]
+
+
+def test_a_radial_coefficient_is_found_where_the_points_support_one() -> None:
+    for radial in (-0.3, 0.0):
+        pixels, scene, rotation = planted(600.0, points=150, radial=radial, distance=3.0)
+        solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
+        assert turned(solution.rotation, rotation) < 1
+        coefficient = json.loads(solution.to_json())["camera"]["params"][3]
+        assert coefficient == pytest.approx(radial, abs=0.1)
+        assert (coefficient == 0) == (radial == 0)
+
+
+def test_the_derivative_by_the_focal_length_is_that_of_finite_differences() -> None:
+    rays = np.random.default_rng(0).normal(size=(5, 3)) + [0, 0, 4]
+    stretched = [rays * (math.exp(step), math.exp(step), 1) for step in (-1e-6, 1e-6)]
+    below, above = (points / np.linalg.norm(points, axis=1, keepdims=True) for points in stretched)
+    seen = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+    np.testing.assert_allclose(by_focal_length(seen)[..., 0], (above - below) / 2e-6, atol=1e-8)
+
+
+def test_the_ladder_covers_the_range() -> None:
+    unknown = unknown_camera(None, SIZE, None)
+    focals = np.sort([camera.focal for camera in unknown.ladder(1.57)])
+    assert focals[0] <= 1.26 * unknown.smallest * 640
+    assert focals[-1] >= unknown.largest * 640 / 1.26
+    assert (focals[1:] / focals[:-1] < 1.58).all()
+    assert unknown.focal(unknown.reference) == UnknownFocal(math.log(6.0), math.inf, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"image_size": SIZE, "camera": np.diag([600, 600, 1.0])}, "a `camera` or the `image_size` .*, got both"),
+        ({"image_size": (480, 640)}, "inside the 480 x 640 pixels .* are width and height swapped"),
+        ({"image_size": (320, 200)}, "inside the 320 x 200 pixels .* try the size of the image"),
+        ({"image_size": (640.5, 480)}, "`image_size` as .width, height. in whole pixels"),
+        ({"image_size": 640}, "`image_size` as .width, height. in whole pixels"),
+        ({"image_size": SIZE, "focal_error": 0.1}, "`focal_error` beside a `camera`"),
+        ({"focal_error": 0.1}, "expected a `camera` whose focal length"),
+        ({"camera": np.diag([600, 600, 1.0]), "focal_error": 1.5}, "`focal_error` above 0 and below 1"),
+        ({"camera": np.diag([600, 600, 1.0]), "distortion": True}, "`distortion=True` beside an `image_size`"),
+    ],
+)
+def test_errors_name_the_argument(options: dict[str, Any], message: str) -> None:
+    pixels, scene, _ = planted(600.0, points=200, distance=2.5)
+    with pytest.raises(ValueError, match=message):
+        solve(pixels, scene, **options)
+
+
+def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
+    pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
+    truth = plant_model(tmp_path, camera=pinhole, images=2, points=140, seen=90, clutter=0)
+    scene, pixels = SceneMap.from_colmap(tmp_path), 520 * truth.points2d[0] + [WIDTH / 2, HEIGHT / 2]
+    solution = scene.localize(pixels, image_size=(WIDTH, HEIGHT), views=["photo 0.jpg"], solver="search")
+    assert solution.focal_length == pytest.approx(520, rel=0.01)
+    assert turned(solution.rotation, truth.rotations[0]) < 0.1
+    with pytest.raises(ValueError, match="or `image_size` where the focal length is unknown, got neither"):
+        scene.localize(pixels)
+
+
+def test_the_command_takes_the_size_of_the_image(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pixels, scene, rotation = planted(900.0)
+    np.savetxt(tmp_path / "image.csv", pixels, delimiter=",", header="x,y", comments="")
+    np.savetxt(tmp_path / "scene.csv", scene, delimiter=",", header="x,y,z", comments="")
+    files = [str(tmp_path / "image.csv"), str(tmp_path / "scene.csv")]
+    main(["solve", *files, "--image_size", "640,480", "--time_limit", str(LIMIT), "--solver", "search", "--json"])
+    solution = Solution.from_json(capsys.readouterr().out)
+    assert turned(solution.rotation, rotation) < 0.5
+    assert solution.focal_length == pytest.approx(900, rel=0.05)
