@@ -5,6 +5,8 @@ import numpy as np
 from bpnp.loops.parallel import NEVER, one_blas_thread
 from bpnp.loops.vectors import F
 from bpnp.search.enumeration.search import search_by_enumeration
+from bpnp.search.infinity.kernels import Image
+from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.neighbours import HashedPoints, sums_near
 from bpnp.search.kernels.raster import add_shifted, add_up
@@ -30,6 +32,7 @@ def warm_up() -> None:
         search_by_enumeration(PointSets(rays, points, prior=prior), NEVER, DEFAULT)
     HashedPoints(points, 0.1).count_on(points, points, 1)
     sums_near(rays, rays, np.eye(3)[:, :2].copy(), np.array([0.1, 0.2]), np.array([1.0, 0.0]))
+    search_rotation(Image(rays, np.full(POINTS, 1e-3)), rays)
     _warm_annealing(points, rays)
 
 
