@@ -7,6 +7,7 @@ noise, mirror: images of no sky, where every confident answer is wrong. wrong fo
 tetra3rs too, where it is installed.
 """
 
+import importlib
 import struct
 import tempfile
 import time
@@ -127,7 +128,7 @@ def outcomes(count: int, field: float, limit: int, seed: int, kind: str = "") ->
 @lru_cache(2)
 def tetra_database(count: int, field: float, seed: int) -> Any:
     """tetra3rs's index of a catalogue, in its own file format; all stars are equally bright."""
-    import tetra3rs
+    tetra3rs: Any = importlib.import_module("tetra3rs")
 
     directions = catalogue(count, field, seed)
     with tempfile.TemporaryDirectory() as folder:
