@@ -220,10 +220,12 @@ class Contested:
     times as far as a different pose; nearer ones slide along the same lines and surfaces. most: nats of evidence of an
     image point, what 100 scene points leave to one that is met to the finest scale. alone: share of the points that the
     first pose alone explains; a pose that explains so many alone is no repetition of it. same: share of a pose's
-    partners in the places of those of another from which both say the same of the scene.
+    partners in the places of those of another from which both say the same of the scene. together: scales within which
+    image points are of one line or one clump; with 3 the middle of a surface is full of lines.
     """
 
     near: float = 3.0
+    together: float = 1.0
     far: float = 5.0
     most: float = 13.0
     alone: float = 0.5

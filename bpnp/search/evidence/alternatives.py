@@ -102,7 +102,7 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
     best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
     first = _partners(sets, limits.near, *(x[0] for x in (*poses, scales)))
     places = sets.bearings[sets.image.chosen] @ sets.image.axes
-    blocks = observations(places, limits.near * float(scales[0]))
+    blocks = observations(places, limits.together * float(scales[0]))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
         if float(np.abs(gap).sum()) ** 2 < least * float((gap**2).sum()):
