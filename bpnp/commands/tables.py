@@ -48,6 +48,7 @@ def table(
         output: folder of the results.
         paper: published rows beneath.
     """
+    from bpnp.loops.processes import in_processes
     from bpnp.report.figures import outlier_curves, save_figure
     from bpnp.report.tables import (
         CAPTION,
@@ -59,7 +60,6 @@ def table(
         table_frame,
         table_of_rows,
     )
-    from bpnp.solving.processes import in_processes
     from bpnp.training.comparison import MethodTest, parse_methods, read_data, with_setting
 
     at_least(1, limit=limit, processes=processes)

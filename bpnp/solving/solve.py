@@ -1,6 +1,6 @@
 """Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,6 +28,7 @@ from bpnp.solving.arguments import (
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
 from bpnp.solving.infinity import refuse_at_infinity, solve_directions
 from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.rigs.rig_solution import solve_rig
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
 
@@ -52,6 +53,7 @@ def solve(
     inlier_threshold: float | int | None = None,
     clutter: float | int | None = None,
     at_infinity: bool = False,
+    rig: Sequence[Any] | None = None,
     seed: int = 0,
     time_limit: float | int | None = None,
     device: str | torch.device | None = None,
@@ -90,6 +92,9 @@ def solve(
     at_infinity: `points3d` are unit directions, such as of stars: the rotation alone is found, and the translation is
         zero. Pixels of a fisheye may lie 90 degrees and more off its axis. Points with the largest `scores2d` are tried
         first. See docs/stars.md.
+    rig: cam_from_rig, (3, 4), (4, 4) or (R, t), of each of several cameras that are fixed to each other. `points2d` and
+        `labels2d` are then lists with one array each, `camera` too or one for all; the pose is rig_from_world, in the
+        unit of the rig and of the scene, and `matches` count the 2D points of one camera after those of the other.
     time_limit: seconds for all of it, 10 by default, math.inf for no limit. At the limit each stage of the search ends
         with the poses that it has, and the best of them is returned.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
@@ -131,6 +136,24 @@ def solve(
             camera,
             scores2d=scores2d,
             inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+            seed=seed,
+            time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
+        )
+    if rig is not None:
+        known = {"prior": prior, "scores2d": scores2d, "scores3d": scores3d, "device": device}
+        refused = [name for name, value in known.items() if value is not None]
+        if refused or solver not in ("auto", "search"):
+            raise ValueError(f"expected no `{(refused or ['solver'])[0]}` with a `rig`; try without")
+        return solve_rig(
+            points2d,
+            points3d,
+            camera,
+            rig,
+            normals3d=normals3d,
+            labels2d=labels2d,
+            labels3d=labels3d,
+            inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+            clutter=clutter,
             seed=seed,
             time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
         )

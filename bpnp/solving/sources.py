@@ -11,13 +11,13 @@ import torch
 from torch import nn
 
 from bpnp.loops.parallel import Deadline
+from bpnp.loops.processes import in_processes
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.solving.matches import finished, without_pose
 from bpnp.solving.networks import device_of, evaluation_copy, pose_prior, predicted, proposals_for, proposed, view_for
 from bpnp.solving.problem import Problem
-from bpnp.solving.processes import in_processes
 from bpnp.solving.solution import Solution
 
 Progress = Callable[[int, int, float], None]  # problem, batches of starts so far, seconds

@@ -13,8 +13,8 @@ import torch
 
 import bpnp
 from bpnp.examples import load
+from bpnp.loops.processes import in_processes
 from bpnp.solving import sources
-from bpnp.solving.processes import in_processes
 
 EXAMPLES = [load("photo", seed=seed) for seed in range(6)]
 SETS = [e.points2d for e in EXAMPLES], [e.points3d for e in EXAMPLES], [e.camera for e in EXAMPLES]

@@ -159,6 +159,17 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
     return seen
 
 
+def log_evidence_of(sets: PointSets, seen: Array, scale: float, fixing: int) -> Array:
+    """(2,) log of the evidence of one camera for points seen in directions (n, 3): at the scales of the residuals, and
+    at rougher ones; without the `fixing` largest terms."""
+    if len(sets.bearings) <= FIXING or int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
+        return np.zeros(2)
+    ratio = _ratio(sets.image, scale)
+    own, rough = _is_own(ratio), ratio >= ROUGH
+    evidence = _log_evidence(sets, seen, int(own.argmax()), fixing)
+    return np.array([np.logaddexp.reduce(evidence[some], initial=-math.inf) for some in (own, rough)])
+
+
 def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
     """log x_i / c_i (k,) of each chosen image point under a pose, clumps weighted, at the share and the s within a
     factor of two of the scale of its residuals, radians, at which their sum is largest."""
@@ -192,12 +203,12 @@ def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
     return np.asarray(image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], SHARES))
 
 
-def _log_evidence(sets: PointSets, seen: Array, finest: int) -> Array:
+def _log_evidence(sets: PointSets, seen: Array, finest: int, left_out: int | None = None) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
     points seen in directions (n, 3); -inf at the scales before the finest one, which are not looked at."""
     image, terms = sets.image, _terms(sets, seen, finest)
-    count = _fixing(sets)
-    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - count, 0)[-count:]
+    count = _fixing(sets) if left_out is None else left_out
+    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - _fixing(sets), 0)[len(terms) - count :]
     evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
     total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
     return np.r_[np.full(finest, -math.inf), total]

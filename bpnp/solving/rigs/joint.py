@@ -1,0 +1,171 @@
+"""One pose of several cameras that are fixed to each other: proposed by each alone, refined and judged on all of them.
+
+The image points of the cameras are independent, so the logs of their likelihood ratios add up. Three matches fix the
+pose of all: the three largest terms are left out once, in that camera where they count most. The tests are those of all
+cameras together, for each of them proposes poses from its own triples.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.loops.parallel import Deadline
+from bpnp.search.candidates import Candidates
+from bpnp.search.enumeration.poses import enumerate_poses
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
+from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
+from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
+from bpnp.search.point_sets import PointSets
+from bpnp.search.search import search_poses
+from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.verdict import SearchResult, judged, no_pose
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all cameras that are refined
+WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
+COOLING, STEPS = 0.6, 9  # from a scale to the next one, and Gauss-Newton steps
+
+
+class Rig:
+    """Cameras with their points: `sets` of each, all with the same scene; `mounts`, camera_k = C_k rig + c_k."""
+
+    def __init__(self, sets: Sequence[PointSets], mounts: Sequence[Pose]) -> None:
+        self.sets, self.mounts = sets, mounts
+        self.floor = max(each.floor or float(each.image.scales[0]) for each in sets)
+
+    def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
+        """Of camera k, for poses (..., 3, 3), (..., 3) of the rig."""
+        turn, shift = self.mounts[k]
+        return turn @ rotation, translation @ turn.T + shift
+
+    def rig_of(self, k: int, rotation: Array, translation: Array) -> Pose:
+        """Of the rig, for those of camera k."""
+        turn, shift = self.mounts[k]
+        return turn.T @ rotation, (translation - shift) @ turn
+
+    def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
+        """Each camera that sees a point near an image point, and the turn (6, 6) of a step of the rig into its axes."""
+        found = []
+        for k, sets in enumerate(self.sets):
+            linear = linearised(sets, *self.pose_of(k, rotation, translation), scale)
+            if linear is not None:
+                found.append((np.asarray(np.kron(np.eye(2), self.mounts[k][0]), np.float64), linear))
+        return found
+
+    def refined(self, rotation: Array, translation: Array) -> tuple[Array, Array, float, float]:
+        """The optimum beside a pose, the scale of its residuals, radians, and the expected number of its matches."""
+        scale, middle, count = WIDE * self.floor, self.sets[0].middle, 0.0
+        for _ in range(STEPS):
+            information, gradient, squared, count = 1e-9 * np.eye(6), np.zeros(6), 0.0, 0.0
+            for turn, linear in self.linearised(rotation, translation, scale):
+                rows = linear.jacobian @ turn
+                information = information + np.einsum("k,kia,kib->ab", linear.probability, rows, rows)
+                gradient = gradient + np.einsum("k,kia,ki->a", linear.probability, rows, linear.residual)
+                squared += float(linear.probability @ (linear.residual**2).sum(-1)) * scale**2
+                count += float(linear.probability.sum()) * len(linear.sets.bearings) / len(linear.sets.image.chosen)
+            if count <= 3:
+                break
+            step = np.linalg.solve(information, gradient)
+            moved = rotation @ middle + translation + step[3:]
+            rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
+            translation = moved - rotation @ middle
+            own = math.sqrt(squared / max(2 * count - 6, 1.0))
+            scale = max(self.floor, min(COOLING * scale, own) if own < scale else COOLING * scale)
+        return rotation, translation, scale, count
+
+    def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+        """log10 of the number of false alarms at the scale of the residuals, and at rougher ones."""
+        tests = math.log10(sum(10 ** log10_tests(each) for each in self.sets))
+        terms = []
+        for k, sets in enumerate(self.sets):
+            seen = directions_of(sets, *self.pose_of(k, rotation, translation))
+            terms.append([log_evidence_of(sets, seen, scale, fixing) for fixing in (0, 3)])
+        every, without = np.array(terms).transpose(1, 2, 0)  # (own and rough, cameras)
+        fixing = np.where(np.isfinite(every), every, 0) - np.where(np.isfinite(without), without, 0)
+        own, rough = tests - (every.sum(1) - fixing.max(1)) / math.log(10)
+        return float(own), float(rough)
+
+    def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
+        """Covariance (6, 6) of the turn and of the shift of the middle of the scene, in the axes of the rig."""
+        information = np.zeros((6, 6))
+        for turn, linear in self.linearised(rotation, translation, scale):
+            own = local_covariance(linear)
+            if own is not None:
+                information += turn.T @ np.linalg.solve(own, turn)
+        return np.asarray(np.linalg.inv(information), np.float64) if np.linalg.matrix_rank(information) == 6 else None
+
+
+def search_rig(
+    rig: Rig, *, clutter: float | None, seed: int, deadline: Deadline, settings: SearchSettings = DEFAULT
+) -> SearchResult:
+    """Distinct poses of the rig, best first, and the verdict on the first one."""
+    rotations, translations, hits, exhaustive = [], [], [], True
+    for k, sets in enumerate(rig.sets):
+        until = Deadline((Deadline.after(0.0).at * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k))
+        if is_enumerable(sets):
+            radius = ENUMERATION.radius if sets.floor is None else ENUMERATION.floors * sets.floor
+            rule = replace(ENUMERATION, kept=PROPOSED)
+            poses = enumerate_poses(sets, radius=radius, deadline=until.at, is_safe=lambda _: False, settings=rule)
+            exhaustive &= poses.ended == "exhausted"
+            proposed, own = (poses.rotation, poses.translation), np.zeros(len(poses.rotation), np.int64)
+        else:
+            found = search_poses(sets, clutter=clutter, seed=seed, deadline=until, settings=settings).candidates
+            proposed, own, exhaustive = (found.rotation, found.translation), found.hits, False
+        rotation, translation = rig.rig_of(k, *proposed)
+        rotations.append(rotation)
+        translations.append(translation)
+        hits.append(own)
+    rotation, translation = np.concatenate(rotations), np.concatenate(translations)
+    if not len(rotation):
+        return no_pose("no pose was found")
+    order = np.argsort(-_screened(rig, rotation, translation), kind="stable")[:REFINED]
+    found = _candidates(rig, rotation[order], translation[order], np.concatenate(hits)[order])
+    best = int(np.argmin(found.log10_false_alarms))
+    pose = found.rotation[best], found.translation[best]
+    strongest = max(range(len(rig.sets)), key=lambda k: len(rig.sets[k].bearings))
+    sets, scale = rig.sets[strongest], float(found.scale[best])
+    (turns, shifts), _ = repeated_poses(sets, *rig.pose_of(strongest, *pose), scale, settings.evidence)
+    if len(turns):
+        repeated = _candidates(rig, *rig.rig_of(strongest, turns, shifts), np.zeros(len(turns), np.int64))
+        found = Candidates.concatenated([found, repeated])
+    found = found[np.argsort(found.log10_false_alarms, kind="stable")]
+    # The alternatives that need the derivative of one camera are asked of the one with most points.
+    turns, shifts = rig.pose_of(strongest, found.rotation, found.translation)
+    share = found.matched / min(len(sets.bearings), len(sets.points3d))
+    seen = replace(found, rotation=turns, translation=shifts, matched=share)
+    result = judged(seen, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
+    turns, shifts = rig.rig_of(strongest, result.candidates.rotation, result.candidates.translation)
+    return replace(result, candidates=replace(result.candidates, rotation=turns, translation=shifts))
+
+
+def _screened(rig: Rig, rotations: Array, translations: Array) -> Array:
+    """How well poses (p, 3, 3), (p, 3) explain the bearings of all cameras at a wide scale, nats (p,)."""
+    total, scale = np.zeros(len(rotations)), WIDE * rig.floor
+    if len(rotations) <= REFINED:
+        return total
+    for k, sets in enumerate(rig.sets):
+        turns, shifts = rig.pose_of(k, rotations, translations)
+        seen = sets.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]
+        seen /= np.maximum(np.linalg.norm(seen, axis=-1, keepdims=True), 1e-300)
+        nearest = (sets.bearings @ seen.transpose(0, 2, 1)).max(-1)
+        total += np.logaddexp((nearest - 1) / scale**2, -4.0).sum(-1)
+    return total
+
+
+def _candidates(rig: Rig, rotations: Array, translations: Array, hits: NDArray[np.int64]) -> Candidates:
+    """Poses refined on all cameras, with their false alarms; `matched` is their expected number of matches."""
+    ends = [rig.refined(r, t) for r, t in zip(rotations, translations, strict=True)]
+    alarms = np.array([rig.alarms(r, t, scale) for r, t, scale, _ in ends])
+    start = Candidates.unscored(np.stack([end[0] for end in ends]), np.stack([end[1] for end in ends]))
+    counts, scales = np.array([end[3] for end in ends]), np.array([end[2] for end in ends])
+    own, rough = alarms.T
+    return replace(
+        start, matched=counts, scale=scales, hits=hits, score=-own, log10_false_alarms=own, log10_rough=rough
+    )

@@ -1,0 +1,101 @@
+"""Rigs: planted poses of two and three cameras, none of which sees enough alone; bad rigs are named."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from planted import degrees_between
+from scipy.spatial.transform import Rotation
+
+import bpnp
+
+Array = NDArray[np.float64]
+CAMERA = ("SIMPLE_PINHOLE", [500.0, 320.0, 240.0])
+
+
+def planted_rig(seed: int, seen: tuple[int, ...], points: int = 20) -> Any:
+    """Pixels of each camera, the scene, the mounts, the pose of the rig, and which points each camera sees."""
+    rng = np.random.default_rng([9, seed])
+    scene = rng.uniform(-0.5, 0.5, (points, 3))
+    pose = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.1, 3.0])
+    mounts, images, chosen = [], [], []
+    for count in seen:
+        turn = Rotation.from_rotvec(0.15 * rng.standard_normal(3)).as_matrix()
+        mounts.append((turn, rng.uniform(-0.4, 0.4, 3)))
+        camera = (scene @ pose[0].T + pose[1]) @ turn.T + mounts[-1][1]
+        chosen.append(rng.choice(points, count, replace=False))
+        pixels = 500 * camera[:, :2] / camera[:, 2:] + [320, 240]
+        images.append(pixels[chosen[-1]] + 0.2 * rng.standard_normal((count, 2)))
+    return images, scene, mounts, pose, chosen
+
+
+def test_cameras_that_are_unsure_alone_are_sure_together() -> None:
+    alone = together = 0
+    for seed in range(4):
+        images, scene, mounts, pose, chosen = planted_rig(seed, (4, 5, 4))
+        solution = bpnp.solve(images, scene, [CAMERA] * 3, rig=mounts, time_limit=60)
+        assert degrees_between(solution.rotation, pose[0]) < 2
+        assert np.linalg.norm(solution.translation - pose[1]) < 0.15
+        together += solution.verdict == "confident"
+        alone += bpnp.solve(images[0], scene, CAMERA, solver="search").verdict == "confident"
+        right = np.concatenate(chosen)[solution.matches[:, 0]] == solution.matches[:, 1]
+        assert right.mean() > 0.9
+        assert len(solution.points2d) == 13
+        step = np.r_[Rotation.from_matrix(pose[0] @ solution.rotation.T).as_rotvec(), pose[1] - solution.translation]
+        assert step @ np.linalg.solve(solution.covariance, step) < 40
+    assert together > alone
+
+
+def test_a_rig_of_one_camera_is_that_camera() -> None:
+    images, scene, mounts, pose, _ = planted_rig(0, (10,))
+    for mount in (mounts[0], np.column_stack(mounts[0]), np.vstack([np.column_stack(mounts[0]), [0, 0, 0, 1]])):
+        rig = bpnp.solve(images, scene, CAMERA, rig=[mount], time_limit=60)
+        one = bpnp.solve(images[0], scene, CAMERA, solver="search")
+        turn, shift = mounts[0]
+        assert rig.verdict == one.verdict == "confident"
+        assert degrees_between(rig.rotation, pose[0]) < 0.5
+        np.testing.assert_allclose(turn @ rig.rotation, one.rotation, atol=2e-3)
+        np.testing.assert_allclose(turn @ rig.translation + shift, one.translation, atol=2e-2)
+        assert rig.log10_false_alarms == pytest.approx(one.log10_false_alarms, abs=1.5)
+
+
+def test_many_points_are_searched_and_joined() -> None:
+    images, scene, mounts, pose, _ = planted_rig(1, (80, 80), points=120)
+    clutter = np.random.default_rng(9).uniform((150, 100), (490, 380), (2, 40, 2))
+    images = [np.concatenate(pair) for pair in zip(images, clutter, strict=True)]
+    solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=mounts, time_limit=60)
+    assert solution.verdict == "confident"
+    assert degrees_between(solution.rotation, pose[0]) < 0.3
+    one = bpnp.solve(images[0], scene, CAMERA, solver="search")
+    assert solution.log10_false_alarms < one.log10_false_alarms - 20
+
+
+def test_unrelated_points_are_never_confident() -> None:
+    rng = np.random.default_rng(9)
+    mounts = planted_rig(0, (4, 4))[2]
+    for _ in range(8):
+        images = list(rng.uniform((200, 150), (440, 330), (2, 6, 2)))
+        solution = bpnp.solve(images, rng.uniform(-0.5, 0.5, (15, 3)), [CAMERA] * 2, rig=mounts, time_limit=60)
+        assert solution.verdict != "confident"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"camera": [CAMERA]}, "expected 2 of `camera`, one a camera of the `rig`, got 1"),
+        ({"rig": [np.eye(4)]}, "expected 1 of `points2d`, one a camera of the `rig`, got 2"),
+        ({"rig": [np.eye(4), np.eye(3)]}, r"expected `rig\[1\]` as cam_from_rig, \(3, 4\), \(4, 4\) or \(R, t\)"),
+        ({"rig": [np.eye(4), 2 * np.eye(4)]}, r"expected a rotation in `rig\[1\].rotation`"),
+        ({"prior": bpnp.GravityPrior([0, 1, 0], [0, 1, 0])}, "expected no `prior` with a `rig`"),
+        ({"scores3d": np.ones(20)}, "expected no `scores3d` with a `rig`"),
+        ({"solver": "matcher-sfm"}, "expected no `solver` with a `rig`"),
+        ({"points2d": [np.zeros((3, 2)), np.zeros((5, 2))]}, "points in `points2d` of camera 0, got 3"),
+        ({"labels2d": [np.zeros(6, int)]}, "expected 2 of `labels2d`"),
+    ],
+)
+def test_a_bad_rig_is_named(change: dict[str, Any], message: str) -> None:
+    images, scene, *_ = planted_rig(0, (6, 6))
+    given: dict[str, Any] = {"points2d": images, "points3d": scene, "camera": [CAMERA] * 2, "rig": [np.eye(4)] * 2}
+    with pytest.raises(ValueError, match=message):
+        bpnp.solve(**given | change)
