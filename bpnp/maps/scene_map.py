@@ -163,8 +163,10 @@ class SceneMap:
         keypoints: (m, 2) pixels, COLMAP's: (0.5, 0.5) is the centre of the first one; or a list of cv2.KeyPoint, which
             OpenCV counts from (0, 0).
         camera: as for `bpnp.solve`. With OpenCV's (K, distortion) pixels count as OpenCV's do, those in an array too.
-        image_size, focal_error, distortion: as for `bpnp.solve`, where the focal length is unknown or rough. It is
-            looked for where those of the views are too.
+        image_size: (width, height) in pixels of a photo whose focal length is unknown, as for `bpnp.solve`. The focal
+            length is looked for where those of the views are too.
+        focal_error: relative standard deviation of the focal length of `camera`, as for `bpnp.solve`.
+        distortion: whether one radial coefficient is unknown too, as for `bpnp.solve`.
         views: names of views of the map that may show the same place, best first, from any image retrieval: the points
             that any of them sees are used near each; None to try the points of one view of the whole map after the
             other, those first that together see most of it.

@@ -111,7 +111,7 @@ class PointSets:
             return 0.0
         if isinstance(self.prior, GravityPrior):
             up = rotation @ (np.asarray(self.prior.up_scene) / np.linalg.norm(self.prior.up_scene))
-            off = _angle(up, np.asarray(self.prior.up_camera))
+            off = _angle(up, np.asarray(self.prior.up_camera, np.float64))
             return math.log10(_cap(max(off, math.radians(SIGMAS * self.prior.sigma_deg))))
         known = np.asarray(self.prior.rotation, np.float64)
         off = max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg))

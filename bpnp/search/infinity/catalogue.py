@@ -27,7 +27,7 @@ class Catalogue(NamedTuple):
 
     def sky(self, reach: float) -> Sky:
         """The directions in cells, to be looked up within a chord of `reach`."""
-        table = HashedPoints(self.directions, reach)
+        table = HashedPoints(self.directions.copy(), reach)  # one that may be written to, as elsewhere: compiled once
         return Sky(table.points, self.density, table.heads, table.links, reach)
 
 
