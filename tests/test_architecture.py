@@ -32,7 +32,7 @@ MAY_IMPORT = {
     "models": {"robust", "layers", "search"},
     "solving": {"robust", "layers", "search", "models", "report", "datamodules"},
     "datamodules": set(),
-    "maps": {"solving", "search", "models", "robust", "layers", "datamodules"},
+    "maps": {"solving", "search", "models", "robust", "layers", "datamodules", "report"},
     "report": set(),
     "training": {"robust", "layers", "models", "report"},
     "commands": {"maps", "models", "search", "solving", "training", "datamodules", "report"},

@@ -17,9 +17,12 @@ import numpy as np
 from bpnp.cameras import camera_from, plain_camera
 from bpnp.datamodules.colmap.model_files import FILES, model_format
 from bpnp.files import fingerprint, interruptions_later, write_text
+from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
-from bpnp.solving.pictures import pose_text, save_over_photo
+from bpnp.report.figures import save_figure
+from bpnp.report.photos import read_photo
+from bpnp.solving.pictures import pose_text
 from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
@@ -155,7 +158,7 @@ def localize_photos(
         for task, solution in attempts(scene, tasks()):
             try:
                 with interruptions_later():
-                    folder.keep(task, solution, picture=pictures)
+                    folder.keep(task, solution, draw_in=scene if pictures else None)
                 done(task.name)
             except (ValueError, OSError) as error:
                 failed(task.name, task.photo, error)
@@ -219,14 +222,15 @@ class SolutionFolder:
         before = self.records[task.name][MADE_WITH]
         return [key for key, value in task.made_with.items() if before.get(key) != value]
 
-    def keep(self, task: PhotoTask, solution: Solution | str, *, picture: bool = False) -> None:
-        """Write the solution of a photo, what it was made with, and its picture. Raises ValueError with the reason if
-        there is none."""
+    def keep(self, task: PhotoTask, solution: Solution | str, *, draw_in: SceneMap | None = None) -> None:
+        """Write the solution of a photo, what it was made with, and its picture with a map. Raises ValueError with the
+        reason if there is none."""
         if isinstance(solution, str):
             raise ValueError(solution)
         self.picture(task.name).unlink(missing_ok=True)
-        if picture:
-            save_over_photo(solution, task.photo, self.picture(task.name), title=f"{task.name}: {solution.view}")
+        if draw_in is not None:
+            title, photo = f"{task.name}: {solution.view}", read_photo(task.photo)
+            save_figure(localized_picture(draw_in, solution, photo=photo, title=title), self.picture(task.name))
         text = f'{solution.to_json()[:-1]}, "{MADE_WITH}": {json.dumps(task.made_with)}}}'
         write_text(self._file("solutions", task.name, "json"), text + "\n")
         self._record(task.name, text)

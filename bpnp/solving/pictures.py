@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, Lens, camera_from
 from bpnp.files import written_whole
-from bpnp.report.figures import plot_image, plot_residuals, save_figure
+from bpnp.report.figures import plot_image, plot_residuals
 from bpnp.report.palette import VERDICTS
-from bpnp.report.photos import Box, read_photo
+from bpnp.report.photos import Box
 from bpnp.report.points import ProblemPoints
 
 if TYPE_CHECKING:
@@ -67,11 +67,6 @@ def solution_picture(
     figure.suptitle(drawn.id.replace("$", r"\$"), fontsize=10, color=VERDICTS[solution.verdict])
     figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
     return figure
-
-
-def save_over_photo(solution: "Solution", photo: Path, path: Path, *, title: str) -> None:
-    """Write `solution_picture` over the photo in a file."""
-    save_figure(solution_picture(solution, title=title, photo=read_photo(photo)), path)
 
 
 def pose_text(rotation: Array, translation: Array) -> str:

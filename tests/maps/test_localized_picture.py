@@ -1,0 +1,52 @@
+"""What the picture of a photo in a map shows, read back from the figure."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from planted_model import plant_model
+
+from bpnp import SceneMap
+from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches, localized_picture
+
+CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
+
+
+def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_it_was_planted(tmp_path: Path) -> None:
+    from matplotlib.figure import Figure
+
+    truth = plant_model(tmp_path, camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    scene = SceneMap.from_colmap(tmp_path)
+    pixels = 520 * truth.points2d[1] + [400, 300] + np.random.default_rng(0).normal(0, 0.5, truth.points2d[1].shape)
+    keypoints = np.concatenate([pixels, truth.clutter_px[1]])
+    solution = scene.localize(keypoints, CAMERA, views=["photo 1.jpg"])
+    assert solution.verdict == "confident"
+
+    image, above = Figure().subplots(1, 2)
+    marks = draw_matches(image, solution)
+    matched = solution.match_places[:, 0]
+    np.testing.assert_allclose(marks.get_offsets(), keypoints[matched], atol=1e-6)
+    assert float(np.mean(marks.get_array())) == pytest.approx(solution.reprojection_error, rel=1e-6)
+    assert {len(line.get_xdata()) for line in image.lines} == {len(keypoints) - len(matched)}
+
+    draw_from_above(above, scene, solution)
+    views = next(line for line in above.lines if line.get_label() == "3 views").get_xydata()
+    (place,) = next(line for line in above.lines if line.get_label() == "the photo").get_xydata()
+    (ellipse,) = above.patches
+    off = np.linalg.norm(views[1] - place)  # the photo is view 1, with other noise
+    assert off < max(ellipse.width, ellipse.height) / 2 <= 1.01 * BOUND * solution.centre_std
+    spaced = np.linalg.norm(views[0] - views[2])
+    centres = scene.views[0].centre - scene.views[2].centre
+    down = np.mean([view.rotation[1] for view in scene.views], axis=0)
+    down /= np.linalg.norm(down)
+    assert spaced == pytest.approx(np.linalg.norm(centres - down * (centres @ down)))
+
+
+def test_a_photo_without_a_pose_is_drawn_too(tmp_path: Path) -> None:
+    plant_model(tmp_path, camera=CAMERA, images=3)
+    scene = SceneMap.from_colmap(tmp_path)
+    random = np.random.default_rng(1).uniform(0, 600, (40, 2))
+    solution = scene.localize(random, CAMERA, views=["photo 0.jpg"], time_limit=2)
+    assert solution.verdict != "confident"
+    figure = localized_picture(scene, solution, photo=np.zeros((600, 800, 3), np.uint8), title="none")
+    assert [axes.get_title() for axes in figure.axes][1].startswith("the map from above")
