@@ -329,6 +329,7 @@ def interrupted(loader):
     return workers
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts tests in the background ignores it
     DataLoader.__iter__ = interrupted
     try:
         prepare_meshes(*map(Path, sys.argv[1:]), points=32, normalisation="none", processes=2)
