@@ -97,7 +97,9 @@ def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> Non
     lost = replace(tasks(place, scene)[0], name="lost.png", photo=place[1] / "lost.png")
     ((task, reason),) = attempts_on_cluster(scene, [lost], "1")
     assert (task.name, "expected a photo that can be read" in str(reason)) == ("lost.png", True)
-    assert set(psutil.Process().children(recursive=True)) <= before
+    left = [" ".join(each.cmdline()) for each in set(psutil.Process().children(recursive=True)) - before]
+    # Python's own tracker of shared memory is started with the first process and lives as long as this one.
+    assert [words for words in left if "multiprocessing.resource_tracker" not in words] == []
 
 
 def test_the_command_goes_on_where_it_was(
