@@ -7,10 +7,7 @@ import sys
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
-TESTS = Path(__file__).parent
 FILES = sorted(PACKAGE.rglob("*.py"))
-FOLDERS = sorted({file.parent for file in FILES})
-
 GROUND = {
     "types",
     "geometry",
@@ -44,7 +41,6 @@ MAY_IMPORT = {
 LIGHTNING = {"training", "datamodules", "cli", "commands"}
 # Files that may import a library: of OpenCV the pose solvers and the detector of keypoints.
 USERS = {"cv2": 2, "poselib": 1, "pycolmap": 2, "trimesh": 1}
-VAGUE = {"utils", "util", "helpers", "helper", "misc", "common", "base"}
 
 
 def module(file: Path) -> str:
@@ -118,22 +114,6 @@ def test_modules_do_not_import_in_circles() -> None:
 
     for name in graph:
         visit(name, ())
-
-
-def test_no_function_hides_a_module_of_its_name() -> None:
-    for folder in FOLDERS:
-        modules = {file.stem for file in folder.glob("*.py")} | {sub.name for sub in folder.iterdir() if sub.is_dir()}
-        for node in ast.parse((folder / "__init__.py").read_text()).body:
-            if isinstance(node, ast.ImportFrom):
-                names = {alias.asname or alias.name for alias in node.names}
-                assert not names & modules, f"{named(folder)}: {names & modules}"
-
-
-def test_the_tests_mirror_the_package() -> None:
-    rooms = {folder.relative_to(PACKAGE).parts[0] for folder in FOLDERS if folder != PACKAGE}
-    assert {folder.name for folder in TESTS.iterdir() if any(folder.glob("test_*.py"))} <= {*rooms, "commands"}
-    names = [file.name for file in TESTS.rglob("test_*.py")]
-    assert len(names) == len(set(names))  # pytest collects only one file of a name
 
 
 def test_only_the_command_line_prints_and_no_assertion_decides_anything() -> None:

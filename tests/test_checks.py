@@ -5,7 +5,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from bpnp.checks import check_positive, checked_shapes
+from bpnp.checks import checked_shapes
 
 
 @checked_shapes
@@ -52,10 +52,3 @@ def test_arguments_that_fit_their_annotations_pass_through() -> None:
 def test_what_does_not_fit_is_named(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         shape_of(**{"cost": COST, "points2d": POINTS, **changed})
-
-
-def test_options_that_are_not_positive_are_named() -> None:
-    check_positive(threshold=0.1, seeds=3)
-    for value in (0, -1.5, float("nan")):
-        with pytest.raises(ValueError, match=f"expected `seeds` > 0, got {value}"):
-            check_positive(threshold=0.1, seeds=value)

@@ -25,11 +25,6 @@ def test_importing_the_package_loads_neither_compilers_nor_optimisers() -> None:
     assert loaded("import bpnp", (*HEAVY, "scipy.optimize", "numba")) == []
 
 
-def test_solving_two_arrays_loads_neither_networks_nor_torchs_compiler() -> None:
-    assert loaded("from bpnp import solve, solve_many, PosePrior, GravityPrior, Solution, Batch", HEAVY) == []
-    assert loaded("from bpnp import BPnPNet", HEAVY) == ["bpnp.models"]  # a network, without torch's compiler either
-
-
 def run_loads(*arguments: str) -> list[str]:
     """Which of the modules COSTLY a command loads, and torch."""
     call = f"from bpnp.cli import main\ntry:\n    main({list(arguments)})\nexcept SystemExit:\n    pass"
@@ -67,8 +62,3 @@ def test_the_command_that_solves_loads_neither_lightning_nor_wandb(tmp_path: Pat
 def test_every_public_name_is_found_and_listed(name: str) -> None:
     assert getattr(bpnp, name).__name__ == name
     assert name in dir(bpnp)
-
-
-def test_an_unknown_name_is_an_attribute_error() -> None:
-    with pytest.raises(AttributeError, match="No bpnp attribute solver"):
-        bpnp.solver  # noqa: B018

@@ -1,11 +1,9 @@
 import json
-import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from planted import posed
 from torchmetrics import MetricCollection
 
 from bpnp.metrics import (
@@ -14,11 +12,9 @@ from bpnp.metrics import (
     PoseQuartiles,
     PoseRecall,
     RecallThresholds,
-    pose_errors,
     pose_quartiles,
     pose_recalls,
 )
-from bpnp.types import Batch
 
 
 def random_errors(seed: int, size: int, first_index: int = 0) -> PoseErrors:
@@ -47,18 +43,6 @@ def test_metrics_over_batches_are_the_functions_over_everything() -> None:
     assert metrics.compute()["rotation_q1_deg"] == errors.rotation_deg[3]
 
 
-def test_a_metric_does_not_keep_the_graph_of_the_errors() -> None:
-    points2d, points3d = torch.zeros(2, 5, 2), torch.ones(2, 5, 3)
-    batch = Batch.from_arrays(points2d, points3d, torch.eye(3).expand(2, 3, 3), torch.zeros(2, 3))
-    translation = torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, math.nan]]).requires_grad_()
-    metric = PoseQuartiles()
-    metric.update(pose_errors(posed(torch.eye(3).expand(2, 3, 3), translation), batch))
-    assert not metric.records[0].requires_grad
-    values = metric.compute()
-    assert (values["found"], values["rotation_q2_deg"]) == (0.5, 90)
-    assert metric.errors().centre.tolist() == [5, math.inf]
-
-
 def test_a_repeated_pair_is_counted_once_only_if_it_has_an_index() -> None:
     errors = random_errors(0, 5)
     metric = PoseQuartiles()
@@ -70,22 +54,6 @@ def test_a_repeated_pair_is_counted_once_only_if_it_has_an_index() -> None:
     for _ in range(3):
         metric.update(PoseErrors(*(torch.tensor([value], dtype=torch.float64) for value in (1, 2, 3, 4))))
     assert len(metric.errors().rotation_deg) == 3
-
-
-def test_two_data_sets_in_one_metric_are_noticed() -> None:
-    metric = PoseQuartiles()
-    metric.update(random_errors(0, 5))
-    metric.update(random_errors(1, 5))
-    with pytest.warns(UserWarning, match="one problem per `Batch.index`"):
-        values = metric.compute()
-    assert values == pose_quartiles(random_errors(0, 5))
-
-
-@pytest.mark.filterwarnings("ignore:The ``compute`` method of metric")
-@pytest.mark.parametrize("metric", [PoseQuartiles(), PoseRecall(), MeanOverProblems()])
-def test_an_empty_metric_raises(metric: PoseQuartiles | PoseRecall | MeanOverProblems) -> None:
-    with pytest.raises(ValueError, match=r"expected at least one problem, got none; try update\(\)"):
-        metric.compute()
 
 
 def _process(rank: int, folder: Path, shards: list[list[list[list[int]]]]) -> None:

@@ -47,17 +47,6 @@ def test_lists_of_pairs_are_padded_and_masked() -> None:
         assert (batch.match3d[i, n:] == -1).all()
 
 
-def test_numpy_torch_lists_and_stacks_give_the_same() -> None:
-    given = [pair(4, 6, seed=i) for i in range(2)]
-    arrays = lists(*given)
-    expected = Batch.from_arrays(**arrays)
-    for form in (lambda values: list(map(torch.as_tensor, values)), np.stack, tuple,
-                 lambda values: torch.as_tensor(np.stack(values))):  # fmt: skip
-        batch = Batch.from_arrays(**{name: form(values) for name, values in arrays.items()})
-        for name in ("points2d", "points3d", "mask2d", "mask3d", "rotation", "translation", "match3d", "focal"):
-            assert torch.equal(getattr(batch, name), getattr(expected, name))
-
-
 @pytest.mark.parametrize("points", [[[0.1, 0.2], [0.3, 0.4]], np.array([[0.1, 0.2], [0.3, 0.4]])[::-1],
                                     np.array([[0.1, 0.2], [0.3, 0.4]], ">f8"), [[1, 2], [3, 4]]])  # fmt: skip
 def test_takes_what_numpy_takes(points: Any) -> None:
@@ -71,13 +60,6 @@ def test_is_a_copy_of_a_read_only_array() -> None:
     batch = Batch.from_arrays(points2d, np.zeros((4, 3)))
     batch.points2d.add_(1)
     assert not points2d.any()
-
-
-def test_float64_is_kept_and_the_rest_is_float32() -> None:
-    batch = Batch.from_arrays(**pair(3, 4, dtype=np.float64))
-    assert batch.points3d.dtype == batch.rotation.dtype == batch.focal.dtype == torch.float64
-    assert Batch.from_arrays(np.zeros((3, 2), np.float16), np.zeros((3, 3))).points3d.dtype == torch.float32
-    assert Batch.from_arrays(np.zeros((3, 2), int), np.zeros((3, 3))).points2d.dtype == torch.float32
 
 
 def test_one_focal_serves_all() -> None:

@@ -1,12 +1,7 @@
-import importlib
-import inspect
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
-from lightning import Trainer
 from planted_model import plant_model
 from small_data import SMALL_NET, write_mesh_tree
 from torch import Tensor, nn
@@ -14,10 +9,8 @@ from torch import Tensor, nn
 import bpnp
 from bpnp import BPnPNet
 from bpnp.cli import main
-from bpnp.training import BlindPnPTask
 
 CONFIGS = Path(bpnp.__file__).parents[1] / "configs"
-EXPERIMENT = "PoseLossWarmup.start_epoch"  # modelnet40 names the paper's 120 epochs itself
 RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
 
 
@@ -90,49 +83,9 @@ def test_every_preset_joins_a_recipe(preset: str, tmp_path: Path, monkeypatch: p
     main(["fit", *arguments, f"--trainer.default_root_dir={tmp_path}"])
 
 
-def restated(content: Any, kind: type) -> Iterator[str]:
-    """Options of a configuration that have the value which they have without it."""
-    for name, value in (content or {}).items():
-        if isinstance(value, dict) and "class_path" in value:
-            yield from restated(value.get("init_args"), import_object(value["class_path"]))
-        elif isinstance(value, list) and value and isinstance(value[0], dict):
-            for each in value:
-                yield from restated(each.get("init_args"), import_object(each["class_path"]))
-        elif any(
-            name in signature and list_or_value(signature[name].default) == value
-            for signature in (inspect.signature(base.__init__).parameters for base in kind.__mro__)
-        ):
-            yield f"{kind.__name__}.{name}"
-
-
-def list_or_value(value: Any) -> Any:
-    return list(value) if isinstance(value, tuple) else value
-
-
-def import_object(path: str) -> Any:
-    module, name = path.rsplit(".", 1)
-    return getattr(importlib.import_module(module), name)
-
-
-@pytest.mark.parametrize("recipe", RECIPES)
-def test_a_recipe_says_only_what_differs_from_the_defaults(recipe: str) -> None:
-    content = yaml.safe_load((CONFIGS / recipe).read_text())
-    data = import_object(content["data"]["class_path"])
-    found = [*restated(content["model"], BlindPnPTask), *restated(content["data"].get("init_args"), data)]
-    found += restated(content["trainer"], Trainer)
-    assert found == ([EXPERIMENT] if recipe == "modelnet40.yaml" else [])
-    assert list(restated({"batch_size": 16}, data)) == [f"{data.__name__}.batch_size"]
-
-
 @pytest.mark.parametrize("file", sorted(CONFIGS.rglob("*.yaml")), ids=lambda file: file.stem)
 def test_a_configuration_begins_with_what_it_is_for_what_it_needs_and_how_long_it_takes(file: Path) -> None:
     comments = [line for line in file.read_text().splitlines() if line.startswith("#")]
     heads = [line[2:].split(":")[0] for line in comments if not line.startswith("#   ")]
     assert heads == ["For", "Needs", "Takes"]
     assert file.read_text().startswith("\n".join(comments))
-
-
-def test_the_papers_experiment_names_its_epochs() -> None:
-    trainer = yaml.safe_load((CONFIGS / "modelnet40.yaml").read_text())["trainer"]
-    (warmup,) = (each for each in trainer["callbacks"] if each["class_path"].endswith("PoseLossWarmup"))
-    assert (warmup["init_args"]["start_epoch"], trainer["max_epochs"]) == (120, 120 + 80)

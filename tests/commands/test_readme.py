@@ -32,13 +32,6 @@ def command_lines() -> Iterator[tuple[str, str]]:
 COMMAND_LINES = list(command_lines())
 
 
-def test_every_command_line_of_the_texts_is_looked_at() -> None:
-    """Counted in another way: lines that begin with a command, wherever they stand."""
-    lines = [line for text in TEXTS for line in text.read_text(encoding="utf-8").splitlines()]
-    assert len(COMMAND_LINES) == sum(bool(re.match(r"(bpnp|lightning|make) [a-z]", line)) for line in lines)
-    assert len(COMMAND_LINES) > 40
-
-
 @pytest.mark.parametrize(("text", "line"), COMMAND_LINES)
 def test_commands_are_parsed(text: str, line: str, capsys: pytest.CaptureFixture[str]) -> None:
     """Every command that the documentation shows is one, with options that it has."""
@@ -76,12 +69,6 @@ def test_links_lead_somewhere(text: Path) -> None:
 def test_every_picture_is_shown_somewhere() -> None:
     shown = " ".join(text.read_text(encoding="utf-8") for text in TEXTS)
     assert [file.name for file in (ROOT / "docs" / "images").iterdir() if file.name not in shown] == []
-
-
-def test_the_readme_is_short() -> None:
-    lines = (ROOT / "README.md").read_text(encoding="utf-8").splitlines()
-    assert len(lines) <= 90
-    assert max(map(len, lines)) <= 120
 
 
 def test_the_code_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,6 +1,5 @@
 """`bpnp report`, `view` and `wandb` on planted results."""
 
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -29,22 +28,6 @@ def test_commands_write_what_they_say(
     assert "got 'nothing'; try one of" in fails("view", str(tmp_path / "run"), "nothing")
     (tmp_path / "run" / "test" / "points.npz").unlink()
     assert "expected points.npz in" in fails("view", str(tmp_path / "run"))
-
-
-def test_a_run_that_was_only_trained_shows_its_curves(
-    tmp_path: Path, fails: Callable[..., str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_run(tmp_path / "run", 12, 0)
-    shutil.rmtree(tmp_path / "run" / "test")
-    page = tmp_path / "report.html"
-    main(["report", str(tmp_path / "run"), "--html", str(page)])
-    words = [line.split() for line in capsys.readouterr().out.splitlines()]
-    # The loss at step k is 1 / (k + 1), logged every tenth step up to 90.
-    assert ["train/loss", "90", "0.0110", "0.0110"] in words
-    text = page.read_text()
-    assert 'id="training"' in text
-    assert 'id="quartiles"' not in text
-    assert "expected a results folder" in fails("report", str(tmp_path))
 
 
 def test_every_problem_of_a_test_can_be_viewed_by_name(tmp_path: Path, fails: Callable[..., str]) -> None:

@@ -74,14 +74,6 @@ def test_a_mesh_is_found_by_its_corners(tmp_path: Path, capsys: pytest.CaptureFi
     np.testing.assert_allclose(content["rotation"], rotation, atol=1e-4)
 
 
-def test_a_pose_without_trust_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = write(tmp_path, X, np.outer(P[:, 0], [1.0, 2.0, 3.0]))
-    main(["solve", *files, "--output", str(tmp_path / "r.json"), "--picture", str(tmp_path / "r.svg")])
-    assert "failed: the 3D points lie on one line" in " ".join(capsys.readouterr().out.split())
-    assert json.loads((tmp_path / "r.json").read_text())["rotation"] is None
-    assert "<svg" in (tmp_path / "r.svg").read_text()
-
-
 def test_a_rough_pose_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rotation, translation = (value[0].tolist() for value in PLANTED.near(0.05))
     (tmp_path / "rough.json").write_text(json.dumps({"rotation": rotation, "translation": translation}))

@@ -11,11 +11,9 @@ from small_data import check_pairs
 
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
-from bpnp.datamodules.problem import Counts, Problem, stacked
+from bpnp.datamodules.problem import Problem, stacked
 from bpnp.geometry import transform
 from bpnp.types import Batch
-
-FIELDS = ("points2d", "points3d", "mask2d", "mask3d", "match3d", "rotation", "translation", "origin")
 
 
 def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0) -> Problem:
@@ -93,16 +91,6 @@ def test_subsets_and_clutter_are_as_many_as_asked_for(clutter: float, side: str,
     assert (int(matches_of(whole)), int(whole.count2d), int(whole.count3d)) == (40, 52, 70)
 
 
-def test_every_pair_and_every_clutter_point_is_as_likely() -> None:
-    """How often each of 10 matches and 6 free points is among 5 and 2 chosen, over 4000 draws."""
-    batch = raw(*[planted(10, free3d=6)] * 4000)
-    result = augmented(batch, max_points=5, clutter=0.4)
-    for points, count in ((batch.points3d[0, :10], 5), (batch.points3d[0, 10:], 2)):
-        hits = (result.points3d[:, :, None] == points).all(-1).sum((0, 1)).double()
-        share = count / len(points)
-        assert (hits / 4000 - share).abs().max() < 4 * (share * (1 - share) / 4000) ** 0.5
-
-
 def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     """camera = R (p + origin) + t - R origin is the same however the problem is turned."""
     batch = raw(planted(), planted(seed=1))
@@ -122,52 +110,6 @@ HARD: dict[str, Any] = {
     "max_points": 30, "clutter": 0.3, "rotate": True,
     "outliers": Outliers(ratio=(0.0, 1.0), side="random", occlusion=(0.0, 0.4), occluded_side="random"),
 }  # fmt: skip
-
-
-def test_a_pair_depends_on_its_key_alone_not_on_neighbours_or_padding() -> None:
-    problems = [planted(n, free2d=n // 2, free3d=9, seed=n) for n in (8, 60, 25)]
-    together = augmented(raw(*problems), 1, 2, **HARD)
-    check_pairs(together)
-    for row, problem in enumerate(problems):
-        alone = augment(
-            stacked([problem], torch.tensor([row])), Augmentation(**HARD), row_keys(torch.tensor([row]), 1, 2)
-        )
-        for name in FIELDS:
-            whole, own = getattr(together, name)[row], getattr(alone, name)[0]
-            assert torch.equal(whole[: len(own)], own), name
-            assert name in ("rotation", "translation", "origin") or not (whole[len(own) :] > 0).any()
-    again, other = (augmented(raw(*problems), 1, epoch, **HARD) for epoch in (2, 3))
-    assert torch.equal(again.points2d, together.points2d)
-    assert other.points2d.shape != together.points2d.shape or not torch.equal(other.points2d, together.points2d)
-
-
-def test_ranges_are_drawn_uniformly_for_each_pair() -> None:
-    """Counts follow their ranges: ratio uniform in (0.2, 1.4), occlusion in (0.1, 0.5), each side a third."""
-    outliers = Outliers(ratio=(0.2, 1.4), side="random", occlusion=(0.1, 0.5), occluded_side="3d")
-    result = augmented(raw(*[planted(200)] * 600), outliers=outliers)
-    true = matches_of(result).double()
-    outliers2d, outliers3d = result.count2d - 200, result.count3d - true
-    added = torch.maximum(outliers2d, outliers3d) / true
-    assert stats.kstest(added.numpy(), "uniform", (0.2, 1.2)).statistic < 0.08
-    assert stats.kstest(1 - true.numpy() / 200, "uniform", (0.1, 0.4)).statistic < 0.08
-    kinds = np.bincount(((outliers2d > 0) + 2 * (outliers3d > 0)).numpy(), minlength=4)
-    assert kinds[0] == 0
-    assert stats.chisquare(kinds[1:]).pvalue > 1e-3
-
-
-def test_sizes_are_upper_bounds_that_are_reached() -> None:
-    problems = [planted(n, free2d=2 * n, free3d=7, seed=n) for n in (8, 60, 25)]
-    counts = Counts(*(np.array(x) for x in ([8, 60, 25], [24, 180, 75], [15, 67, 32])))
-    hard = dict(HARD, outliers=Outliers(ratio=(0.0, 1.0)))
-    for options in ({}, {"max_points": 30}, {"clutter": 0.0}, {"clutter": 0.5, "clutter_side": "3d"}, hard):
-        bound = Augmentation(**options).sizes(counts)
-        largest = np.zeros(3)
-        for seed in range(60 if "outliers" in options else 1):
-            result = augmented(raw(*problems), seed, **options)
-            sides = torch.maximum(result.count2d, result.count3d).numpy()
-            assert (sides <= bound).all()
-            largest = np.maximum(largest, sides)
-        assert (largest >= (0.8 if "outliers" in options else 1) * bound).all()
 
 
 WRONG: list[tuple[type, dict[str, Any]]] = [

@@ -10,7 +10,7 @@ from released_pickles import Sample, sample, write
 
 from bpnp.cli import main
 from bpnp.datamodules.augment import Outliers
-from bpnp.datamodules.authors import AuthorsDataModule, PickleError, prepare_authors, split_rows
+from bpnp.datamodules.authors import AuthorsDataModule, PickleError, prepare_authors
 from bpnp.datamodules.store import Store, StoreError, open_store
 from bpnp.datamodules.stored import PROBLEMS, scene_rows, stored_problem
 
@@ -76,14 +76,6 @@ BAD = {
     "no correspondence": {"W_gt": np.full(40, -1)},
     "no numbers": {"p2d": [["a", "b"]]},
 }
-
-
-def test_bad_samples_are_counted(tmp_path: Path) -> None:
-    samples = [sample(i) for i in range(20)] + [sample(30) | change for change in BAD.values()]
-    prepared = prepare_authors(write(tmp_path, samples), tmp_path / "store")
-    assert [len(split_rows(prepared, split)) for split in ("train", "test")] == [20, 20]
-    assert set(prepared.skipped) == {f"{split}/{20 + i:06d}" for split in ("train", "test") for i in range(len(BAD))}
-    assert all(reason.startswith("expected") for reason in prepared.skipped.values())
 
 
 def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:

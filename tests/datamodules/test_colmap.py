@@ -1,13 +1,11 @@
-import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
-from small_data import check_pairs, recorded
+from small_data import check_pairs
 
 from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.module import ColmapDataModule
@@ -71,12 +69,6 @@ def test_scenes_are_split_without_overlap() -> None:
     assert not {"s4", "s2", "s0"} & set(named["val"])
 
 
-@pytest.mark.parametrize(("count", "expected"), [(1, (0, 0, 1)), (2, (1, 0, 1)), (3, (1, 1, 1))])
-def test_few_scenes_are_tested_on_first(count: int, expected: tuple[int, ...]) -> None:
-    split = split_scenes(SCENES[:count])
-    assert tuple(len(split[part]) for part in ("train", "val", "test")) == expected
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -137,27 +129,6 @@ def test_wrong_options_are_named_for_models_and_stores_alike(options: dict[str, 
             ColmapDataModule(root, **options)
 
 
-def test_only_training_draws_anew(tmp_path: Path) -> None:
-    plant_scenes(tmp_path)
-    data = ColmapDataModule(str(tmp_path), eval_max_points=10)
-    data.setup()
-    for part, changes in (("train", True), ("val", False), ("test", False)):
-        first, second = (data.datasets[part].problem(0, epoch).points2d for epoch in (0, 1))
-        assert torch.equal(first, second) != changes
-    assert max(data.datasets["test"].sizes) == 10
-
-
-def test_a_stage_reads_its_scenes_only(tmp_path: Path) -> None:
-    plant_scenes(tmp_path, 3)
-    (tmp_path / "s0/sparse/0/images.bin").write_bytes(b"")
-    data = ColmapDataModule(str(tmp_path), train_scenes=["s0"], val_scenes=[], test_scenes=["s1"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        data.setup("test")
-    with pytest.raises(ColmapError, match="s0/sparse/0/images.bin of 0 bytes"):
-        data.setup("fit")
-
-
 def test_a_broken_model_among_others_is_skipped_and_counted(tmp_path: Path) -> None:
     plant_scenes(tmp_path, 3)
     (tmp_path / "s1/sparse/0/points3D.bin").write_bytes(b"\0" * 7)
@@ -178,9 +149,3 @@ def test_a_stage_without_scenes_is_one_error(tmp_path: Path) -> None:
             data.setup(stage)
     with pytest.raises(ValueError, match="expected scenes for fit, got"):
         data.setup(TrainerFn.FITTING)
-
-
-def test_training_does_without_validation_scenes(tmp_path: Path) -> None:
-    plant_scenes(tmp_path, 2)
-    data = ColmapDataModule(str(tmp_path), val_fraction=0.0)
-    assert len(recorded(data, max_steps=1)) == 1

@@ -116,22 +116,6 @@ def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int 
         assert [{k for part in parts for k in part} for parts in zip(*shares, strict=True)] == alone
 
 
-def test_max_cells_bounds_padding_and_buckets_waste_little() -> None:
-    sizes = np.array(random_sizes(3000, largest=14_742))
-
-    def cells(batches: list[list[tuple[int, int]]]) -> list[tuple[int, int]]:
-        return [(len(b), len(b) * int(sizes[[i for _, i in b]].max()) ** 2) for b in batches]
-
-    bounded = cells(list(sampler(sizes.tolist(), batch_size=16, shuffle=False, max_cells=10_000_000)))
-    assert all(cost <= 10_000_000 or count == 1 for count, cost in bounded)
-    needed = int((sizes.astype(float) ** 2).sum())
-    assert sum(cost for _, cost in bounded) < 1.05 * needed
-    training = sum(cost for _, cost in cells(list(sampler(sizes.tolist(), batch_size=16, shuffle=True))))
-    shuffled = np.random.default_rng(1).permutation(sizes)[:2992].reshape(-1, 16)
-    assert training < 1.4 * needed
-    assert training < 0.25 * (16 * shuffled.max(1).astype(float) ** 2).sum()
-
-
 def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
     source = dataset(random_sizes(20))
     whole = [batch.ids for batch in problem_loader(source, batch_size=4, shuffle=False, seed=1)]

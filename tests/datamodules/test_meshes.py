@@ -15,7 +15,6 @@ from small_data import check_pairs, recorded
 from bpnp.datamodules.augment import Augmentation, Outliers
 from bpnp.datamodules.loader import ProblemDataset, ProblemKeys, hold_out
 from bpnp.datamodules.meshes import POINTS, SURFACES, MeshDataModule, MeshSource, RandomCameras
-from bpnp.datamodules.problem import ProblemSource
 from bpnp.datamodules.store import Store, new_store, open_store
 from bpnp.types import Batch
 
@@ -83,29 +82,6 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
     assert turn[:2, 0] == pytest.approx([np.cos(b) * np.cos(c), np.cos(b) * np.sin(c)])
 
 
-def test_so3_is_uniform(tmp_path: Path) -> None:
-    """The angle of a uniform rotation has the distribution function (a - sin a) / pi, its axes are uniform too."""
-    batch = drawn(source(tmp_path, RandomCameras(rotation="so3"), count=1000, num_points=4), 1000)
-    rotations = Rotation.from_matrix(batch.rotation)
-    assert stats.kstest(rotations.magnitude(), lambda a: (a - np.sin(a)) / np.pi).pvalue > 1e-3
-    assert stats.kstest(rotations.as_matrix()[:, 2, 2], stats.uniform(-1, 2).cdf).pvalue > 1e-3
-
-
-def test_a_pair_depends_on_seed_epoch_and_index_alone(tmp_path: Path) -> None:
-    one, reseeded, split = (source(tmp_path, seed=seed) for seed in ((0, 0), (1, 0), (0, 1)))
-    assert isinstance(one, ProblemSource)
-    index = torch.tensor([3, 7, 12])
-    whole, alone = one.batch(index, 2), one.batch(index[1:2], 2)
-    others = [reseeded.batch(index[1:2], 2), split.batch(index[1:2], 2), one.batch(index[1:2], 3)]
-    for name in ("points2d", "points3d", "rotation", "translation"):
-        assert torch.equal(getattr(whole, name)[1], getattr(alone, name)[0])
-        assert not any(torch.equal(getattr(alone, name), getattr(other, name)) for other in others)
-        assert not torch.equal(getattr(whole, name)[1], getattr(whole, name)[2])  # another view of the same mesh
-    assert one.names([7, 12]) == ("c/train/m2#1", "c/train/m2#2")
-    samples = {tuple(p) for p in one.store.row(2)[POINTS].tolist()}
-    assert len({tuple(p) for p in alone.points3d[0].tolist()} & samples) == 300
-
-
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="reach 1 from their origin"):
         inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), count=5)
@@ -145,20 +121,6 @@ def test_splits_are_by_model(folder: Path, tmp_path: Path) -> None:
     train, held = hold_out(10, 0.01, seed=1)
     assert len(held) == 1
     assert sorted([*train, *held]) == list(range(10))
-
-
-def test_stages_open_what_they_need(folder: Path, tmp_path: Path) -> None:
-    for path in folder.glob("*/test/*"):
-        path.unlink()
-    data = module(tmp_path, folder)
-    data.setup("fit")
-    assert set(data.datasets) == {"train", "val"}
-    with pytest.raises(ValueError, match=r"expected `setup` before the test loader"):
-        data.test_dataloader()
-    with pytest.raises(ValueError, match=rf"<class>/.train,test./.*in {folder}, got none for 'test'"):
-        data.setup("test")
-    with pytest.raises(ValueError, match=rf"got {folder}x, which is not there"):
-        module(tmp_path, folder.with_name("meshesx")).setup("fit")
 
 
 def test_a_bad_mesh_is_left_out_and_a_changed_one_read_again(folder: Path, tmp_path: Path) -> None:

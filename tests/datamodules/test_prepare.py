@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-import warnings
 import zipfile
 import zlib
 from collections.abc import Callable
@@ -20,11 +19,9 @@ import trimesh
 from planted_model import plant_model
 from small_data import check_pairs
 
-import bpnp.datamodules.store
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.colmap.module import prepare_colmap
-from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.datamodules.meshes import POINTS, SURFACES, prepare_meshes
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
 from bpnp.datamodules.surfaces import MeshFiles, normalise, read_mesh, sample_surface
@@ -272,19 +269,6 @@ class Stopping:
         monkeypatch.setattr(MeshFiles, "samples", samples)
 
 
-def test_a_run_that_is_stopped_leaves_nothing_and_starts_again(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with monkeypatch.context() as patch:
-        Stopping(patch, 9)
-        with pytest.raises(KeyboardInterrupt):
-            run(meshes, tmp_path / "out" / "store")
-    assert not (tmp_path / "out" / "store").exists()
-    assert [path.name for path in (tmp_path / "out").rglob("*") if path.is_file()] == []
-    run(meshes, tmp_path / "out" / "store")
-    check(opened(tmp_path / "out" / "store"), meshes)
-
-
 def test_ctrl_c_says_that_nothing_was_written(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -381,20 +365,6 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
         ColmapDataModule(str(tmp_path / "store"), val_scenes=str(tmp_path / "nothing.txt"))
 
 
-def test_what_was_not_used_of_a_model_is_listed_and_not_logged(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:  # fmt: skip
-    """A distortion that folds the border over: keypoints there cannot be undistorted."""
-    folded = ("SIMPLE_RADIAL", [800.0, 400.0, 300.0, -0.9])
-    plant_model(tmp_path / "scenes" / "a" / "sparse" / "0", camera=folded, origin=1e7)
-    model = read_reconstruction(tmp_path / "scenes" / "a" / "sparse" / "0")
-    assert "keypoints that could not be undistorted" in caplog.text
-    caplog.clear()
-    prepared = prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=4, clutter=0.0, processes=1)
-    assert prepared.skipped == {"a/points": model.notable}
-    assert caplog.text == ""
-
-
 def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     scenes(tmp_path / "scenes", 1)
     with pytest.raises(StoreError, match="at least one usable image.*min_points"):
@@ -427,27 +397,6 @@ def test_meshes_that_were_not_prepared_are_sampled_into_the_cache_once(
             module(meshes, tmp_path / "cache")
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
     assert len(counted.names) == 4 * 19
-
-
-@pytest.mark.parametrize("root", [True, False])
-def test_a_cached_store_is_compared_with_its_checksums_once_a_run(
-    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, root: bool
-) -> None:
-    options = {"num_points": 16, "pool_size": 32, "train_shapes": 3, "val_shapes": 3, "val_fraction": 0.2}
-    options |= {"cache_dir": str(tmp_path / "cache")}
-    source = str(meshes) if root else None
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the seven bad files
-        MeshDataModule(source, **options).setup("fit")
-        read: list[Path] = []
-        whole = bpnp.datamodules.store.open_store
-        monkeypatch.setattr(
-            "bpnp.datamodules.store.open_store", lambda folder, kind: (read.append(folder), whole(folder, kind))[1]
-        )
-        data = MeshDataModule(source, **options)
-        data.prepare_data()
-        data.setup("fit")
-    assert len(set(read)) == len(read) == (1 if root else 3)  # of training, validation and test
 
 
 def test_the_cache_is_the_users_wherever_the_work_is(

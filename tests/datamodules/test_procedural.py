@@ -3,11 +3,8 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 from scipy.spatial.distance import pdist, squareform
-from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules.meshes import POINTS, open_surfaces
 from bpnp.datamodules.store import Store
@@ -40,23 +37,3 @@ def test_shapes_are_connected_and_varied() -> None:
         ratios.append(deviations[:2] / deviations[2])
     low, high = np.quantile(ratios, [0.1, 0.9], axis=0)
     assert (high - low > 0.2).all()
-
-
-def test_shapes_are_not_symmetric() -> None:
-    """A half turn about a principal axis moves the surface by several times the distance between two samplings."""
-    moved = []
-    for i in range(30):
-        rng = np.random.default_rng(i)
-        shape = procedural_shape(rng)
-        points, again = (normalise(sample_surface(shape, 1500, rng), "unit_sphere") for _ in range(2))
-        tree = cKDTree(points)
-        axes = np.linalg.eigh(np.cov(points.T))[1].T
-        turned = [tree.query(Rotation.from_rotvec(np.pi * axis).apply(again))[0].mean() for axis in axes]
-        moved.append(min(turned) / tree.query(again)[0].mean())
-    assert np.median(moved) > 2
-    assert min(moved) > 1.15
-
-
-def test_no_shapes_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="at least one procedural val shape, got 0"):
-        shapes(tmp_path, "val", 0)

@@ -15,7 +15,6 @@ from bpnp.datamodules.colmap.model_files import ModelRecords, read_records
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
-SIMPLE_RADIAL = ("SIMPLE_RADIAL", [700.0, 400.0, 300.0, -0.35])
 EXACT = ("name", "points2d", "seen", "clutter2d", "observed", "translation")
 PARAMETERS = {
     "f": 450.0, "fx": 440.0, "fy": 460.0, "cx": 390.0, "cy": 310.0, "omega": 0.8, "alpha": 0.6, "beta": 1.1,

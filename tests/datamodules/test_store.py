@@ -2,7 +2,6 @@
 
 import json
 import os
-import pickle
 import resource
 import subprocess
 import sys
@@ -58,19 +57,6 @@ def test_round_trip(store: Store) -> None:
     assert (store.parameters, store.skipped) == ({"clutter": 1.0}, {"s9/1": "too few"})
     for path in store.folder.glob("*.npy"):
         np.load(path)  # a column is a plain .npy file
-
-
-def test_a_store_may_be_empty(tmp_path: Path) -> None:
-    assert len(write(tmp_path / "none", 0)) == 0
-
-
-def test_nothing_is_copied_for_a_reader_or_a_worker(store: Store) -> None:
-    a, b = store.row(3)["deep"], store.row(3)["deep"]
-    assert np.shares_memory(a, b)
-    assert not a.flags.writeable
-    sent = pickle.dumps(store)
-    assert len(sent) < 500
-    check(pickle.loads(sent))
 
 
 COLUMNS = ["flat", "deep", "flat_start", "deep_start", "number", "scene", "name"]

@@ -47,17 +47,6 @@ def store(tmp_path: Path) -> Store:
     return open_store(tmp_path / "store", PROBLEMS)
 
 
-def test_matches_come_first_and_lose_no_point() -> None:
-    for i, (_, problem) in enumerate(problems()):
-        points2d, points3d, match = sets(i)
-        assert problem.matched == (match >= 0).sum()
-        np.testing.assert_array_equal(problem.points2d[: problem.matched, 0], problem.points3d[: problem.matched, 0])
-        assert (problem.points2d[problem.matched :, 0] < 0).all()
-        assert (problem.points3d[problem.matched :, 0] >= 2).all()
-        for ours, given in ((problem.points2d, points2d), (problem.points3d, points3d)):
-            assert {tuple(p) for p in ours} == {tuple(p) for p in given.astype("f4")}
-
-
 def test_pairs_come_back(store: Store) -> None:
     assert {name: rows.tolist() for name, rows in scene_rows(store).items()} == {
         f"s{s}": list(range(s, 12, 3)) for s in range(3)

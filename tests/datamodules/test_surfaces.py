@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy import stats
 
-from bpnp.datamodules.surfaces import Mesh, MeshError, normalise, primitives, read_mesh, sample_surface
+from bpnp.datamodules.surfaces import Mesh, MeshError, primitives, read_mesh, sample_surface
 
 VERTICES = "0 0 0\n2 0 0\n2 1 0\n0 1 0\n0 0 3\n"
 FACES = "4 0 1 2 3\n3 0 1 4\n"  # a rectangle of area 2 and a triangle of area 3
@@ -78,13 +78,6 @@ def test_other_formats(tmp_path: Path, suffix: str) -> None:
         read_mesh(path)
 
 
-def test_point_cloud_is_no_mesh(tmp_path: Path) -> None:
-    path = tmp_path / "cloud.ply"
-    trimesh.PointCloud(np.random.default_rng(0).random((10, 3))).export(path)
-    with pytest.raises(MeshError, match="faces, got none"):
-        read_mesh(path)
-
-
 def test_real_meshes_as_trimesh_reads_them(shared_data: Path) -> None:
     files = sorted((shared_data / "psb").glob("*/test/*.off"))[::60]
     assert files
@@ -105,17 +98,6 @@ def test_samples_are_uniform_by_area() -> None:
     assert stats.kstest(points[flat, 0], stats.uniform(0, 2).cdf).pvalue > 1e-3
     assert stats.kstest(points[flat, 1], stats.uniform(0, 1).cdf).pvalue > 1e-3
     np.testing.assert_allclose(points[~flat].mean(0), [2 / 3, 0, 1], atol=0.03)  # centroid of the triangle
-
-
-def test_normalisation() -> None:
-    points = np.random.default_rng(0).normal([100, -3, 7], [4, 1, 0.1], (500, 3))
-    sphere = normalise(points, "unit_sphere")
-    np.testing.assert_allclose(sphere.mean(0), 0, atol=1e-12)
-    assert np.linalg.norm(sphere, axis=1).max() == pytest.approx(1)
-    cube = normalise(points, "unit_cube")
-    np.testing.assert_allclose(cube.min(0), -cube.max(0))
-    assert np.ptp(cube, axis=0).max() == pytest.approx(1)
-    np.testing.assert_array_equal(normalise(points, "none"), points)
 
 
 def test_primitives_have_the_areas_of_their_formulas() -> None:

@@ -4,37 +4,27 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from jsonargparse import ArgumentParser
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules import Outliers, Problem, ProblemSource, SyntheticMapDataModule
-from bpnp.datamodules.synthetic_maps.kinds import blob_points
+from bpnp.datamodules import Outliers, Problem, SyntheticMapDataModule
 from bpnp.datamodules.synthetic_maps.maps import (
     KINDS,
     MOST_ERROR_PX,
     MapOptions,
-    MapSource,
     draw_map_problem,
-    triangulated,
 )
 from bpnp.datamodules.synthetic_maps.scene import (
     NO_BLOBS,
     NO_WALLS,
-    Blobs,
     Scene,
     Viewpoint,
     Walls,
     camera_at,
     details,
-    hidden_by_blobs,
     hidden_by_walls,
     look,
 )
-
-
-def source(*, seed: tuple[int, ...] = (0, 0), **options: object) -> MapSource:
-    return MapSource(MapOptions(**options), count=100, seed=seed, label="train")
 
 
 def problems(count: int, **options: object) -> list[Problem]:
@@ -75,18 +65,6 @@ def test_of_each_side_at_most_a_share_has_no_partner(limit: float) -> None:
     everything = problems(15, num_points=120, outliers=1.0)
     without = [1 - problem.matched / len(problem.points2d) for problem in everything]
     assert np.median(without) > 0.6  # most keypoints of a photo are in no other photo, or not in the view's
-
-
-def test_a_problem_is_a_function_of_seed_epoch_and_index() -> None:
-    options = {"num_points": 40}
-    first, index = source(**options), torch.tensor([3, 4])
-    assert isinstance(first, ProblemSource)
-    problem = first.batch(index[1:], 2)
-    size = int(problem.count3d)
-    assert torch.equal(problem.points3d[0], source(**options).batch(index, 2).points3d[1, :size])
-    others = [first.batch(index[1:], 1), first.batch(index[:1], 2)]
-    others += [source(seed=seed, **options).batch(index[1:], 2) for seed in ((1, 0), (0, 1))]
-    assert not any(torch.equal(problem.points3d[0, :16], other.points3d[0, :16]) for other in others)
 
 
 def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
@@ -146,40 +124,6 @@ def test_a_wall_hides_what_is_behind_it_and_nothing_else() -> None:
     assert found.tolist() == list(points.values())
 
 
-def test_an_ellipsoid_hides_what_is_behind_it_and_nothing_else() -> None:
-    """Radii 1, 1 and 2 around (0, 0, 3); rays along x from (-10, 0, 3) and to its surface."""
-    blob = Blobs(np.array([[0.0, 0.0, 3.0]]), np.diag([1.0, 1.0, 0.5])[None])
-    points = {
-        (5.0, 0.0, 3.0): True,
-        (5.0, 1.4, 3.0): True,  # the ray passes at y = 0.93, within the radius of 1
-        (5.0, 1.6, 3.0): False,
-        (5.0, 0.0, 5.9): True,  # passes 1.93 above the centre
-        (5.0, 0.0, 6.2): False,
-        (-1.0, 0.0, 3.0): False,  # the surface that faces the camera
-        (1.0, 0.0, 3.0): True,  # the one on the other side
-        (-12.0, 0.0, 3.0): False,
-    }
-    found = hidden_by_blobs(blob, np.array([-10.0, 0.0, 3.0]), np.array(list(points)))
-    assert found.tolist() == list(points.values())
-
-
-def test_points_of_blobs_are_on_a_surface_outside_of_the_others() -> None:
-    rng = np.random.default_rng(0)
-    radii = rng.uniform(0.5, 2, (4, 3))
-    turn = Rotation.random(4, random_state=1).as_matrix()
-    blobs = Blobs(rng.normal(0, 1.5, (4, 3)), turn / radii[:, :, None])
-    points, normals, _ = blob_points(blobs, 500, rng)
-
-    def level(at: np.ndarray) -> np.ndarray:
-        """Of each point the smallest ||to_sphere (p - centre)||: 1 on the surface of the union, more outside."""
-        place = np.einsum("kij,nkj->nki", blobs.to_sphere, at[:, None] - blobs.centre)
-        return np.linalg.norm(place, axis=-1).min(1)
-
-    np.testing.assert_allclose(level(points), 1, atol=1e-9)
-    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1)
-    assert (level(points + 1e-5 * normals) > level(points - 1e-5 * normals)).all()
-
-
 def plane(count: int, rng: np.random.Generator, *, repeatability: float) -> Scene:
     """A wall of points at x = 0 that faces the negative x axis; nothing hides them."""
     points = np.stack([np.zeros(count), *rng.uniform(-2, 2, (2, count))], 1)
@@ -208,48 +152,6 @@ def test_a_photo_has_keypoints_where_points_repeat_face_it_and_are_near_enough()
     single = scene._replace(repeatability=np.zeros(20_000))
     assert len(look(single, front, everywhere, rng, alone=False).of) == 0
     assert len(look(single, front, everywhere, rng, alone=True).of) > 0
-
-
-def test_a_triangulated_point_is_off_along_its_ray_by_the_square_of_its_depth() -> None:
-    """Inverse depths are off by noise / (baseline sqrt(photos)), the same at every depth."""
-    rng = np.random.default_rng(0)
-    scene = plane(20_000, rng, repeatability=1.0)
-    camera = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
-    spread = []
-    for depth in (10.0, 20.0):
-        moved = scene._replace(points=scene.points + [depth - 10.0, 0.0, 0.0])
-        seed = np.random.default_rng(5)  # the same number of photos
-        found = triangulated(moved, FRONT, [camera], np.full(20_000, np.inf), 1e-4, seed)
-        exact, points = moved.points[found.of] - camera.centre, found.points - camera.centre
-        assert np.abs(np.cross(exact, points)).max() < 1e-9 * np.abs(exact).max() ** 2
-        spread.append(np.std(1 / (points @ camera.rotation[2]) - 1 / (exact @ camera.rotation[2])))
-    assert spread[0] == pytest.approx(spread[1], rel=0.05)
-    photos = (1e-4 / (1.0 * spread[0])) ** 2  # the baseline is 1: a tenth of the distance to the target
-    assert photos == pytest.approx(round(photos), rel=0.05)
-    assert 2 <= round(photos) <= 16
-
-
-def test_the_map_has_no_point_that_one_photo_alone_has_a_keypoint_of() -> None:
-    rng = np.random.default_rng(0)
-    camera = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
-    far = np.full(1000, np.inf)
-    counts = [
-        len(triangulated(plane(1000, rng, repeatability=share), FRONT, [camera], far, 1e-4, rng).of)
-        for share in (0.0, 0.05, 0.9)
-    ]
-    assert counts[0] == 0
-    assert counts[1] < 50  # seen by this camera and one of at most 16 others
-    assert counts[2] > 850
-
-
-def test_density_is_uneven_as_that_of_keypoints() -> None:
-    """Counts in cells of the image vary several times as much as those of uniform points would."""
-    spread = []
-    for problem in problems(20, num_points=250, min_points=40):
-        half = np.abs(problem.points2d).max(0)
-        cells = np.histogram2d(*problem.points2d.T, bins=6, range=[(-h, h) for h in half])[0]
-        spread.append(cells.var() / cells.mean())
-    assert np.median(spread) > 2.5
 
 
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
@@ -283,8 +185,3 @@ WRONG: list[tuple[str, object]] = [
 def test_wrong_options_are_named(name: str, value: object) -> None:
     with pytest.raises(ValueError, match="at least one train problem" if name == "train_pairs" else name):
         SyntheticMapDataModule(**{name: value}).setup("fit")  # type: ignore[arg-type]
-
-
-def test_a_photo_that_never_shares_enough_is_an_error() -> None:
-    with pytest.raises(ValueError, match="expected a photo that shares 500 points with its map in 50 scenes"):
-        problems(1, num_points=500, min_points=500, field_of_view=5.0)

@@ -1,10 +1,10 @@
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 import pytest
 import torch
 from torch import Tensor
 
-from bpnp.layers import compiled, laplacian
+from bpnp.layers import laplacian
 from bpnp.layers.compiled import conjugate_gradients
 from bpnp.layers.laplacian import solve_multipliers
 from bpnp.layers.plan import Plan
@@ -53,53 +53,6 @@ def test_solves_the_laplacian(shape: tuple[int, int, int], threads: int) -> None
     assert solved.all()
     torch.testing.assert_close((system @ x.unsqueeze(-1)).squeeze(-1), rhs, atol=1e-12, rtol=1e-9)
     torch.testing.assert_close(mean, (p @ x.unsqueeze(-1)).squeeze(-1) / p.sum(-1), atol=1e-9, rtol=1e-9)
-
-
-@pytest.mark.parametrize("sums", [laplacian.first_sums, compiled.first_sums])
-@pytest.mark.parametrize("shape", [(5, 300, 20), (2, 3, 2100)])
-def test_the_first_sums_are_those_of_the_formed_matrices(
-    sums: Callable[[Tensor, Tensor], tuple[Tensor, ...]], shape: tuple[int, int, int], threads: int
-) -> None:
-    p, v = plan(*shape), noise(*shape)
-    rows, cols, mean, rhs, degree = sums(p, v.mT.contiguous().mT)
-    torch.testing.assert_close((rows, cols), (p.sum(-1), p.sum(-2)))
-    torch.testing.assert_close(mean, torch.einsum("bmn,bmn->bm", p, v) / p.sum(-1))
-    torch.testing.assert_close(rhs, torch.einsum("bmn,bmn->bn", p, v - mean.unsqueeze(-1)))
-    torch.testing.assert_close(degree, laplacian_matrix(p).diagonal(dim1=-2, dim2=-1))
-    p[:, 1], p[:, :, 1] = 0, 0
-    rows, cols, mean, _, degree = sums(p, v)
-    assert not any(values[:, 1].any() for values in (rows, cols, mean, degree))
-
-
-def test_every_sample_stops_at_its_own_tolerance_whatever_its_neighbours(threads: int) -> None:
-    p = plan(4, 40, 30).float()
-    rhs = (laplacian_matrix(p) @ noise(4, 30, 1).float()).squeeze(-1)
-    rhs[1], rhs[2, 0] = 0, torch.nan
-    tolerance = torch.tensor([1e-1, 1e-3, 1e-3, 1e-5])
-    x, _, _ = solve(p, rhs, tolerance=tolerance)
-    assert not x[1].any()  # done before it starts
-    unit = 1 / p.sum(-2)
-    residual = rhs - (laplacian_matrix(p) @ x.unsqueeze(-1)).squeeze(-1)
-    relative = ((unit * residual**2).sum(-1) / (unit * rhs**2).sum(-1)).sqrt()
-    assert 1e-3 < relative[0] <= 1.01e-1
-    assert relative[3] < 2e-5
-    swapped, _, _ = solve(p.flip(0), rhs.flip(0), tolerance=tolerance.flip(0))
-    assert (swapped.flip(0) - x)[[0, 1, 3]].abs().max() < 1e-2 * x[[0, 3]].abs().max()
-
-
-def test_nothing_is_done_for_an_empty_batch(threads: int) -> None:
-    x, mean, solved = solve(torch.empty(0, 4, 5), torch.empty(0, 5))
-    assert (x.shape, mean.shape, solved.shape) == ((0, 5), (0, 4), (0,))
-
-
-def test_results_do_not_depend_on_the_strides_of_the_inputs() -> None:
-    p = plan(3, 30, 20)
-    rhs = (laplacian_matrix(p) @ noise(3, 20, 1)).squeeze(-1)
-    expected, _, _ = solve(p, rhs)
-    found, _, solved = solve(p.mT.contiguous().mT, rhs.T.contiguous().T)
-    assert solved.all()
-    assert expected.any()
-    torch.testing.assert_close(found, expected)
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -95,59 +95,6 @@ def test_a_change_of_a_record_of_constants_compiles_again(package: Path, tmp_pat
     assert doubled(package, str(tmp_path / "cache"))[0] == "120 150\n"
 
 
-RECORD = """
-from typing import NamedTuple
-
-
-class Record(NamedTuple):
-    value: int
-"""
-OF_RECORD = """
-from bpnp.loops.compilation import compiler
-from bpnp.record import Record
-
-
-@compiler()
-def value_of(record):
-    return record.value
-
-
-def double(x):
-    return 2 * value_of(Record(x))
-"""
-
-
-def test_a_type_that_has_moved_compiles_again(package: Path, tmp_path: Path) -> None:
-    cache, folder = str(tmp_path / "cache"), package / "bpnp"
-    (folder / "record.py").write_text(RECORD)
-    (folder / "loop.py").write_text(OF_RECORD)
-    assert doubled(package, cache)[0] == "8 10\n"
-    (folder / "record.py").rename(folder / "entry.py")
-    (folder / "loop.py").write_text(OF_RECORD.replace("bpnp.record", "bpnp.entry"))
-    printed, logged = doubled(package, cache)
-    assert printed == "8 10\n", logged
-    assert logged.count("compiling") == 1
-
-
-def test_without_any_folder_to_write_to_each_process_compiles(package: Path) -> None:
-    for _ in range(2):
-        printed, logged = doubled(package, "/dev/null/nowhere")
-        assert printed == "8 10\n"
-        assert logged.count("compiling") == 1
-
-
-def test_another_version_of_numba_compiles_without_shortcuts_and_says_so(package: Path, tmp_path: Path) -> None:
-    for version in ("0.99.0rc1", "1.2.3"):
-        ask = f"import numba\nnumba.__version__ = '{version}'\nfrom bpnp.loop import double\nprint(double(4))"
-        environment = {**os.environ, "PYTHONPATH": str(package), "NUMBA_CACHE_DIR": str(tmp_path)}
-        done = subprocess.run(
-            [sys.executable, "-c", ask], env=environment, cwd=package, capture_output=True, text=True, check=True
-        )
-        assert done.stdout == "8\n"
-        assert f"got {version}: loops are compiled slowly" in done.stderr
-        assert not list(tmp_path.rglob("*.nbi"))
-
-
 def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, tmp_path: Path) -> None:
     """All find the loop's value, and what they leave in the cache is whole: the next one compiles nothing."""
     cache, gate = str(tmp_path / "cache"), tmp_path / "gate"

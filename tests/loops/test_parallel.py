@@ -1,7 +1,6 @@
 """Loops shared among threads: every index once, none stuck; and numpy's products on one thread meanwhile."""
 
 import multiprocessing
-import threading
 from collections.abc import Iterator
 
 import numpy as np
@@ -32,12 +31,6 @@ def test_every_index_is_visited_once_and_no_share_is_empty(threads: int, count: 
     assert (seen == 1).all()
     assert len(shares) == max(min(threads, count), 1)
     assert count == 0 or min(shares) >= 1
-
-
-@pytest.mark.parametrize("threads", [3], indirect=True)
-def test_shares_run_at_the_same_time(threads: int) -> None:
-    together = threading.Barrier(threads, timeout=20)
-    in_threads(lambda _first, _last: together.wait(), threads)
 
 
 def test_an_error_in_any_share_is_raised(threads: int) -> None:

@@ -47,12 +47,6 @@ def test_one_keypoint_a_place_with_its_scale(database: Path) -> None:
     np.testing.assert_array_equal(read_database(database, "c.jpg").scores, [3, 3])  # a turn by 90 deg times 3; 2 and 4
 
 
-def test_a_database_is_left_as_it_was(database: Path, tmp_path: Path) -> None:
-    before, files = database.read_bytes(), sorted(tmp_path.iterdir())
-    assert len(photo_keypoints(photo_of(tmp_path), database, "a.jpg").pixels) == 2
-    assert (database.read_bytes(), sorted({*tmp_path.iterdir()} - {tmp_path / "photo.png"})) == (before, files)
-
-
 def test_what_is_wrong_is_one_clear_error(database: Path, tmp_path: Path) -> None:
     for photo, size, message in (
         ("d.jpg", None, r"expected keypoints of d\.jpg in .*database\.db, got none, but a\.jpg, b\.jpg"),

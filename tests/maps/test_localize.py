@@ -10,8 +10,7 @@ from planted_model import Planted, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import PosePrior, SceneMap, Solution
-from bpnp.maps.localize import BRIEF, counted
-from bpnp.search.settings import DEFAULT
+from bpnp.maps.localize import BRIEF
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
@@ -49,15 +48,6 @@ def test_a_photo_near_a_given_view(planted: tuple[SceneMap, Planted]) -> None:
     assert_right(solution, truth, 1, ids)
     assert solution.view == "photo 1.jpg"
     assert solution.verdict == "confident"
-
-
-def test_the_points_of_all_given_views_are_used_at_once(planted: tuple[SceneMap, Planted]) -> None:
-    scene, truth = planted
-    keypoints, ids = photo_of(truth, 1)
-    solution = scene.localize(keypoints, CAMERA, views=["photo 0.jpg", "photo 1.jpg"])
-    assert solution.verdict == "confident"
-    assert_right(solution, truth, 1, ids)
-    np.testing.assert_array_equal(solution.point_ids, np.union1d(truth.seen[0], truth.seen[1]) + 1)
 
 
 def test_a_photo_somewhere_in_the_map(planted: tuple[SceneMap, Planted]) -> None:
@@ -139,15 +129,6 @@ def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap,
     for seed in range(3):
         noise = np.random.default_rng(seed).uniform((0, 0), (800, 600), (90, 2))
         assert scene.localize(noise, CAMERA, time_limit=3).verdict != "confident"
-
-
-def test_each_view_that_was_tried_is_as_many_tests_again(planted: tuple[SceneMap, Planted]) -> None:
-    scene, truth = planted
-    clear = scene.localize(photo_of(truth, 0)[0], CAMERA, views=["photo 0.jpg"])
-    close = replace(clear, log10_false_alarms=DEFAULT.evidence.false_alarms - 1)
-    assert counted(clear, 1000).verdict == counted(close, 9).verdict == "confident"
-    assert counted(close, 11).verdict == "ambiguous"
-    assert counted(close, 100).log10_false_alarms == pytest.approx(close.log10_false_alarms + 2)
 
 
 def test_a_view_of_too_few_points_is_passed_over(planted: tuple[SceneMap, Planted]) -> None:

@@ -7,7 +7,7 @@ import pytest
 from planted_model import plant_model
 
 from bpnp import SceneMap
-from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches, localized_picture
+from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches
 
 CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
@@ -40,13 +40,3 @@ def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_i
     down = np.mean([view.rotation[1] for view in scene.views], axis=0)
     down /= np.linalg.norm(down)
     assert spaced == pytest.approx(np.linalg.norm(centres - down * (centres @ down)))
-
-
-def test_a_photo_without_a_pose_is_drawn_too(tmp_path: Path) -> None:
-    plant_model(tmp_path, camera=CAMERA, images=3)
-    scene = SceneMap.from_colmap(tmp_path)
-    random = np.random.default_rng(1).uniform(0, 600, (40, 2))
-    solution = scene.localize(random, CAMERA, views=["photo 0.jpg"], time_limit=2)
-    assert solution.verdict != "confident"
-    figure = localized_picture(scene, solution, photo=np.zeros((600, 800, 3), np.uint8), title="none")
-    assert [axes.get_title() for axes in figure.axes][1].startswith("the map from above")

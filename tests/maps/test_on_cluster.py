@@ -81,16 +81,6 @@ def test_a_lost_worker_loses_nothing(place: tuple[Path, Path, Path], cluster: Lo
         np.testing.assert_array_equal(solution.matches, alone[name].matches)
 
 
-def test_each_worker_is_sent_the_map_once(place: tuple[Path, Path, Path], cluster: LocalCluster, monkeypatch) -> None:
-    """It is pickled for the workers, not for each of the photos."""
-    scene = SceneMap.from_colmap(place[0])
-    pickled = []
-    monkeypatch.setattr(SceneMap, "__getstate__", lambda self: pickled.append(1) or self.__dict__, raising=False)
-    results = list(attempts_on_cluster(scene, tasks(place, scene, views=VIEWS), cluster.scheduler_address))
-    assert len(results) == PHOTOS
-    assert len(pickled) == 1
-
-
 def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> None:
     before = set(psutil.Process().children(recursive=True))
     scene = SceneMap.from_colmap(place[0])

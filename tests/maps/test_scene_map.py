@@ -1,6 +1,5 @@
 """Maps are read with the points, tracks and views that the model has, whichever its form."""
 
-import inspect
 import struct
 from pathlib import Path
 
@@ -123,11 +122,3 @@ def test_a_real_map_is_that_of_pycolmap(shared_data: Path) -> None:
         np.testing.assert_allclose(view.centre, image.projection_center(), atol=1e-9)
         seen = {point.point3D_id for point in image.points2D if point.has_point3D()}
         assert set(scene.point_ids[view.points].tolist()) == seen
-
-
-def test_a_map_says_how_large_it_is_and_what_localize_takes(planted: tuple[Path, Planted]) -> None:
-    scene = SceneMap.from_colmap(planted[0])
-    assert repr(scene) == f"SceneMap(4 views, {len(scene.points3d)} points)"
-    told = SceneMap.localize.__doc__ or ""
-    for name in inspect.signature(SceneMap.localize).parameters:
-        assert name == "self" or f"{name}:" in told

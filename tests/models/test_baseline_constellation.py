@@ -2,14 +2,12 @@
 
 import math
 
-import pytest
 import torch
 
 from bpnp import Batch
 from bpnp.geometry import project, random_rotations, transform
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import Constellation
-from bpnp.models.baselines.blind_p3p import neighbour_triples
 
 
 def ring(seed: int, *, seen: int = 9, lights: int = 2, noise: float = 0.0004) -> Batch:
@@ -45,24 +43,3 @@ def test_points_without_a_pose_in_common_are_not_found() -> None:
     points2d, points3d = (torch.rand(8, k, generator=generator, dtype=torch.float64) for k in (2, 3))
     pose = Constellation(radius=1e-4, neighbours2d=3, neighbours3d=4)(Batch.from_arrays(points2d, points3d)).poses
     assert not pose["constellation"].stats.converged[0]
-
-
-def test_triples_are_those_of_a_loop() -> None:
-    points = torch.rand(7, 2, generator=torch.Generator().manual_seed(1))
-    distance = torch.cdist(points, points)
-    expected = set()
-    for i in range(7):
-        nearest = sorted((j for j in range(7) if j != i), key=lambda j: float(distance[i, j]))[:3]
-        expected |= {(i, a, b) for a in nearest for b in nearest if a != b}
-    ordered = [tuple(triple) for triple in neighbour_triples(points, 3, ordered=True).tolist()]
-    assert set(ordered) == expected
-    assert len(ordered) == len(expected)
-    unordered = {(i, *sorted(rest)) for i, *rest in neighbour_triples(points, 3, ordered=False).tolist()}
-    assert unordered == {(i, *sorted(rest)) for i, *rest in expected}
-    assert len(neighbour_triples(points, 3, ordered=False)) == len(expected) // 2
-
-
-def test_options_out_of_range_are_named() -> None:
-    for options in ({"neighbours2d": 1}, {"neighbours3d": 0}, {"min_matches": 3}, {"radius": 0.0}):
-        with pytest.raises(ValueError, match="expected .* got"):
-            Constellation(**options)

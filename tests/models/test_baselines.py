@@ -3,7 +3,6 @@
 import math
 from pathlib import Path
 
-import numpy as np
 import pytest
 import roma
 import torch
@@ -15,7 +14,7 @@ from bpnp.metrics import rotation_error, translation_error
 from bpnp.models.baselines import GOPAC, GOSMA, Constellation, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.blind_p3p import probability_of_true_triple
 from bpnp.models.baselines.hungarian import hungarian
-from bpnp.models.baselines.single_problem import SingleSolver, agreement
+from bpnp.models.baselines.single_problem import SingleSolver
 from bpnp.models.baselines.softposit import slack_scalings, softposit
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 
@@ -41,15 +40,6 @@ def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_
     torch.testing.assert_close(of_two.rotation[1], of_one.rotation[0], rtol=0, atol=0, equal_nan=True)
     torch.testing.assert_close(of_two.translation[1], of_one.translation[0], rtol=0, atol=0, equal_nan=True)
     assert of_two.stats.iterations[1] == of_one.stats.iterations[0]
-
-
-@each_solver
-def test_three_points_have_no_pose_and_say_so(name: str) -> None:
-    problem = plant(1, 12)
-    pose = QUICK[name](Batch.from_arrays(problem.points2d[:, :3], problem.points3d)).poses[name]
-    assert not pose.found[0]
-    assert not pose.stats.converged[0]
-    assert pose.stats.residual[0] == math.inf
 
 
 @each_solver
@@ -101,27 +91,6 @@ def test_softposit_starts_near_the_truth_as_far_as_it_says() -> None:
         SoftPOSIT(start="near_truth")(Batch.from_arrays(problem.points2d, problem.points3d))
 
 
-def test_softposit_starts_at_the_mean_of_the_papers_cameras() -> None:
-    problem = plant(1, 5)
-    pose = SoftPOSIT(start="mean", max_steps=0)(problem.batch()).poses["softposit"]
-    from scipy.spatial.transform import Rotation
-
-    expected = Rotation.from_euler("xyz", [22.5] * 3, degrees=True).as_matrix()  # as the views are drawn
-    np.testing.assert_allclose(pose.rotation[0].numpy(), expected, atol=1e-6)
-    np.testing.assert_allclose(pose.translation[0].numpy(), [0, 0, 4.5], atol=1e-6)
-
-
-def test_softposit_starts_at_random_on_the_ray_of_the_images_centre() -> None:
-    problem = plant(1, 9, seed=3)
-    poses = [SoftPOSIT(start="random", max_steps=0, seed=s)(problem.batch()).poses["softposit"] for s in (0, 0, 1)]
-    for pose in poses:
-        centre = pose.rotation @ problem.points3d.mean(1).unsqueeze(-1) + pose.translation.unsqueeze(-1)
-        seen = centre[:, :2, 0] / centre[:, 2:, 0]
-        torch.testing.assert_close(seen, problem.points2d.mean(1))
-    assert torch.equal(poses[0].rotation, poses[1].rotation)
-    assert not torch.equal(poses[0].rotation, poses[2].rotation)
-
-
 @pytest.mark.parametrize(
     ("solver", "options", "message"),
     [
@@ -158,27 +127,6 @@ def test_blind_ransac_reaches_its_predicted_success_rate() -> None:
     assert triple == pytest.approx(1 / (6 * 5 * 4))
     predicted = 1 - (1 - triple) ** hypotheses
     assert float(solved) == pytest.approx(predicted, abs=3 * math.sqrt(predicted * (1 - predicted) / problems))
-
-
-def test_blind_ransac_stops_when_it_is_sure_and_converges() -> None:
-    batch = plant(4, 5, seed=6).batch()
-    pose = RandomRansac(threshold=1e-4, confidence=0.99, time_limit=None, max_hypotheses=20_000)(batch).poses[
-        "random_ransac"
-    ]
-    assert pose.stats.converged.all()
-    assert (pose.stats.iterations < 20_000).all()
-    assert (rotation_error(pose.rotation, batch.rotation) < 0.1).all()
-
-
-def test_agreement_counts_as_a_loop_would() -> None:
-    problem = plant(2, 15, seed=7, outliers2d=4, outliers3d=6)
-    counts = agreement(problem.points2d[0], problem.points3d[0], problem.rotation, problem.translation, threshold=0.02)
-    for i in range(2):
-        camera = problem.points3d[0] @ problem.rotation[i].T + problem.translation[i]
-        close = torch.cdist(problem.points2d[0], camera[:, :2] / camera[:, 2:]) < 0.02
-        assert int(counts.partnered2d[i]) == int(close.any(1).sum())
-        assert int(counts.partnered3d[i]) == int(close.any(0).sum())
-    assert int(counts.matches[0]) >= 15
 
 
 def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:

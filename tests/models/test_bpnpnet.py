@@ -9,7 +9,6 @@ from torch import Tensor
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
 from bpnp.models import Refinement
-from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.nets import PointFeatures
 from bpnp.search.settings import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_loss
@@ -69,15 +68,6 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
         Refinement(hypotheses=-1)
 
 
-def test_without_poses_none_is_solved() -> None:
-    batch = different_sizes(8, dtype=torch.float32)
-    net = small_net()
-    del net.ransac, net.pnp, net.refinement
-    prediction = net.match(batch)
-    assert prediction.poses == {}
-    assert prediction.assignment is not None
-
-
 def test_the_cost_is_the_distance_between_unit_features() -> None:
     net = small_net(scale=2.0).eval().double()
     batch = different_sizes(9)
@@ -85,19 +75,6 @@ def test_the_cost_is_the_distance_between_unit_features() -> None:
     aligned = net.features3d.align(batch.points3d, batch.mask3d)
     z3d = PointFeatures.forward(net.features3d, aligned, batch.mask3d)
     torch.testing.assert_close(net.cost(batch), torch.cdist(z2d, z3d), atol=1e-7, rtol=0)
-
-
-def test_pairwise_distance_and_its_gradient_near_zero() -> None:
-    a = torch.nn.functional.normalize(torch.randn(2, 6, 8, dtype=torch.float64), dim=-1)
-    b = torch.nn.functional.normalize(torch.randn(2, 5, 8, dtype=torch.float64), dim=-1)
-    torch.testing.assert_close(pairwise_distance(a, b), torch.cdist(a, b), atol=1e-12, rtol=0)
-    assert torch.autograd.gradcheck(pairwise_distance, (a.requires_grad_(), b.requires_grad_()))
-    same = a.detach().float().requires_grad_()
-    distance = pairwise_distance(same, same.detach())
-    assert distance.diagonal(dim1=1, dim2=2).max() < 1e-3
-    distance.sum().backward()
-    assert same.grad is not None
-    assert same.grad.isfinite().all()
 
 
 @pytest.mark.parametrize("options", [{}, {"batch_norm": True}, {"centre": True, "normalise": True}])
@@ -117,37 +94,6 @@ def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any
                     together.poses[name].rotation[i], pose.rotation[0], atol=tolerance, rtol=0, equal_nan=True
                 )
                 assert together.poses[name].stats.converged[i] == pose.stats.converged[0]
-
-
-def test_points_in_another_order_are_assigned_in_that_order() -> None:
-    net = small_net().double().eval()
-    planted = plant(2, 15)
-    batch = planted.batch()
-    rows, columns = torch.randperm(15), torch.randperm(15)
-    shuffled = Batch.from_arrays(planted.points2d[:, rows], planted.points3d[:, columns])
-    with torch.no_grad():
-        expected = net.match(batch).assignment[:, rows][:, :, columns]
-        assert (net.match(shuffled).assignment - expected).abs().max() < 1e-12
-
-
-def test_a_normalised_scene_has_no_unit_and_no_origin() -> None:
-    net = small_net(normalise=True).double().eval()
-    planted = plant(2, 15)
-    moved = Batch.from_arrays(planted.points2d, 40 * planted.points3d - 300)
-    with torch.no_grad():
-        expected = net.match(planted.batch()).assignment
-        assert (net.match(moved).assignment - expected).abs().max() < 1e-11
-
-
-def test_points_in_float64_enter_a_float32_network() -> None:
-    planted = plant(1, 12)
-    batch = Batch.from_arrays(planted.points2d[0].numpy(), planted.points3d[0].numpy())
-    assert batch.points2d.dtype == torch.float64
-    net = small_net().eval()
-    with torch.no_grad():
-        found, expected = net(batch), net(batch.to(torch.float32))
-    torch.testing.assert_close(found.assignment, expected.assignment)
-    assert found.poses["pnp"].rotation.dtype == torch.float32
 
 
 def test_learns_one_pair_by_heart(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:

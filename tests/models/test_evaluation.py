@@ -5,11 +5,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from planted import Planted, padded, plant, posed
-from small_data import small_net
+from planted import Planted, plant, posed
 from torch import Tensor, nn
 
-from bpnp import Batch, BPnPNet, Pose, Prediction, SolveStats
+from bpnp import Batch, Pose, Prediction, SolveStats
 from bpnp.geometry import is_finite, transform
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP, sinkhorn
 from bpnp.metrics import rotation_error
@@ -24,7 +23,6 @@ from bpnp.models.evaluation import (
     log_support,
     match_again,
     pnp_pose,
-    refinement_enabled,
     round_widths,
 )
 
@@ -76,27 +74,6 @@ def test_the_cost_is_a_gaussian_of_the_angle_with_a_floor() -> None:
             assert float(found[0, i, j]) == pytest.approx(float(expected), rel=1e-9)
 
 
-def test_widths_fall_to_the_last() -> None:
-    assert round_widths(3, RansacPnP(threshold=0.01)) == pytest.approx([0.05, 0.05 / 5**0.5, 0.01])
-    assert round_widths(0, nn.Identity()) == []
-    with pytest.raises(ValueError, match="expected a `ransac` with a `threshold`, got Identity; try `rounds` 0"):
-        BPnPNet(ransac=nn.Identity(), rounds=1)
-    with pytest.raises(ValueError, match="expected a number of `rounds`, got -1"):
-        BPnPNet(rounds=-1)
-
-
-def test_a_pair_depends_neither_on_its_batch_nor_on_padding_and_training_has_no_rounds() -> None:
-    torch.manual_seed(0)
-    net = small_net(rounds=3, threshold=0.05, refine=False).double().eval()
-    scenes = [plant(1, n, outliers2d=n // 3, seed=n) for n in (12, 20, 15)]
-    joint = net(padded(scenes)).rematched
-    for i, scene in enumerate(scenes):
-        alone = net(padded([scene])).rematched[0]
-        torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-4, atol=1e-9)
-        assert (net.match(padded([scene])).assignment[0] - alone).abs().max() > 1e-4
-    assert net.train()(padded(scenes)).rematched is None
-
-
 def support(
     plan: Tensor, planted: Planted, rotation: Tensor, translation: Tensor, batch: Batch | None = None
 ) -> Tensor:
@@ -140,15 +117,6 @@ def test_speaks_for_the_true_pose_and_against_a_wrong_one_whatever_the_padding()
     torch.testing.assert_close(support(pad(plan, (0, 5, 0, 3)), planted, *planted.pose, wide), right)
 
 
-def test_there_is_none_without_a_pose() -> None:
-    planted = plant(2, 8)
-    rotation = planted.rotation.clone()
-    rotation[1] = torch.nan
-    found = support(planted.permutation(), planted, rotation, planted.translation)
-    assert found[0] > 0
-    assert found[1] == -math.inf
-
-
 def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
     """Annealing is made to end at a wrong pose wherever it starts from proposals; the sure sample keeps its pose."""
     planted = plant(2, 40, noise=1e-4)
@@ -174,18 +142,3 @@ def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch
     torch.testing.assert_close(refined.translation, planted.translation)
     assert refined.stats.iterations.tolist() == [1, 2]
     assert refined.stats.converged.all()
-
-
-def test_refinement_is_off_within_a_block_and_as_it_was_after_an_error() -> None:
-    outer = nn.ModuleList([small_net(), small_net(refine=False)])
-
-    def fail() -> None:
-        with refinement_enabled(outer, False):
-            assert [net.estimates for net in outer] == [("ransac", "pnp")] * 2
-            raise RuntimeError("inside")
-
-    with pytest.raises(RuntimeError, match="inside"):
-        fail()
-    assert [net.refinement.enabled for net in outer] == [True, False]
-    with refinement_enabled(outer, True):
-        assert [net.refinement.enabled for net in outer] == [True, False]

@@ -1,9 +1,7 @@
 """The packaged weights: found by name, offline, and good on shapes that they were not trained on."""
 
 import importlib
-import tomllib
 from dataclasses import replace
-from fnmatch import fnmatch
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ from small_data import small_net
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error
-from bpnp.models.weights import LEARNED, described, pretrained_names, pretrained_path
+from bpnp.models.weights import LEARNED, described, pretrained_path
 
 ROOT = Path(__file__).parents[2]
 
@@ -32,17 +30,6 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
     )
     data.setup("test")
     return next(iter(data.test_dataloader()))
-
-
-def test_every_packaged_file_is_in_the_wheel() -> None:
-    patterns = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["package-data"]["bpnp"]
-    files = sorted((ROOT / "bpnp" / "weights").iterdir())
-    assert f"{LEARNED}.ckpt" in [file.name for file in files]
-    for file in files:
-        assert any(fnmatch(f"weights/{file.name}", pattern) for pattern in patterns), file
-        assert file.stat().st_size < 8e6
-    assert LEARNED in pretrained_names()
-    assert pretrained_path(LEARNED).is_file()
 
 
 def test_an_unknown_name_is_refused_with_those_there_are() -> None:
@@ -65,15 +52,6 @@ def test_the_weights_find_unseen_shapes_from_every_side(unseen: Batch) -> None:
     assert found["ransac"] < 3
     assert found["pnp"] < 1
     assert found["refined"] < 1
-
-
-def test_the_weights_for_the_papers_rotations_find_unseen_shapes(tmp_path: Path) -> None:
-    data = MeshDataModule(num_points=256, pool_size=512, test_shapes=16, batch_size=16, cache_dir=str(tmp_path))
-    data.setup("test")
-    found = medians("procedural-euler", next(iter(data.test_dataloader())))
-    assert found["ransac"] < 2
-    assert found["pnp"] < 0.5
-    assert found["refined"] < 0.5
 
 
 def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -> None:

@@ -28,14 +28,6 @@ class Flat(nn.Module):
         return nn.functional.normalize(self.map(points), dim=-1)
 
 
-class Forgetful(nn.Module):
-    """Keeps nothing of its argument."""
-
-    def __init__(self, size: int) -> None:
-        super().__init__()
-        self.map = nn.Linear(size, size)
-
-
 def pair() -> Batch:
     return padded([plant(1, 10, outliers2d=2, seed=10, dtype=torch.float32)])
 
@@ -89,14 +81,6 @@ def test_a_checkpoint_names_no_class_that_is_not_known(name: str, tmp_path: Path
         BPnPNet.from_checkpoint(tmp_path / "evil.ckpt")
 
 
-def test_settings_that_a_class_does_not_have_are_named(tmp_path: Path) -> None:
-    solver = described(small_net())
-    solver["settings"]["transport"]["settings"]["nonsense"] = 3
-    torch.save({"solver": solver, "state_dict": {}}, tmp_path / "net.ckpt")
-    with pytest.raises(ValueError, match=r"net.ckpt: expected settings of Sinkhorn, got .*nonsense"):
-        TrainedNet.from_checkpoint(tmp_path / "net.ckpt")
-
-
 def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
     given = [
         ImageFeatures(channels=8, depth=1, batch_norm=True, centre=True, scale=2.0),
@@ -114,13 +98,6 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
         assert type(again) is type(module)
     assert described(given[2])["settings"]["mu"] == 0.3
     assert described(given[-1])["settings"]["ransac"]["settings"]["threshold"] == 0.2
-
-
-def test_a_module_that_forgets_its_arguments_can_be_saved_and_says_so_when_built() -> None:
-    description = described(Forgetful(3))
-    assert description["settings"] is None
-    with pytest.raises(ValueError, match="expected the settings of test_weights.Forgetful, got none; try a class that"):
-        built(description, [Forgetful])
 
 
 def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:

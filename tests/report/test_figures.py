@@ -1,4 +1,3 @@
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -43,18 +42,6 @@ def test_the_true_pose_reprojects_each_point_onto_its_match() -> None:
         plot_problem(planted, estimate="best")
     assert figure.axes[1].get_title() == "reprojected by ransac"
     assert plot_problem(planted, estimate="pnp").axes[1].get_title() == "no pose"
-
-
-def test_wrong_matches_are_dotted_and_unknown_ones_are_not() -> None:
-    planted = drawn_problem(3, "problem", 10)
-    (wrong,) = plot_problem(planted, lines="assigned3d").axes[1].collections
-    assert len(wrong.get_segments()) == 10
-    assert wrong.get_linestyles()[0][1] is not None
-    assigned = np.where(np.arange(10) < 4, np.arange(10), -1)
-    solved = replace(planted, match3d=np.full(10, -1), assigned3d=assigned)
-    (unknown,) = plot_problem(solved).axes[1].collections
-    assert len(unknown.get_segments()) == 4
-    assert unknown.get_linestyles()[0][1] is None
 
 
 @pytest.mark.parametrize("suffix", [".png", ".svg", ".pdf"])

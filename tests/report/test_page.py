@@ -1,6 +1,5 @@
 import json
 import re
-from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -9,9 +8,9 @@ import pytest
 from plotly.offline import get_plotlyjs
 from report_data import HOSTILE, inflated, rows, write_run
 
-from bpnp.report import read_results, write_page, write_results
-from bpnp.report.page.charts import chart_text, error_chart, page_charts, recall_chart
-from bpnp.report.page.write import MOST_BYTES, described, page_html, plotly_script
+from bpnp.report import write_page, write_results
+from bpnp.report.page.charts import chart_text, error_chart, recall_chart
+from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 
@@ -59,29 +58,6 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
     (training,) = (chart for chart in map(json.loads, data["charts"]) if "Training" in chart["layout"]["title"]["text"])
     assert [shape["x0"] for shape in training["layout"]["shapes"]] == [50, 50]  # where the pose loss joins
     assert [note["text"] for note in training["layout"]["annotations"]] == ["a: pose loss", "b: pose loss"]
-
-
-def test_the_headline_says_what_was_tested(tmp_path: Path) -> None:
-    planted = rows(20, 0)
-    data = {
-        "class_path": "bpnp.datamodules.MeshDataModule",
-        "init_args": {"root": "psb", "rotation": "so3", "seed": None},
-    }
-    write_results(tmp_path, planted, settings={"data": data, "checkpoint": "best.ckpt"})
-    text = described(read_results(tmp_path))
-    low, high = min(row.m for row in planted), max(row.m for row in planted)
-    assert f"20 problems with {low} to {high} 2D points" in text
-    assert "data MeshDataModule (root psb, rotation so3), checkpoint best.ckpt" in text
-
-
-def test_charts_without_data_are_left_out(tmp_path: Path) -> None:
-    """Pairs of one size, without times and without a training, have nothing to draw in those charts."""
-    planted = [replace(row, m=10, n=12, matches=9, seconds=0.0) for row in rows(30, 0)]
-    runs = {"run": write_results(tmp_path, planted)}
-    assert list(page_charts(runs, {})) == ["Recall"]
-    shown = Elements(page_html([tmp_path]))
-    assert {a["id"] for tag, a in shown.tags if tag == "section"} == {
-        "quartiles", "versus-section", "recall", "failures", "problems"}  # fmt: skip
 
 
 def test_charts_are_the_shares_and_medians_of_the_rows(tmp_path: Path) -> None:

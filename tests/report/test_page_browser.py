@@ -3,7 +3,6 @@ unless BPNP_REQUIRE_BROWSER is set."""
 
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -168,22 +167,6 @@ def test_the_worst_pairs_come_first_and_filters_narrow_them(
     assert page("return document.getElementById('least').value") == "12.5"
 
 
-def test_run_against_run_counts_the_better_pairs_and_opens_one(
-    browser: Any, page: Callable[..., Any], written: Any
-) -> None:
-    page("document.querySelector('#versus').scrollIntoView()")
-    browser.execute_async_script("setTimeout(arguments[0], 500)")
-    choose(page, "b", "2")
-    a, b = (column(written[1][name], "ransac", "rotation_error_deg") for name in ("first", "second"))
-    (text,) = texts(page, "#versus-text")
-    shares = re.findall(r"([\d.]+) %", text)
-    assert floats(shares) == pytest.approx([100 * (a < b).mean(), 100 * (a > b).mean()], abs=0.051)
-    points = page("const t = document.getElementById('versus').data[0]; return [t.customdata, t.x, t.y]")
-    np.testing.assert_allclose(np.array(points).T[np.argsort(points[0])], np.c_[np.arange(COUNT), a, b], rtol=6e-5)
-    page("document.getElementById('versus').emit('plotly_click', {points: [{customdata: 5}]})")
-    assert texts(page, "#problem-title") == ["scene/0005"]
-
-
 def test_a_pair_opens_with_its_points_and_names_stay_text(page: Callable[..., Any], written: Any) -> None:
     choose(page, "name", "SCRIPT")
     press(page, "#problem-table button.link")
@@ -271,18 +254,6 @@ def test_a_pair_opens_from_the_keyboard_and_arrows_go_through_the_list(browser: 
     assert not page("return document.getElementById('problem').open || location.hash.includes('open=')")
     opened(browser, page("return location.href.split('#')[0]") + "#open=scene%2F0042")
     assert texts(page, "#problem-title") == ["scene/0042"]
-
-
-def test_the_page_of_a_training_alone_opens_without_an_error(browser: Any, tmp_path: Path) -> None:
-    write_run(tmp_path, 9, 0)
-    shutil.rmtree(tmp_path / "test")
-    page = write_page([tmp_path], tmp_path / "r.html")
-    opened(browser, page.as_uri())
-    browser.execute_script("dispatchEvent(new Event('beforeprint'))")
-    browser.execute_async_script("setTimeout(arguments[0], 500)")
-    assert len(browser.find_elements("css selector", "#training .js-plotly-plot")) == 2
-    assert not browser.find_element("id", "problems").is_displayed()
-    assert severe(browser) == []
 
 
 OVERLAPS = """return [...document.querySelectorAll('.js-plotly-plot')].flatMap((chart) => {

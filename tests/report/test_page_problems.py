@@ -63,14 +63,6 @@ def test_assignments_are_those_of_the_solver_and_large_pairs_are_thinned() -> No
         assert assigned == (line["ids2d"].index(partner) if partner in line["ids2d"] else -1)
 
 
-def test_runs_on_other_points_have_lines_of_their_own() -> None:
-    one, other = drawn_problem(0, "a", 20), replace(drawn_problem(3, "a", 20), index=0)
-    runs = {"x": results([one]), "y": results([other])}
-    places, lines = read(page_points(runs, {"x": [one], "y": [other]}, room=10**6))
-    assert sorted(places["x"] + places["y"]) == [0, 1]
-    assert [list(line["poses"]) for line in lines] == [["x"], ["y"]]
-
-
 @pytest.mark.parametrize("room", [0, 8_000, 30_000])
 def test_the_page_keeps_to_its_room_and_takes_the_worst_first(room: int) -> None:
     error = np.random.default_rng(0).random(200)

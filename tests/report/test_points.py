@@ -7,7 +7,7 @@ import torch
 from report_data import planted
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.points import FEW, ProblemPoints, points_from, read_points, select_points, thin, write_points
+from bpnp.report.points import FEW, points_from, read_points, thin, write_points
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 
@@ -41,37 +41,6 @@ def test_a_view_keeps_true_matches_and_drops_padding(most: int) -> None:
         assert problem.error == pytest.approx(10.0, abs=1e-6)
 
 
-def test_a_pair_without_a_pose_is_the_worst() -> None:
-    batch = planted((8, 8, 8), clutter=0)
-    prediction = answered(batch)
-    prediction.poses["pnp"].rotation[1] = torch.nan
-    problems = points_from(prediction, batch)
-    assert [problem.error for problem in problems] == pytest.approx([10.0, 180.0, 10.0])
-    assert [problem.index for problem in select_points(problems, worst=1, others=0)] == [1]
-
-
-def plain(index: int, error: float) -> ProblemPoints:
-    none = np.zeros((0,), np.int32)
-    return ProblemPoints(index, str(index), np.zeros((1, 2)), np.zeros((1, 3)), none, none, error=error)
-
-
-def test_choosing_in_parts_is_choosing_from_the_whole() -> None:
-    rng = np.random.default_rng(0)
-    problems = [plain(i, error) for i, error in enumerate(rng.gamma(1, 10, 500).round(1).tolist())]
-    whole = select_points(problems, worst=5, others=9)
-    worst = sorted(problems, key=lambda problem: (-problem.error, problem.index))[:5]
-    assert {problem.index for problem in worst} <= {problem.index for problem in whole}
-    for _ in range(3):
-        kept: tuple[ProblemPoints, ...] = ()
-        for part in np.array_split(rng.permutation(500), 7):
-            kept = select_points([*kept, *(problems[i] for i in part)], worst=5, others=9)
-        assert [problem.index for problem in kept] == [problem.index for problem in whole]
-    others = sorted({problem.index for problem in whole} - {problem.index for problem in worst})
-    assert np.diff([0, *others, 500]).max() < 3 * 500 / 9
-    with pytest.raises(ValueError, match="expected `worst` and `others` >= 0, got -1"):
-        select_points(problems, worst=-1)
-
-
 def test_views_are_read_as_they_were_written(tmp_path: Path) -> None:
     batch = planted((12, 9), clutter=2)
     problems = points_from(answered(batch), batch)
@@ -92,14 +61,6 @@ def test_views_are_read_as_they_were_written(tmp_path: Path) -> None:
         read_points(tmp_path)
     with pytest.raises(ValueError, match=r"expected problems with the estimates \['pnp'\], got others"):
         write_points(tmp_path, [problems[0], replace(problems[1], estimates={})])
-
-
-def test_without_poses_and_matches_the_points_are_kept(tmp_path: Path) -> None:
-    batch = Batch.from_arrays(np.ones((2, 2)), np.ones((3, 3)), ids=["x"], index=[7])
-    write_points(tmp_path, points_from(Prediction(), batch))
-    (problem,) = read_points(tmp_path)
-    assert problem.assigned3d.tolist() == problem.match3d.tolist() == [-1] * 3
-    assert (problem.estimates, problem.pose) == ({}, None)
 
 
 def test_a_thinned_pair_knows_the_numbers_of_its_points(tmp_path: Path) -> None:

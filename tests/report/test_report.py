@@ -2,7 +2,6 @@ import csv
 import dataclasses
 import json
 import math
-import random
 from collections.abc import Callable
 from pathlib import Path
 
@@ -120,21 +119,6 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
     assert read_results(tmp_path).estimates["pnp"]["translation_q3"] == math.inf
 
 
-def test_the_files_do_not_depend_on_the_order_of_rows_and_count_a_repeated_problem_once(tmp_path: Path) -> None:
-    rows = [row(i, estimate) for i in range(20) for estimate in ("refined", "own", "ransac", "pnp")]
-    write_results(tmp_path / "a", rows)
-    shuffled = rows + rows[:12]
-    random.Random(0).shuffle(shuffled)
-    write_results(tmp_path / "b", shuffled)
-    assert (tmp_path / "a" / "problems.csv").read_bytes() == (tmp_path / "b" / "problems.csv").read_bytes()
-    summaries = [json.loads((tmp_path / name / "summary.json").read_text()) for name in "ab"]
-    assert [summary.pop("written") != "" for summary in summaries] == [True, True]
-    assert summaries[0] == summaries[1]
-    assert list(summaries[0]["estimates"]) == ["ransac", "pnp", "refined", "own"]
-    assert [(r.index, r.estimate) for r in read_results(tmp_path / "a").rows[:5]] == [
-        (0, "ransac"), (0, "pnp"), (0, "refined"), (0, "own"), (1, "ransac")]  # fmt: skip
-
-
 def test_a_summary_is_numpys_quantiles_and_counts_of_its_rows() -> None:
     rows = [row(i, seconds=0.1 * i, converged=i % 2 == 0) for i in range(11)]
     summary = summarise(rows, thresholds=RecallThresholds((5,), (), (), (), ((4, 6),)))["pnp"]
@@ -145,20 +129,6 @@ def test_a_summary_is_numpys_quantiles_and_counts_of_its_rows() -> None:
     assert summary["recall_joint_4deg_6"] == ((degrees <= 4) & (lengths <= 6)).mean()
     assert summary["seconds_mean"] == pytest.approx(0.5)
     assert summary["converged"] == 6 / 11
-
-
-def test_a_failed_write_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_results(tmp_path, [row(0)])
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    monkeypatch.setattr("bpnp.files.os.replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        write_results(tmp_path, [row(0), row(1)])
-    assert [path.name for path in tmp_path.iterdir()] == ["problems.csv"]
-    with pytest.raises(ValueError, match=r"expected a results folder with summary\.json, got no .*summary\.json"):
-        read_results(tmp_path)
 
 
 @pytest.mark.parametrize(

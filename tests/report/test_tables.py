@@ -1,6 +1,5 @@
 import dataclasses
 import io
-import json
 import math
 from pathlib import Path
 
@@ -9,10 +8,9 @@ from report_data import row
 from rich.console import Console
 from rich.table import Table
 
-from bpnp.report import Results, learning_table, read_results, recall_table, report, results_table, write_results
+from bpnp.report import Results, recall_table, results_table, write_results
 from bpnp.report.page.write import quartile_rows
-from bpnp.report.tables import RECALL_COLUMNS, RESULT_COLUMNS, run_rows
-from bpnp.report.terminal import SplitTable, number
+from bpnp.report.terminal import SplitTable
 
 
 def rendered(table: Table | SplitTable, width: int = 80) -> list[str]:
@@ -26,16 +24,6 @@ def bold(table: SplitTable) -> list[list[str]]:
     """The bold numbers of each row."""
     rows = [cells for group in table.groups for _, cells in group]
     return [[cell.plain for cell in cells if cell.style == "bold"] for cells in rows]
-
-
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, "-"), (0.0, "0"), (math.inf, "inf"), (math.nan, "nan"), (180.0, "180"), (12.34, "12.3"), (1.0, "1.00"),
-     (9.996, "10.0"), (0.5, "0.500"), (0.01234, "0.0123"), (0.00126, "0.0013"), (1.26e-4, "1.3e-4"), (1e-16, "1e-16"),
-     (999.7, "1000"), (12345.6, "12346"), (1.26e5, "1.3e5"), (-0.25, "-0.250")],
-)  # fmt: skip
-def test_numbers_are_compact(value: float | None, text: str) -> None:
-    assert number(value) == text
 
 
 @pytest.mark.parametrize("width", [80, 100, 160])
@@ -76,52 +64,6 @@ def test_the_best_of_each_column_is_bold(tmp_path: Path) -> None:
     assert bold(results_table({"run": alone})) == [[]]
 
 
-def test_the_learning_table_sets_untrained_beside_trained(tmp_path: Path) -> None:
-    before = write_results(tmp_path, [row(0, rotation_error_deg=40.0)], correspondence_loss=0.5)
-    after = write_results(tmp_path, [row(0, rotation_error_deg=2.5)], correspondence_loss=-0.75)
-    words = [line.split() for line in rendered(learning_table(before, after))]
-    assert ["correspondence", "loss", "0.500", "-0.750"] in words
-    assert ["median", "rotation", "error,", "deg:", "pnp", "40.0", "2.50"] in words
-    other = write_results(tmp_path, [row(0), row(1)])
-    with pytest.raises(ValueError, match="expected the same problems untrained and trained, got 1 and 2"):
-        learning_table(before, other)
-
-
-def test_a_report_names_runs_by_what_their_paths_do_not_share(tmp_path: Path) -> None:
-    for name in ("first", "second"):
-        write_results(tmp_path / name / "test", [row(i) for i in range(4)], correspondence_loss=0.5)
-    console = Console(width=140, file=io.StringIO(), color_system=None)
-    with console.capture() as capture:
-        report(
-            [tmp_path / name / "test" for name in ("first", "second")], console, untrained=tmp_path / "first" / "test"
-        )
-    text = capture.get()
-    assert text.count("first: pnp") == text.count("second: pnp") == 2
-    assert str(tmp_path) not in text
-    assert "untrained" in text
-    assert "paper" not in text
-    with console.capture() as capture:
-        report([tmp_path / "first" / "test"], console, paper="modelnet40")
-    text = capture.get()
-    assert "first" not in text
-    assert "paper, ModelNet40: Lc Lp R" in text
-    with pytest.raises(ValueError, match="expected at least one results folder"):
-        report([], console)
-
-
-def test_a_report_without_a_wide_terminal_is_wide_enough(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "40")
-    results = write_results(tmp_path, [row(i) for i in range(4)])
-    monkeypatch.setenv("TERM", "dumb")
-    report([tmp_path])
-    text = capsys.readouterr().out
-    assert "…" not in text
-    assert max(map(len, text.splitlines())) <= 80
-    assert number(results.estimates["pnp"]["seconds_mean"]) in text
-
-
 def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Path) -> None:
     def run(name: str, error: float, **settings: object) -> Results:
         return write_results(tmp_path / name, [row(0, rotation_error_deg=error)], settings=settings)
@@ -139,14 +81,3 @@ def test_the_best_of_a_column_is_that_of_runs_on_the_same_problems(tmp_path: Pat
     best = {value for row in quartile_rows(other, None) for _, value, best in row.cells if best}
     assert 1.0 in best
     assert 0.1 not in best
-
-
-def test_tables_show_the_figures_of_the_summary_and_compute_none_again(tmp_path: Path) -> None:
-    write_results(tmp_path, [row(i) for i in range(4)])
-    summary = tmp_path / "summary.json"
-    content = json.loads(summary.read_text())
-    content["estimates"]["pnp"] = dict.fromkeys(content["estimates"]["pnp"], 42.0)
-    summary.write_text(json.dumps(content))
-    (shown,) = run_rows({"run": read_results(tmp_path)})
-    columns = {column.key for column in (*RESULT_COLUMNS, *RECALL_COLUMNS)}
-    assert {shown.values[key] for key in columns} == {42.0}

@@ -2,14 +2,11 @@
 
 import cv2
 import numpy as np
-import pytest
 import torch
 from planted import plant
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from bpnp.geometry import rotation_angle
-from bpnp.robust import consensus as scoring
 from bpnp.robust.consensus import Matches, in_scene, normalised, refine_locally, residuals, truncated_scores
 
 
@@ -55,15 +52,6 @@ def test_a_point_behind_the_camera_is_an_outlier_and_no_pose_has_no_score() -> N
     assert truncated_scores(torch.full_like(poses, torch.nan), pairs, 1e-4).isnan().all()
 
 
-def test_thresholds_of_samples_and_the_size_of_the_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
-    pairs, poses = problem()
-    together = truncated_scores(poses, pairs, torch.tensor([1e-4, 4e-4])[:, None, None])
-    expected = torch.stack([truncated_scores(poses, pairs, t)[i] for i, t in enumerate((1e-4, 4e-4))])
-    torch.testing.assert_close(together, expected)
-    monkeypatch.setattr(scoring, "CHUNK", 90)
-    torch.testing.assert_close(truncated_scores(poses, pairs, 1e-4)[0], expected[0])
-
-
 def test_a_pose_on_normalised_pairs_is_the_same_camera_in_the_scene() -> None:
     pairs, poses = problem()
     far = pairs._replace(points3d=30 * pairs.points3d + 1e5)
@@ -92,11 +80,3 @@ def test_the_refinement_ends_at_the_optimum_of_the_inliers() -> None:
 
         optimum = least_squares(error, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
         np.testing.assert_allclose(optimum, 0, atol=1e-6)
-
-
-def test_poses_are_refined_independently() -> None:
-    pairs, poses = problem()
-    together = refine_locally(poses, pairs, 0.01**2, 4)
-    alone = refine_locally(poses[1:, 2:3], Matches(*(v[1:] for v in pairs)), 0.01**2, 4)
-    # Near the optimum, rounding of the score decides which of two iterates is returned.
-    assert rotation_angle(alone[0, 0, :, :3], together[1, 2, :, :3]) < 1e-8

@@ -1,7 +1,6 @@
 """Poses that rest on one wrong match, beside the planted one."""
 
 import numpy as np
-from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
@@ -10,8 +9,6 @@ from bpnp.search.enumeration.poses import Enumeration
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 from bpnp.solving.matches import fit_pose
-
-Array = NDArray[np.float64]
 
 
 def test_a_wrong_match_that_holds_the_pose_is_exchanged() -> None:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.evidence.false_alarms import alarms_of, log10_cells, log10_false_alarms
+from bpnp.search.evidence.false_alarms import log10_cells, log10_false_alarms
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -83,26 +83,6 @@ def test_the_bound_of_markov_holds_for_unrelated_points(count: int) -> None:
         assert np.mean(np.array(products) > bound) <= 10**-bound
 
 
-def test_poses_together_have_the_evidence_of_each_alone() -> None:
-    rng = np.random.default_rng(2)
-    rays, points, rotation = planted(rng, 80)
-    sets = PointSets(rays, points)
-    turns, shifts = np.stack([rotation, np.eye(3), rotation]), np.stack([SHIFT, SHIFT, -SHIFT])
-    alone = [log10_false_alarms(sets, r, t) for r, t in zip(turns, shifts, strict=True)]
-    assert alarms_of(sets, turns, shifts).own.tolist() == alone
-    assert alone[0] < -10 < 0 < alone[1]
-    assert alarms_of(sets, turns[:0], shifts[:0]).own.shape == (0,)
-
-
-def test_it_does_not_depend_on_the_frame_or_unit_of_the_scene() -> None:
-    rng = np.random.default_rng(1)
-    rays, points, rotation = planted(rng, 30)
-    turn, shift, scale = Rotation.random(random_state=rng).as_matrix(), np.array([5.0, -3, 2]), 40.0
-    sets, other = PointSets(rays, scale * (points @ turn.T + shift)), rotation @ turn.T
-    value = log10_false_alarms(sets, other, scale * (SHIFT - other @ shift))
-    assert value == pytest.approx(evidence(rays, points, rotation, None), abs=1e-6)
-
-
 def test_keypoints_in_one_place_are_one_observation() -> None:
     rays, points, rotation = planted(np.random.default_rng(2), 10)
     assert evidence(np.tile(rays, (5, 1)), points, rotation) > evidence(rays, points, rotation) - 1
@@ -137,14 +117,3 @@ def test_a_prior_leaves_less_to_chance_where_the_pose_agrees_with_it() -> None:
 def test_residuals_below_the_floor_count_as_the_floor() -> None:
     rays, points, rotation = planted(np.random.default_rng(5), 6, 0.0)
     assert evidence(rays, points, rotation, 5e-3) > evidence(rays, points, rotation, 1e-4) + 3
-
-
-def test_the_poses_that_differ_at_a_scale_are_counted() -> None:
-    """Of random poses whose points are seen in this view, no more than one in a cell is a scale apart in each of six
-    numbers: at twice the scale there are 2^6 times fewer."""
-    sets = PointSets(scattered(np.random.default_rng(0), 300, 0.2), np.random.default_rng(1).normal(size=(300, 3)))
-    cells = log10_cells(sets.image)
-    np.testing.assert_allclose(np.diff(cells), -6 * np.diff(np.log10(sets.image.scales)))
-    at = np.interp(np.log10(0.01 * sets.image.spread), np.log10(sets.image.scales), cells)
-    view = sets.image.solid_angle / sets.image.spread**2
-    assert at == pytest.approx(math.log10(8 * math.pi**2 * view * math.log(30)) + 12, abs=0.01)

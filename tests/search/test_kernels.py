@@ -9,7 +9,6 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.loops.vectors import turn
 from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints
 from bpnp.search.kernels.sparse import REACH, Tiles, assign_sparse, build_tiles, descend_sparse, sparse_scratch
@@ -143,15 +142,6 @@ def test_the_gradient_is_that_of_finite_differences(entry: Any, spread: float) -
         slope = (values[0] - values[1]) / (2 * float(step[k]))
         assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-6 * np.abs(gradient).max() * spread)
     assert np.linalg.eigvalsh(hessian + np.tril(hessian, -1).T).min() > 0
-
-
-def test_a_turn_is_the_exponential_on_the_left(entry: Any) -> None:
-    rotation = random_rotations(1, torch.Generator().manual_seed(3))[0].double()
-    vector = torch.tensor([0.1, -0.3, 0.2], dtype=torch.float64)
-    expected, _ = retract(torch.cat([vector, torch.zeros(3)]), rotation, torch.zeros(3, dtype=torch.float64))
-    turned = rotation.numpy().copy()
-    entry(turn)(turned, vector.numpy())
-    np.testing.assert_allclose(turned, expected.numpy(), atol=1e-7)
 
 
 @pytest.mark.parametrize("part", ["rotation", "translation"])

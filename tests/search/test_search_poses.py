@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import roma
 import torch
 from planted import degrees_between, directions, plant
 from scipy.spatial.transform import Rotation
@@ -19,11 +18,10 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene
-from bpnp.search.search import search_poses, search_proposed
+from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
 from bpnp.search.starts import PosePrior, super_fibonacci
 from bpnp.search.verdict import no_pose
-from bpnp.types import Batch
 
 NO_POSE = no_pose("none yet")
 
@@ -55,40 +53,6 @@ def test_search_finds_planted_poses(problem):
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=1e-5, rtol=0)
 
 
-def test_the_budget_counts_turns_and_an_easy_problem_needs_few(problem):
-    settings = SearchSettings(Schedule(turns=2), starts=96, first_starts=24)
-    rng, seen = np.random.default_rng(0), []
-    noise = rng.normal(size=(80, 3)) * [0.3, 0.3, 0] + [0, 0, 1]
-    unrelated = PointSets(directions(noise), rng.normal(size=(80, 3)))
-    search_poses(unrelated, settings=settings, progress=lambda batches, _: seen.append(batches))
-    assert seen == [1, 2]
-    related = PointSets(problem.bearings[1].double().numpy(), problem.points3d[1].double().numpy())
-    easy = search_poses(related)
-    assert easy.verdict == "confident"
-    assert easy.batches <= 4  # 720 starts
-
-
-def test_neighbours_padding_and_batch_size_do_not_matter(problem):
-    padded = Batch.from_arrays(
-        [problem.points2d[0].numpy(), problem.points2d[1, :150].numpy()],
-        [problem.points3d[0].numpy(), problem.points3d[1, :150].numpy()],
-    )
-    together = Search()(padded).poses["search"]
-    rotation, translation, _ = search(problem.bearings[1:2, :150], problem.points3d[1:2, :150])
-    torch.testing.assert_close(together.rotation[1], rotation[0], rtol=0, atol=0)
-    torch.testing.assert_close(together.translation[1], translation[0], rtol=0, atol=0)
-
-
-def test_candidates_are_distinct_and_fall_in_score(problem):
-    candidates = search_poses(PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())).candidates
-    assert (np.diff(candidates.score) <= 0).all()
-    for i in range(len(candidates)):
-        for j in range(i):
-            turn = Rotation.from_matrix(candidates.rotation[i].T @ candidates.rotation[j])
-            apart = np.degrees(turn.magnitude()) > 2.9
-            assert apart or np.linalg.norm(candidates.translation[i] - candidates.translation[j]) > 0.01
-
-
 @pytest.mark.parametrize("case", ["three", "line2d", "line3d", "same2d", "same3d"])
 def test_what_fixes_no_pose_has_none(problem, case):
     f, p = problem.bearings[:1].clone(), problem.points3d[:1].clone()
@@ -112,14 +76,6 @@ def test_what_fixes_no_pose_has_none(problem, case):
         assert not stats.converged.any()
 
 
-def test_a_rough_pose_saves_batches(problem):
-    rotation, translation = problem.near(0.05, seed=1)
-    prior = PosePrior(rotation[0], translation[0], rotation_sigma_deg=4, translation_sigma=0.1)
-    r, t, stats = search(problem.bearings[:1], problem.points3d[:1], prior=prior, settings=DEFAULT.limited(1))
-    assert rotation_error(r, problem.rotation[:1]) < 0.5
-    assert stats.iterations.item() <= 1
-
-
 @pytest.mark.parametrize("off", [0.05, 1.0])
 def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, off):
     """One near the true pose and one 57 degrees off: the search goes everywhere unless the matches are unique."""
@@ -129,18 +85,6 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
     assert result.verdict == "confident"
     assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
     assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
-
-
-def test_a_search_of_proposals_alone_ends_where_they_leave_a_doubt():
-    """A pose among repeated points, whose matches are no evidence of each other: after its looks nothing is left."""
-    grid = np.stack(np.meshgrid(*3 * [np.arange(4.0)]), -1).reshape(-1, 3)
-    shift, ended = np.array([-1.5, -1.5, 9.0]), []
-    sets = PointSets(directions(grid + shift), grid)
-    few = DEFAULT.limited(20)
-    for least in (few.evidence.missed, -1000.0):  # the latter is never reached
-        rule = replace(few, evidence=replace(few.evidence, missed=least))
-        ended.append(search_proposed(sets, lambda: (np.eye(3)[None], shift[None]), settings=rule).batches)
-    assert max(ended) < 20
 
 
 def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
@@ -164,29 +108,6 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     assert alike.hits.sum() == 0  # fifty alike are no evidence
 
 
-def test_starts_around_a_guess_that_end_alike_are_no_evidence(problem):
-    """Many starts beside the true pose end at it, and from anywhere some do."""
-    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
-    rotation, translation = (values[0].numpy() for values in problem.near(0.02, seed=1))
-    one_turn = DEFAULT.limited(1)
-    around = search_poses(sets, around=PosePrior(rotation, translation, 1.0, 0.01), settings=one_turn)
-    assert degrees_between(around.best[0], problem.rotation[0].numpy()) < 0.5
-    assert (around.candidates.hits == 0).all()
-    assert search_poses(sets, settings=DEFAULT.limited(4)).candidates.hits.max() > 0
-
-
-def test_starts_cover_all_rotations():
-    """No rotation is farther from 1152 even ones than 25 degrees; a random set of that size leaves gaps of 30."""
-    starts = torch.as_tensor(super_fibonacci(1152))
-    torch.testing.assert_close(starts @ starts.mT, torch.eye(3, dtype=starts.dtype).expand_as(starts))
-    generator = torch.Generator().manual_seed(0)
-    targets = roma.unitquat_to_rotmat(
-        torch.nn.functional.normalize(torch.randn(500, 4, dtype=starts.dtype, generator=generator), dim=-1)
-    )
-    cosine = ((targets.flatten(1) @ starts.flatten(1).T).amax(1) - 1) / 2
-    assert torch.rad2deg(torch.acos(cosine)).max() < 25
-
-
 def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
     rotation, translation = problem.near(0.08, seed=2)
     rotation, translation = rotation.unsqueeze(1).clone(), translation.unsqueeze(1).clone()
@@ -199,23 +120,11 @@ def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
     assert pose.stats.converged[:2].all()
 
 
-def test_search_as_a_solver(problem):
-    prediction = Search(settings=DEFAULT.limited(8))(problem.batch())
-    assert prediction.assignment is None
-    found(prediction.poses["search"].rotation, prediction.poses["search"].translation, problem, 0.5)
-
-
 def test_wrong_budgets_are_refused(problem):
     with pytest.raises(ValueError, match="expected a positive `time_limit`"):
         Search(time_limit=0.0)
     with pytest.raises(ValueError, match="expected `clutter`"):
         search(problem.bearings, problem.points3d, clutter=1.0)
-
-
-def test_a_known_share_of_clutter_is_expected_and_the_only_one_tried():
-    known = DEFAULT.expecting(0.5)
-    assert (known.outliers, known.end_outliers) == (0.5, ())
-    assert DEFAULT.expecting(0.0).outliers == DEFAULT.least_outliers
 
 
 @pytest.mark.parametrize(
@@ -293,37 +202,3 @@ def test_of_points_that_have_no_label_in_common_no_pose_is_found():
     assert result.verdict == "failed"
     assert result.batches == 0
     assert not len(result.candidates)
-
-
-def test_a_doubtful_pose_near_a_prior_gets_all_sources_in_turn(problem, monkeypatch):
-    """docs/search.md: a raster search near the prior, a batch drawn from it, a batch from anywhere, and so on."""
-    sets = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
-    rotation, translation = (values[0].double().numpy() for values in problem.near(1.0, seed=1))
-    settings = replace(DEFAULT, schedule=replace(DEFAULT.schedule, near=0, looks=0))
-    pool = Pool(Scene(sets, 0, settings), replace(sets, prior=PosePrior(rotation, translation, 5.0, 0.1)), NO_POSE)
-    found = replace(Candidates.none(), log10_false_alarms=np.zeros(0))
-    asked = []
-    for name in ("search_near", "multistart_near", "multistart"):
-        monkeypatch.setattr(schedule, name, lambda *_, name=name: (asked.append(name), (found, 1.0))[1])
-    one = Candidates.unscored(np.eye(3, dtype=np.float32)[None], np.ones((1, 3), np.float32))
-    pool.candidates = replace(one, log10_false_alarms=np.array([-1.0]))
-    turns = schedule.turns(pool, None, None)
-    for _ in range(6):
-        next(turns)
-    assert asked == ["search_near", "multistart_near", "multistart"] * 2
-
-
-def test_a_look_that_betters_nothing_is_counted_at_once(problem):
-    """And one that the deadline cut short is not."""
-    sets = PointSets(problem.bearings[0].double().numpy(), problem.points3d[0].double().numpy())
-    for deadline, looks in ((Deadline(), 1), (Deadline.after(0.0), 0)):
-        pool = Pool(Scene(sets, 0, DEFAULT, deadline), sets, NO_POSE)
-        pose = problem.rotation[0].double().numpy()[None], problem.translation[0].double().numpy()[None]
-        entered, one = Candidates.unscored(*pool.scene.enter(*pose)), np.ones(1, np.float32)
-        pool.merge(replace(entered, scale=1e-3 * one, score=5 * one, matched=one))
-        assert pool.alarms < 0
-        unseen = pool.missed
-        pool.look_around(pool.leader)
-        pool.merge(Candidates.none())
-        assert pool.looks(pool.leaders()) == looks
-        assert (pool.missed < unseen) == bool(looks)

@@ -1,19 +1,12 @@
 """Normals, labels and scores in the large search: what they weigh, and planted poses that only they make findable."""
 
-from dataclasses import replace
-from typing import Any
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.annealing import anneal_on_points
-from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.sides import visible_weights
 from bpnp.search.point_sets import PointSets, faces
-from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT
 
@@ -80,22 +73,6 @@ def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(k
     assert blind.verdict == "failed"
 
 
-@pytest.mark.parametrize("known", [wall, labelled, scored])
-def test_the_order_of_the_points_does_not_matter(known) -> None:
-    sets, rotation = known(2)
-    rng = np.random.default_rng(0)
-    i, j = rng.permutation(len(sets.bearings)), rng.permutation(len(sets.points3d))
-    of_image = {name: getattr(sets, name) for name in ("labels2d", "scores2d")}
-    of_scene = {name: getattr(sets, name) for name in ("normals3d", "labels3d", "scores3d")}
-    mixed = PointSets(
-        sets.bearings[i], sets.points3d[j],
-        **{name: None if values is None else values[i] for name, values in of_image.items()},
-        **{name: None if values is None else values[j] for name, values in of_scene.items()},
-    )  # fmt: skip
-    for found in (search_poses(sets), search_poses(mixed)):
-        assert degrees_between(found.best[0], rotation) < 0.5
-
-
 def test_nothing_known_is_what_equal_scores_and_one_label_say() -> None:
     bearings, points, rotation, number = cluttered(3, 40)
     one = np.zeros_like(number)
@@ -107,51 +84,3 @@ def test_nothing_known_is_what_equal_scores_and_one_label_say() -> None:
     np.testing.assert_allclose(said.best[0], bare.best[0], atol=1e-4)
     assert said.candidates.score[0] == pytest.approx(bare.candidates.score[0], abs=1e-3)
     assert said.candidates.matched[0] == pytest.approx(bare.candidates.matched[0], abs=1e-3)
-
-
-def test_a_point_is_seen_fully_within_its_cone_and_hardly_behind_it(entry: Any) -> None:
-    sets, rotation = wall(4, side=60, seen=50)
-    scene = Scene(replace(sets, cosines3d=np.full(120, 0.3)), 0, DEFAULT)
-    pose = scene.enter(rotation, TRANSLATION)
-    weight = np.empty(120, np.float32)
-    entry(visible_weights)(scene.sides()[1], *pose, weight)
-    camera = sets.points3d @ rotation.T + TRANSLATION
-    cosine = -((sets.normals3d @ rotation.T) * camera).sum(1) / np.linalg.norm(camera, axis=1)
-    softness = DEFAULT.facing.softness
-    expected = np.clip(0.5 + (cosine - 0.3) / (2 * softness), DEFAULT.facing.unseen, 1)
-    np.testing.assert_allclose(np.sort(weight), np.sort(expected), atol=1e-4)
-    assert weight.max() == 1
-    assert weight.min() == np.float32(DEFAULT.facing.unseen)
-
-
-def test_clusters_keep_labels_weights_and_the_sides_of_a_thin_wall() -> None:
-    rng = np.random.default_rng(5)
-    points = rng.uniform(-1, 1, (2000, 3)) * [1, 1, 1e-3]
-    normals = np.where(rng.random((2000, 1)) < 0.5, 1.0, -1.0) * [0, 0, 1]
-    scores, labels = rng.uniform(0.1, 1, 2000), rng.integers(-1, 3, 2000)
-    sets = PointSets(
-        rays(rng.uniform(-0.3, 0.3, (500, 2))), points, normals, rng.integers(-1, 3, 500), labels, None, None, scores
-    )
-    ((image, seen),) = Scene(sets, 0, DEFAULT).clusters([64])
-    assert max(len(image.label), len(seen.label)) <= 68
-    slope = 1 / (2 * DEFAULT.facing.softness)
-    assert (np.abs(seen.cones[2]) > 0.99 * slope).mean() > 0.9  # hardly a cluster has points of both faces
-    for label in range(-1, 3):
-        total = scores[labels == label].sum()
-        assert seen.b[seen.label == label].sum() == pytest.approx(total, rel=0.15)  # of a sample
-    # The blocks are the pairs of one label and those of which one is free, each of them once.
-    fitting = np.zeros((len(image.label), len(seen.label)), int)
-    for first, last, start, stop in seen.blocks:
-        fitting[first:last, start:stop] += 1
-    one, other = image.label[:, None], seen.label
-    np.testing.assert_array_equal(fitting, (one == other) | (one < 0) | (other < 0))
-
-
-def test_a_point_of_another_label_neither_matches_nor_pulls() -> None:
-    bearings, points, rotation, number = cluttered(6, 0)
-    sets = PointSets(bearings, points, labels2d=number, labels3d=(number + 50) % 100)
-    scene = Scene(sets, 0, DEFAULT)
-    rotations, translations = (values[None] for values in scene.enter(rotation, TRANSLATION))
-    right = Candidates.unscored(rotations, translations)
-    found = anneal_on_points(scene, right, 0.02 * scene.spread, every=True)
-    assert found.matched[0] < 0.05

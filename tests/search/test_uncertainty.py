@@ -69,26 +69,6 @@ def test_it_is_the_covariance_of_fits_to_repeated_noise(count: int) -> None:
         assert np.mean(squared) == pytest.approx(expected, rel=0.25)
 
 
-def test_points_of_another_label_are_no_partners() -> None:
-    """A wall of other points close to each right one leaves the pose as certain as if it were not there."""
-    rng = np.random.default_rng(4)
-    points = rng.uniform(-1, 1, (20, 3))
-    rays = noisy(directions(points + SHIFT), rng)
-    others = np.repeat(points, 10, axis=0) + 0.02 * rng.standard_normal((200, 3))
-    labels2d = np.arange(20) % 3
-    labels2d[0] = -1
-    labels3d = np.concatenate([np.arange(20) % 3, np.repeat((np.arange(20) + 1) % 3, 10)])
-    scene = np.concatenate([points, others])
-    alone = sigma_of(PointSets(rays[1:], points), np.eye(3), SHIFT)
-    for wide in (False, True):  # so many points that neighbours are looked up
-        far = rng.uniform(-1, 1, (300 * wide, 3)) + [0, 0, 300]
-        everything = np.concatenate([scene, far])
-        labels = np.concatenate([labels3d, np.zeros(len(far), int)])
-        labelled = PointSets(rays, everything, labels2d=labels2d, labels3d=labels)
-        assert sigma_of(labelled, np.eye(3), SHIFT) == pytest.approx(alone, rel=0.15)
-        assert sigma_of(PointSets(rays, everything), np.eye(3), SHIFT) > 1.2 * alone
-
-
 def log_likelihood(rays: Array, points: Array, rotation: Array, translation: Array, area: float) -> float:
     """Of the mixture that the assignment comes from, all scene points within 4 NOISE."""
     distance2 = ((rays[:, None] - directions(points @ rotation.T + translation)) ** 2).sum(-1)

@@ -14,9 +14,6 @@ from scipy.spatial.transform import Rotation
 from bpnp import SceneMap, Solution, solve
 from bpnp.cameras import camera_from
 from bpnp.cli import main
-from bpnp.search.evidence.partners import by_focal_length
-from bpnp.search.point_sets import UnknownFocal
-from bpnp.solving.focal_length import unknown_camera
 
 Array = NDArray[np.float64]
 SIZE = (640, 480)
@@ -96,23 +93,6 @@ def test_a_radial_coefficient_is_found_where_the_points_support_one() -> None:
         coefficient = json.loads(solution.to_json())["camera"]["params"][3]
         assert coefficient == pytest.approx(radial, abs=0.1)
         assert (coefficient == 0) == (radial == 0)
-
-
-def test_the_derivative_by_the_focal_length_is_that_of_finite_differences() -> None:
-    rays = np.random.default_rng(0).normal(size=(5, 3)) + [0, 0, 4]
-    stretched = [rays * (math.exp(step), math.exp(step), 1) for step in (-1e-6, 1e-6)]
-    below, above = (points / np.linalg.norm(points, axis=1, keepdims=True) for points in stretched)
-    seen = rays / np.linalg.norm(rays, axis=1, keepdims=True)
-    np.testing.assert_allclose(by_focal_length(seen)[..., 0], (above - below) / 2e-6, atol=1e-8)
-
-
-def test_the_ladder_covers_the_range() -> None:
-    unknown = unknown_camera(None, SIZE, None)
-    focals = np.sort([camera.focal for camera in unknown.ladder(1.57)])
-    assert focals[0] <= 1.26 * unknown.smallest * 640
-    assert focals[-1] >= unknown.largest * 640 / 1.26
-    assert (focals[1:] / focals[:-1] < 1.58).all()
-    assert unknown.focal(unknown.reference) == UnknownFocal(math.log(6.0), math.inf, 0.0)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,6 @@ from bpnp import GravityPrior, PosePrior, solve, solve_many
 from bpnp.models import Matcher
 from bpnp.search.settings import DEFAULT
 from bpnp.solving import networks
-from bpnp.solving.networks import proposals_for, proposed
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
 from bpnp.types import Batch, Pose, Prediction, SolveStats
@@ -75,14 +74,6 @@ def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image
     assert np.linalg.norm(seen.std(0)) == pytest.approx(np.linalg.norm(image.std(0)), rel=0.25)
 
 
-def test_a_network_for_any_axes_gets_the_points_as_they_are() -> None:
-    image, points, rotation, translation = scene()
-    net = Expecting("any", rotation, translation).eval()
-    solution = solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
-    np.testing.assert_allclose(net.given[0], points, atol=1e-5)
-    np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
-
-
 @pytest.mark.parametrize("place", ["solver", "prior"])
 def test_a_network_for_views_without_a_view_says_what_it_expects(place: str) -> None:
     planted = plant(1, 30)
@@ -106,15 +97,6 @@ class Knowing(Matcher):
 
     def forward(self, batch: Batch) -> Prediction:
         raise AssertionError("expected the assignment to be asked for, not poses")
-
-
-def test_poses_of_triples_of_a_right_assignment_are_right() -> None:
-    image, points, rotation, translation = scene(clutter=10)
-    problem = problem_from(image, points, None, prior=PosePrior(VIEW, None, 20.0))
-    turns, shifts = proposed(Knowing(), problem, 0)
-    off = np.abs(turns - rotation).max((1, 2)) + np.abs(shifts - translation).max(1)
-    # Each triple that has different pairs has the true pose among up to four.
-    assert (off < 1e-3).mean() > 0.25
 
 
 @pytest.mark.parametrize("frame", ["any", "view"])
@@ -165,10 +147,3 @@ def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
     )
     assert asked == ([] if name is None else [(3, name)])
     assert alone.verdict == helped.verdict != "confident"
-
-
-def test_a_matcher_is_not_asked_of_too_many_points() -> None:
-    rng = np.random.default_rng(0)
-    image, points = rng.uniform(-0.5, 0.5, (3000, 2)), rng.normal(size=(3000, 3))
-    assert proposals_for(problem_from(image, points, None), 0) is None
-    assert proposals_for(problem_from(image[:1000], points, None), 0) is not None

@@ -136,14 +136,6 @@ def test_a_module_computes_on_the_device() -> None:
     assert module.part.weight.device.type == "cpu"
 
 
-def test_progress_is_told_of_every_batch() -> None:
-    calls: list[tuple[int, int, float]] = []
-    solution = solve(NOISE2D, NOISE3D, solver="search", time_limit=1.0, progress=lambda *call: calls.append(call))
-    assert [batch for _, batch, _ in calls if batch] == list(range(1, solution.stats.iterations + 1))
-    assert {problem for problem, _, _ in calls} == {0}
-    assert sorted(seconds for *_, seconds in calls) == [seconds for *_, seconds in calls]
-
-
 def test_what_is_warm_is_compiled_once(capsys: pytest.CaptureFixture[str]) -> None:
     bpnp.warm_up()
     main(["warm-up"])

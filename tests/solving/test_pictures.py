@@ -1,7 +1,6 @@
 """A solution drawn, as a file that is drawn, and as a COLMAP model that pycolmap reads again."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,6 @@ from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
 from bpnp.report import plot_problem
-from bpnp.report.figures import plot_image, plot_residuals, plot_scene
 from bpnp.solving.pictures import solution_points
 from bpnp.solving.problem import problem_from
 from bpnp.solving.solution import Solution, SolutionStats
@@ -62,11 +60,6 @@ def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
     assert not (tmp_path / "model").exists()
 
 
-def test_a_name_that_text_files_do_not_hold_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="expected a `name` without spaces, .* got 'a photo.jpg'"):
-        SOLUTION.to_colmap(tmp_path / "model", name="a photo.jpg")
-
-
 def solved(camera: Any = None) -> Solution:
     """Exact; of 12 points two are matched."""
     planted = drawn_problem(3, "x", 12)
@@ -90,19 +83,6 @@ def test_a_solution_is_drawn_with_its_matches_in_pixels_of_its_camera() -> None:
         ends = np.stack(segments.get_segments())
         seen = solution.points2d if own is None else own.project(np.c_[solution.points2d, np.ones(12)])
         np.testing.assert_allclose(ends, np.repeat(seen[[3, 5], None], 2, 1), atol=1e-3)
-
-
-def test_the_parts_of_a_picture_are_drawn_into_given_axes() -> None:
-    from matplotlib.figure import Figure
-
-    own = solution_points(solved())
-    image, close_up = Figure().subplots(1, 2)
-    space = Figure().add_subplot(projection="3d")
-    assert (plot_image(image, own), plot_residuals(close_up, own), plot_scene(space, own)) == (image, close_up, space)
-    assert np.abs(np.asarray(close_up.get_lines()[0].get_xydata())).max() < 1e-6
-    assert len(space.collections[0].get_offsets()) == 12
-    lost = replace(own, estimates={"solution": (np.full((3, 3), np.nan), np.full(3, np.nan))})
-    assert not plot_residuals(Figure().subplots(), lost).axison
 
 
 def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(

@@ -44,23 +44,6 @@ def test_solutions_are_those_of_single_calls_whatever_the_number_of_threads(thre
         assert example.rotation_error_deg(solution.rotation) < 0.5
 
 
-def test_progress_is_told_of_every_pair_in_the_process_that_asks(threads: None) -> None:
-    told: list[tuple[int, int]] = []
-    bpnp.solve_many(
-        *SETS, time_limit=math.inf, progress=lambda pair, _batch, _seconds: told.append((os.getpid(), pair))
-    )
-    assert {pair for _, pair in told} == set(range(6))
-    assert {process for process, _ in told} == {os.getpid()}
-
-
-def test_every_item_is_worked_on_once_by_other_processes() -> None:
-    done = list(in_processes(lambda item: (item * item, os.getpid()), range(5, 25), 3))
-    assert sorted((item, value) for item, (value, _) in done) == [(item, item * item) for item in range(5, 25)]
-    processes = {process for _, (_, process) in done}
-    assert os.getpid() not in processes
-    assert 1 <= len(processes) <= 3
-
-
 def test_an_error_in_a_worker_is_raised_and_ends_the_others() -> None:
     def work(item: int) -> int:
         if item == 3:

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import degrees_between, view_with_outliers
+from planted import view_with_outliers
 
 import bpnp
 from bpnp.search.evidence.false_alarms import own_evidence
@@ -85,15 +85,6 @@ def test_only_the_classes_tell_two_equal_things_apart() -> None:
     assert bpnp.verify(image, points, *right).verdict != "confident"
     assert bpnp.verify(image, points, *right, **classes).verdict == "confident"
     assert bpnp.verify(image, points, *twin, **classes).verdict == "failed"
-
-
-def test_many_problems_share_a_table_of_probabilities(view: Any) -> None:
-    bearings, points, rotation, _, labels2d, labels3d = view
-    classes = np.eye(4)[labels2d]
-    options: dict[str, Any] = {"solver": "search", "labels3d": np.eye(4)[labels3d]}
-    for solution in bpnp.solve_many([bearings, bearings], points, labels2d=classes, **options):
-        assert solution.verdict == "confident"
-        assert degrees_between(solution.rotation, rotation) < 1
 
 
 @pytest.mark.parametrize(

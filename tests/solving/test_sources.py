@@ -2,7 +2,6 @@
 
 import math
 import threading
-import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -15,7 +14,6 @@ from bpnp import solve
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.verdict import SearchResult, no_pose
 from bpnp.solving import sources
-from bpnp.solving.networks import evaluation_copy
 from bpnp.types import Pose, Prediction, SolveStats
 
 
@@ -54,24 +52,6 @@ def test_a_module_keeps_the_mode_of_each_of_its_parts(fails: bool) -> None:
         solve(planted.points2d[0], planted.points3d[0], solver=module)
     assert seen == {False}
     assert {name: part.training for name, part in module.named_modules()} == before
-
-
-def test_a_module_stays_on_its_device() -> None:
-    module = Recorder()
-    copied = evaluation_copy(module, torch.device("meta"))
-    assert copied.part.weight.device.type == "meta"
-    assert module.part.weight.device.type == "cpu"
-    assert evaluation_copy(module.eval(), None) is module
-    assert evaluation_copy(module, torch.device("cpu")) is module
-
-
-def test_threads_that_share_a_module_see_it_in_evaluation_mode() -> None:
-    planted, module = plant(1, 30), Recorder()
-    seen.clear()
-    with ThreadPoolExecutor(4) as threads:
-        list(threads.map(lambda _: solve(planted.points2d[0], planted.points3d[0], solver=module), range(8)))
-    assert seen == {False}
-    assert module.training
 
 
 def test_several_threads_find_what_one_does() -> None:
@@ -114,11 +94,3 @@ def test_the_time_limit_of_a_problem_counts_once(
     first, second = deadlines
     assert first is second
     assert first.at == pytest.approx(begun + seconds, abs=0.1)
-
-
-def test_a_net_that_takes_all_the_time_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    planted = plant(1, 30)
-    monkeypatch.setattr(sources, "pose_prior", lambda *_: time.sleep(0.02))
-    solution = solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=0.01)
-    assert solution.reason == "no pose was found in 0.01 s; try a longer time limit"
-    assert solution.seconds >= 0.02

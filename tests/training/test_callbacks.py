@@ -9,7 +9,6 @@ from small_data import quiet_trainer, small_net
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
 
-from bpnp.training.callbacks import PoseLossWarmup
 from bpnp.training.task import BlindPnPTask
 
 
@@ -44,10 +43,3 @@ def test_a_resumed_run_goes_on_at_the_rate_of_its_step_or_on_another_schedule(tm
     assert rates[10:] == pytest.approx([0.02 * k / 40 * 1e-12 for k in range(31, 41)])
     fit(2, half, rate=4e-12)
     assert rates[1:] == pytest.approx([k / 40 * 4e-12 for k in range(22, 41)])
-
-
-def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ValueError, match="expected `warmup_steps` and `decay_start` >= 0"):
-        BlindPnPTask(small_net(), warmup_steps=-1)
-    with pytest.raises(ValueError, match="expected start_epoch >= 0"):
-        PoseLossWarmup(start_epoch=-1)

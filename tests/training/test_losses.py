@@ -8,17 +8,15 @@ import torch
 from planted import Planted, padded, plant, posed
 from scipy.spatial.transform import Rotation
 from small_data import small_net
-from torch import Tensor, nn
+from torch import Tensor
 
 from bpnp import Batch, Pose, Prediction
 from bpnp.geometry import bearings, transform
-from bpnp.models import Matcher
 from bpnp.training.losses import (
     correspondence_loss,
     correspondence_losses,
     matching_likelihood_loss,
     matching_losses,
-    own_losses,
     pose_loss,
     reprojection_loss,
     within_angle,
@@ -64,12 +62,6 @@ def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: fl
             expected += float(assignment[b, i, j]) * (1 - 2 * close)
         assert abs(float(found[b]) - expected) < 1e-12
     assert 0 < within.sum() < within.numel()
-
-
-def test_correspondences_from_a_pose_contain_the_true_ones_in_float32() -> None:
-    planted = plant(3, 500, dtype=torch.float32)
-    within = within_angle(planted.points2d, planted.points3d, *planted.pose, 1e-5)
-    assert (within & (planted.permutation() > 0)).sum((-2, -1)).tolist() == [500] * 3
 
 
 def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
@@ -153,15 +145,6 @@ def test_an_image_point_with_two_scene_points_is_not_alone() -> None:
     assert slope[0, 0] > 0  # and worse in that of a point with partners
 
 
-def test_matching_likelihood_loss_of_the_truth_is_zero_with_and_without_bins() -> None:
-    planted = plant(2, 8)
-    truth = planted.permutation()
-    none = torch.zeros(2, 8, dtype=torch.float64)
-    for bins in ({}, {"unmatched2d": none, "unmatched3d": none}):
-        loss = matching_likelihood_loss(Prediction(truth, **bins), planted.batch())
-        torch.testing.assert_close(loss, torch.zeros(2, dtype=torch.float64))
-
-
 def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> None:
     alone = plant(1, 5, outliers3d=2)
     prediction, batch = _with_bins(alone)
@@ -177,13 +160,6 @@ def test_matching_likelihood_loss_ignores_padding_and_has_its_derivative() -> No
         return matching_likelihood_loss(Prediction(p, unmatched2d=left2d, unmatched3d=left3d), batch)
 
     assert torch.autograd.gradcheck(loss, tuple(x.clone().requires_grad_() for x in (plan, left2d, left3d)))
-
-
-def test_matching_likelihood_loss_wants_pairs_to_compare_with() -> None:
-    prediction, batch = _with_bins(plant(1, 5))
-    batch.match3d = None
-    with pytest.raises(ValueError, match="expected an assignment and a batch with `match3d`, got None"):
-        matching_likelihood_loss(prediction, batch)
 
 
 def solved(planted: Planted, converged: list[bool]) -> Pose:
@@ -217,15 +193,6 @@ def test_a_sample_without_a_pose_has_no_such_loss_and_no_gradient() -> None:
     assert not gradient[1].any()
 
 
-def test_samples_without_a_pose_do_not_dilute_the_mean_of_a_training_step() -> None:
-    planted = plant(2, 6)
-    plan = planted.permutation().roll(1, -1)
-    prediction = Prediction(plan, poses={"pnp": solved(planted, [True, False])})
-    task = BlindPnPTask(small_net(8, 1), matching_loss="reprojection")
-    alone = reprojection_loss(plan, planted.batch(), solved(planted, [True, True]))[0]
-    torch.testing.assert_close(task.losses(prediction, planted.batch()).total.mean(), alone)
-
-
 def test_learns_from_points_alone() -> None:
     """Neither pairs nor pose are in the batch, and still the angle between matched points falls."""
     torch.manual_seed(0)
@@ -243,15 +210,6 @@ def test_learns_from_points_alone() -> None:
     assert min(losses[-5:]) < 0.8 * losses[0]
 
 
-def test_the_likelihood_is_what_its_name_says() -> None:
-    torch.manual_seed(0)
-    batch = plant(2, 9, outliers3d=3, dtype=torch.float32).batch()
-    prediction = Matcher(channels=16, depth=1, heads=2).match(batch)
-    losses = matching_losses(prediction, batch, kind="likelihood", angle=None)
-    torch.testing.assert_close(losses.total, matching_likelihood_loss(prediction, batch))
-    assert losses.matched.all()
-
-
 def test_says_what_is_missing() -> None:
     batch = plant(1, 6).batch()
     with pytest.raises(ValueError, match="expected a solver with an assignment to train, got none"):
@@ -262,14 +220,3 @@ def test_says_what_is_missing() -> None:
         )
     with pytest.raises(ValueError, match="with matching_loss correspondence, got likelihood"):
         BlindPnPTask(matching_loss="likelihood", correspondence_angle=0.1)
-
-
-def test_a_loss_of_the_users_is_one_number_a_pair() -> None:
-    loss, batch = nn.Identity(), plant(2, 6).batch()
-    loss.forward = lambda prediction, batch: torch.tensor([2.0, math.nan])
-    losses = own_losses(loss, Prediction(), batch)
-    assert losses.matched.tolist() == [True, False]
-    assert float(losses.total.mean()) == 2
-    loss.forward = lambda prediction, batch: torch.zeros(())
-    with pytest.raises(ValueError, match=r"expected a tensor of shape \(2,\) from Identity, got \(\)"):
-        own_losses(loss, Prediction(), batch)

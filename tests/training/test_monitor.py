@@ -15,7 +15,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, first_problems, watched_values
+from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, watched_values
 
 
 class PlantedModule(LightningModule):
@@ -98,16 +98,6 @@ def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
     assert float(trainer.callback_metrics["val/feature_spread_2d"]) > 0.1
 
 
-def test_the_first_problems_are_those_of_the_batch() -> None:
-    batch = planted(6)
-    few = first_problems(batch, 2)
-    assert few.ids == batch.ids[:2]
-    assert len(few) == 2
-    torch.testing.assert_close(few.points3d, batch.points3d[:2])
-    unknown = first_problems(Batch.from_arrays(np.ones((1, 2)), np.ones((1, 3))), 3)
-    assert unknown.match3d is None
-
-
 def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None:
     fit(tmp_path, TrainingMonitor(pairs=2, every=2), CSVLogger(tmp_path, name="logs"))
     rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
@@ -123,14 +113,6 @@ def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None
     np.testing.assert_array_equal(first, again)
     with pytest.raises(ValueError, match="expected pairs >= 1 and every >= 0, got 0 and 1"):
         TrainingMonitor(pairs=0, every=1)
-
-
-def is_written(path: Path, text: bytes) -> bool:
-    """Whether another process writes this to a file within half a minute."""
-    deadline = time.monotonic() + 30
-    while text not in path.read_bytes() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    return text in path.read_bytes()
 
 
 def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -162,3 +144,11 @@ def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
         assert len(pictures) == 2
         assert min(picture.width for picture in pictures) > 300
     assert not (tmp_path / "pictures").exists()
+
+
+def is_written(path: Path, text: bytes) -> bool:
+    """Whether another process writes this to a file within half a minute."""
+    deadline = time.monotonic() + 30
+    while text not in path.read_bytes() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return text in path.read_bytes()
