@@ -120,7 +120,10 @@ def line(row: dict[str, Any]) -> str:
 
 
 def measured(
-    rows: Iterable[tuple[str, Sequence[Outcome]]], options: argparse.Namespace, right_deg: float
+    rows: Iterable[tuple[str, Sequence[Outcome]]],
+    options: argparse.Namespace,
+    right_deg: float,
+    right_shift: float = np.inf,
 ) -> dict[str, dict[str, Any]]:
     """Print a line for each row as it comes, and write all with their outcomes to `--output`."""
     found: dict[str, dict[str, Any]] = {}
@@ -128,7 +131,7 @@ def measured(
         if not outcomes:
             print(f"{name}: no problems", flush=True)
             continue
-        found[name] = summary(outcomes, right_deg)
+        found[name] = summary(outcomes, right_deg, right_shift)
         print(f"{name}: {line(found[name])}", flush=True)
         if options.output:
             found[name]["outcomes"] = [asdict(outcome) for outcome in outcomes]

@@ -13,18 +13,21 @@ import numpy as np
 import pytest
 import roma
 import torch
+from planted_model import plant_model
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import bearings, project, rotation_angle, transform
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 from bpnp.maps.views import View
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    "bench_constellation", "bench_layers", "bench_search", "descriptor_poses", "gpu", "paper_layers", "problems",
+    "bench_city", "bench_constellation", "bench_layers", "bench_search", "cities", "descriptor_poses", "gpu",
+    "paper_layers", "problems",
     "rebuilt_maps", "record", "reliability", "results", "steps", "timing",
 )  # fmt: skip
 
@@ -309,3 +312,27 @@ def test_descriptors_are_matched_to_points_seen_from_several_views(bench: Simple
     assert true.sum() == 100
     np.testing.assert_array_equal(ids[true], keypoints[true] + 7)
     assert (~true).sum() < 25
+
+
+def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNamespace, tmp_path: Path) -> None:
+    """A planted model without noise: also in its repeated place; changed copies keep what their views see in view."""
+    plant_model(tmp_path / "planted", camera=("PINHOLE", [520.0, 500.0, 400.0, 300.0]), images=8, points=200, seen=150)
+    model = read_reconstruction(tmp_path / "planted", name="planted")
+    scene, photos = bench.cities.city([model], {"planted": 2}, 0, 5, twice=0.2)
+    assert len(photos) == 2
+    assert len(scene.views) == 12
+    for photo in photos:
+        for rotation, translation in photo.poses:
+            seen = scene.points3d @ rotation.T + translation
+            seen = seen[np.linalg.norm(seen, axis=1) < 3 * photo.distance * np.cbrt(np.linalg.det(rotation))]
+            off = np.linalg.norm(photo.points2d[:, None] - seen[:, :2] / seen[:, 2:], axis=-1).min(1)
+            assert (off < 1e-6).mean() > 0.6
+        first, second = (-rotation.T @ translation for rotation, translation in photo.poses)
+        assert np.linalg.norm(first - second) > photo.distance
+    larger, _ = bench.cities.city([model], {"planted": 2}, 40, 5)
+    assert len(larger.views) == 40
+    assert len({view.name for view in larger.views}) == 40
+    for view in larger.views:
+        camera = larger.points3d[view.points] @ view.rotation.T + view.translation
+        np.testing.assert_allclose(np.linalg.det(view.rotation), 1)
+        assert (np.abs(camera[:, :2] / camera[:, 2:]) < 1).all()

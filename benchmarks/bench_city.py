@@ -1,0 +1,86 @@
+"""Photos without descriptors or a view in maps merged to one city: recall, CPU seconds and memory against its views.
+
+    python -m benchmarks city --views 477 1000 3000 10000 --limit 12 --draw city.png
+    python -m benchmarks city --twice 0.1
+
+The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views
+(`cities.py`). Photos of the scenes of --photos are left out with all points that then fewer than two views see. Right
+is within 5 degrees, the centre within a tenth of the distance. --twice: every place is there twice, this share of the
+points of the second one gone; a confident pose in it is wrong, and no pose there is right.
+"""
+
+import argparse
+import resource
+import time
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from bench_views import REPORTED
+from cities import CityPhoto, city
+from record import TIME_LIMIT, Outcome, measured, parser, solved
+
+from bpnp import SceneMap, Solution, warm_up
+from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+
+RIGHT_DEG, RIGHT_SHIFT = 5.0, 0.1
+VIEWS = (477, 1000, 3000, 10_000)
+
+
+def localized(scene: SceneMap, photo: CityPhoto, seed: int, limit: float) -> Solution:
+    camera = np.diag([photo.focal, photo.focal, 1.0])
+    return scene.localize(photo.focal * photo.points2d, camera, seed=seed, time_limit=limit)
+
+
+def outcome(scene: SceneMap, photo: CityPhoto, seed: int, limit: float) -> Outcome:
+    search = partial(localized, scene, photo, seed, limit)
+    found = solved(photo.name, *photo.poses[0], search, distance=photo.distance)
+    print(f"  {photo.name}: {found.rotation_deg:.3g} deg, {found.shift:.3g}, {found.verdict}, "
+          f"{found.cpu_seconds:.3g} CPU s", flush=True)  # fmt: skip
+    return found
+
+
+def opened(scene: SceneMap) -> float:
+    """CPU seconds of what a map does before its first photo."""
+    start = time.process_time()
+    _ = scene.cones, scene.visibility
+    return time.process_time() - start
+
+
+def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
+    scenes = [read_reconstruction(folder, name=folder.parents[1].name) for folder in folders(options)]
+    each = -(-options.limit // len(options.photos))
+    for views in options.views if options.twice is None else [0]:
+        wanted = dict.fromkeys(options.photos, each)
+        scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
+        seconds = opened(scene)
+        outcomes = [outcome(scene, photo, options.seed, options.time_limit) for photo in photos[: options.limit]]
+        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+        median = np.median([one.cpu_seconds for one in outcomes])
+        yield (
+            f"{len(scene.views):,} views, {len(scene.points3d):,} points, opened in {seconds:.2g} CPU s, "
+            f"{memory:.2g} GB, median {median:.3g} CPU s", outcomes,
+        )  # fmt: skip
+
+
+def folders(options: argparse.Namespace) -> list[Path]:
+    """Those of the models: given ones, or all in the folder of the data."""
+    given = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
+    return [options.data / "colmap" / name / "sparse/0" for name in given]
+
+
+def main() -> None:
+    options = parser(__doc__)
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help="models of the city (default: all of the data)")
+    options.add_argument("--photos", nargs="+", default=REPORTED, metavar="SCENE", help="scenes of the photos")
+    options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
+    options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
+    options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds a photo (default: %(default)s)")
+    chosen = options.parse_args()
+    warm_up()
+    measured(rows(chosen), chosen, RIGHT_DEG, RIGHT_SHIFT)
+
+
+if __name__ == "__main__":
+    main()
