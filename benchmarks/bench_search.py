@@ -45,7 +45,7 @@ def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Itera
     if name.startswith("psb"):
         module: MeshDataModule | ColmapDataModule = MeshDataModule(
             str(data / "psb"),
-            test_pairs=limit,
+            test_problems=limit,
             seed=seed,
             rotation="so3" if name == "psb-so3" else "euler",
             test_outliers=Outliers(ratio=ratio),

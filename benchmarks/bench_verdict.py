@@ -1,4 +1,4 @@
-"""How often `confident` is said of points that have no pose in common, and of pairs on which it is easily wrong.
+"""How often `confident` is said of points that have no pose in common, and of problems on which it is easily wrong.
 
     python -m benchmarks verdict --limit 100 --kinds noise shuffled hard
 

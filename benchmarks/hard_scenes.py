@@ -1,7 +1,7 @@
-"""Pairs on which a verdict is easily wrong: repeated structures, points that depend on each other, wrong models.
+"""Problems with an easily wrong verdict: repeated structures, points that depend on each other, wrong models.
 
-Each function draws one pair: pixels, scene points, and the true poses, none where the points have none in common. Units
-of length are arbitrary; the noise of the pixels is half a pixel.
+Each function draws one: pixels, scene points, and the true poses, none where the points have none in common. Units of
+length are arbitrary; the noise of the pixels is half a pixel.
 """
 
 from collections.abc import Callable

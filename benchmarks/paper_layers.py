@@ -1,7 +1,7 @@
 """The method of Campbell, Liu and Gould (ECCV 2020), written plainly from its formulas: what ours is measured against.
 
 Sinkhorn: scalings of exp(-lambda M), lambda = 1/mu, and the gradient of Lemma 2 through the inverse of the system of
-its m + n - 1 independent constraints, by blocks. RANSAC: OpenCV's P3P and EPnP on the top-k pairs. PnP: L-BFGS on Eq. 7
+its m + n - 1 independent constraints, by blocks. RANSAC: OpenCV's P3P, EPnP on the best matches. PnP: L-BFGS on Eq. 7
 over all m n pairs for the whole batch at once, and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian
 from automatic differentiation. Everything stays in the dtype of its input.
 
@@ -67,7 +67,7 @@ def sinkhorn_backward(plan: Tensor, gradient: Tensor, *, mu: float = MU) -> Tens
 
 
 def ransac(assignment: Tensor, points2d: Tensor, points3d: Tensor) -> tuple[Tensor, Tensor]:
-    """P3P-RANSAC and EPnP (OpenCV) on the 1.5 min(m, n) most probable pairs; the identity where there is no pose."""
+    """P3P-RANSAC and EPnP (OpenCV) on the 1.5 min(m, n) most probable matches; the identity where there is no pose."""
     n = assignment.shape[2]
     best = assignment.flatten(1).topk(int(1.5 * min(assignment.shape[1:])), dim=-1).indices
     poses = np.tile(np.eye(3, 4), (len(best), 1, 1))

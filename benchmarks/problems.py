@@ -6,7 +6,7 @@ points in the unit ball. Two kinds of features lead to two kinds of assignments:
 - smooth: random waves of a point's place in the image (noisy on the 2D side, exact on the 3D side). Points that lie
   close together look alike, as they do to a trained network, and share their probability. `level` is the wave number.
 - independent: a random unit vector for each point and the same with noise of relative size `level` on the other side.
-  A wrong pair is as unlikely as any other; the easy case for every iterative solver.
+  A wrong match is as unlikely as any other; the easy case for every iterative solver.
 """
 
 from dataclasses import dataclass
@@ -49,7 +49,7 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float
     camera = scene @ rotation.mT + translation.unsqueeze(1)
     exact = camera[..., :2] / camera[..., 2:]
     noisy = exact + NOISE_PX / FOCAL * torch.randn(batch, points, 2, generator=generator)
-    pair = Batch.from_arrays(
+    problems = Batch.from_arrays(
         list(noisy), list(scene), list(rotation), list(translation), [torch.arange(points)] * batch, focal=FOCAL
     )
     if kind == "smooth":
@@ -61,11 +61,11 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float
         features2d = features3d + level * torch.randn(batch, points, CHANNELS, generator=generator)
     lost = round(clutter * points)
     features2d[:, :lost] = torch.randn(batch, lost, CHANNELS, generator=generator)
-    return Problem(pair, nn.functional.normalize(features2d, dim=-1), nn.functional.normalize(features3d, dim=-1))
+    return Problem(problems, nn.functional.normalize(features2d, dim=-1), nn.functional.normalize(features3d, dim=-1))
 
 
 def diagonal_mass(assignment: Tensor) -> float:
-    """Share of the assignment on the true pairs, the mean over the batch."""
+    """Share of the assignment on the true matches, the mean over the batch."""
     return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
 
 

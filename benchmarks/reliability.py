@@ -77,14 +77,14 @@ def of_shapes(options: Any) -> Iterator[Problem]:
 
 def photos(options: Any) -> Iterator[Problem]:
     for outliers in OUTLIERS:
-        for pair in _pairs(options, outliers, 1):
-            yield _with_camera(f"{outliers:.0%} outliers/{pair.name}", pair, 1.0, options)
+        for photo in _photos(options, outliers, 1):
+            yield _with_camera(f"{outliers:.0%} outliers/{photo.name}", photo, 1.0, options)
 
 
 def focal(options: Any) -> Iterator[Problem]:
-    for k, pair in enumerate(_pairs(options, 0.5, 1)):
+    for k, photo in enumerate(_photos(options, 0.5, 1)):
         for factor in FACTORS[k % 2 :: 2]:
-            yield _with_camera(f"photos {abs(factor - 1):.0%}/{pair.name} x {factor}", pair, factor, options)
+            yield _with_camera(f"photos {abs(factor - 1):.0%}/{photo.name} x {factor}", photo, factor, options)
     rng = np.random.default_rng([options.seed, 1])
     for k in range(options.limit):
         pixels, points3d, poses = wrong_focal_plane(rng)
@@ -93,11 +93,13 @@ def focal(options: Any) -> Iterator[Problem]:
 
 
 def maps(options: Any) -> Iterator[Problem]:
-    for pair in _pairs(options, 1.0, 0):
-        camera = np.diag([pair.focal, pair.focal, 1.0])
+    for photo in _photos(options, 1.0, 0):
+        camera = np.diag([photo.focal, photo.focal, 1.0])
         known = {"seed": options.seed, "time_limit": options.time_limit}
-        run = partial(pair.scene.localize, pair.focal * pair.points2d, camera, **known)
-        yield Problem(f"maps/{pair.name}", run, [(pair.rotation, pair.translation)], pair.points3d[pair.match3d >= 0])
+        run = partial(photo.scene.localize, photo.focal * photo.points2d, camera, **known)
+        yield Problem(
+            f"maps/{photo.name}", run, [(photo.rotation, photo.translation)], photo.points3d[photo.match3d >= 0]
+        )
 
 
 def hard(options: Any) -> Iterator[Problem]:
@@ -112,25 +114,25 @@ def hard(options: Any) -> Iterator[Problem]:
 FAMILIES = {"leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal}
 
 
-def _pairs(options: Any, outliers: float, views: int) -> Iterator[Any]:
-    """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true pairs."""
+def _photos(options: Any, outliers: float, views: int) -> Iterator[Any]:
+    """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
     known = {"limit": options.limit, "views": views, "outliers": outliers, "seed": options.seed}
     turns = [scene_problems(options.data, scene, most=1024 if views else None, **known) for scene in options.scenes]
-    for pairs in zip(*turns, strict=False):
-        yield from (pair for pair in pairs if pair.matches >= LEAST_MATCHES)
+    for turn in zip(*turns, strict=False):
+        yield from (photo for photo in turn if photo.matches >= LEAST_MATCHES)
 
 
-def _with_camera(name: str, pair: Any, factor: float, options: Any) -> Problem:
+def _with_camera(name: str, photo: Any, factor: float, options: Any) -> Problem:
     """A photo against one view, with the cones of the points, and a camera of `factor` times the focal length."""
 
     def run() -> Solution:
-        camera = camera_from(np.diag([factor * pair.focal, factor * pair.focal, 1.0]))
-        cones = {"normals3d": pair.scene.cones.axes, "cosines3d": pair.scene.cones.cosines}
-        problem = problem_from(pair.focal * pair.points2d, pair.points3d, camera, **cones)
+        camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
+        cones = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
+        problem = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
         return solutions_of({0: problem}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
 
-    points3d = pair.points3d if factor == 1 else pair.points3d[pair.match3d >= 0]  # the depth of what is seen
-    return Problem(name, run, [(pair.rotation, pair.translation)], points3d)
+    points3d = photo.points3d if factor == 1 else photo.points3d[photo.match3d >= 0]  # the depth of what is seen
+    return Problem(name, run, [(photo.rotation, photo.translation)], points3d)
 
 
 def row_of(family: str, problem: Problem) -> dict[str, Any]:

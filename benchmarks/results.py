@@ -91,7 +91,7 @@ def network(weights: str, estimate: str, options: dict[str, Any], limit: int, se
     """Packaged weights on meshes or, without `root`, on procedural shapes."""
     root = str(data / options["root"]) if "root" in options else None
     module = MeshDataModule(
-        root, num_points=1000, test_pairs=limit, test_shapes=limit, batch_size=1, seed=seed,
+        root, num_points=1000, test_problems=limit, test_shapes=limit, batch_size=1, seed=seed,
         **{name: value for name, value in options.items() if name != "root"},
     )  # fmt: skip
     module.setup("test")

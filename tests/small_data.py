@@ -25,7 +25,7 @@ SMALL_MESHES = [
     "--data.train_shapes=12",
     "--data.val_shapes=5",
     "--data.test_shapes=7",
-    "--data.train_pairs=24",
+    "--data.train_problems=24",
     "--data.batch_size=4",
 ]
 

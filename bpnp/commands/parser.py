@@ -14,6 +14,10 @@ from docstring_parser import parse as parse_docstring
 from jsonargparse import ArgumentParser
 
 OVERRIDES = "overrides"  # parameter that receives the options `--data.NAME=VALUE`
+RENAMED = {f"{part}_pairs": f"{part}_problems" for part in ("train", "val", "test")} | {
+    "pairs_factor": "matches_factor",
+    "pairs": "problems",
+}
 
 
 class OneLineParser(ArgumentParser):
@@ -31,6 +35,8 @@ class OneLineParser(ArgumentParser):
                 options.append(f"--{name}" if parent or f"--{name}" in known else name)
             raise ValueError(f"expected {', '.join(options)}, got none; try: {command} --help") from ex
         close = difflib.get_close_matches(re.split("[= ]", unknown)[0], known, n=1) if found else []
+        if old := re.search(r"Option '(\w+)' is not accepted$", text):
+            raise ValueError(text + (f"; it is now {RENAMED[old[1]]}" if old[1] in RENAMED else "")) from ex
         hint = f"; did you mean {close[0]}?" if close else f"; try: {self.prog} --help" if found else ""
         raise ValueError(text + hint) from ex
 

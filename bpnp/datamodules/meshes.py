@@ -182,13 +182,13 @@ class MeshDataModule(ProblemDataModule):
     Args:
         root: folder that `bpnp prepare modelnet40` made, or folder of meshes in ModelNet40's layout,
             <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
-        train_pairs: training problems; problem i shows training mesh i modulo their number.
+        train_problems: training problems; problem i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
         views_on_device: let a Trainer make the training views in batches on its device; none for wherever that is not a
             CPU. They are those that the loader makes, up to rounding.
         val_fraction: share of the training meshes that is held out for validation.
-        val_pairs: validation problems, fixed; none for one per held-out mesh.
-        test_pairs: test problems, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
+        val_problems: validation problems, fixed; none for one per held-out mesh.
+        test_problems: test problems, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
             further views.
         num_points: 3D points of a problem.
         pool_size: surface samples kept of each mesh, at least num_points; every problem draws its own num_points of
@@ -212,12 +212,12 @@ class MeshDataModule(ProblemDataModule):
         self,
         root: str | None = None,
         *,
-        train_pairs: int = 40_000,
+        train_problems: int = 40_000,
         fresh_views: bool = False,
         views_on_device: bool | None = None,
         val_fraction: float = 0.05,
-        val_pairs: int | None = None,
-        test_pairs: int | None = None,
+        val_problems: int | None = None,
+        test_problems: int | None = None,
         num_points: int = 1000,
         pool_size: int = 2048,
         normalisation: Normalisation = "unit_sphere",
@@ -240,7 +240,7 @@ class MeshDataModule(ProblemDataModule):
                 "try a larger `pool_size`"
             )
         self.root, self.cache_dir = None if root is None else Path(root), cache_dir
-        self.problems = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
+        self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.num_shapes = {"train": train_shapes, "val": val_shapes, "test": test_shapes}
         self.cameras = RandomCameras(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation

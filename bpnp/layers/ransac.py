@@ -29,18 +29,18 @@ def top_matches(
     *,
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
-    pairs_factor: float = 1.5,
+    matches_factor: float = 1.5,
 ) -> MatchList:
-    """The k = pairs_factor * min(m, n) matches of highest probability, m and n counting a sample's real points."""
+    """The k = matches_factor * min(m, n) matches of highest probability, m and n counting a sample's real points."""
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
-    count = torch.minimum((pairs_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
+    count = torch.minimum((matches_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
     scores = assignment.detach()
     if not all(mask is None or unpadded(mask) for mask in (mask2d, mask3d)):
         scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
-    k = min(max(1, int(pairs_factor * min(m, n))), m * n)
+    k = min(max(1, int(matches_factor * min(m, n))), m * n)
     flat = scores.flatten(1).topk(k, dim=-1).indices
     mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
     return MatchList(flat // n, flat % n, mask)
@@ -57,12 +57,12 @@ def ransac_pnp(
     mask2d: Bool[Tensor, "b m"] | None = None,
     mask3d: Bool[Tensor, "b n"] | None = None,
     backend: Backend = "auto",
-    pairs_factor: float = 1.5,
+    matches_factor: float = 1.5,
     threshold: float = 0.01,
     max_iterations: int = 1000,
     seed: int = 0,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """Pose from the k = pairs_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
+    """Pose from the k = matches_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
 
     assignment: P; only the order of its entries matters. points2d: normalised image coordinates. points3d: scene units.
     backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with 1000 iterations,
@@ -79,16 +79,16 @@ def ransac_pnp(
     >>> points3d = torch.rand(1, 50, 3, generator=torch.Generator().manual_seed(0))
     >>> camera = points3d + torch.tensor([0.0, 0.0, 4.0])
     >>> points2d = camera[..., :2] / camera[..., 2:]
-    >>> rotation, translation, stats = ransac_pnp(torch.eye(50)[None], points2d, points3d, pairs_factor=1.0)
+    >>> rotation, translation, stats = ransac_pnp(torch.eye(50)[None], points2d, points3d, matches_factor=1.0)
     >>> torch.allclose(translation, torch.tensor([[0.0, 0.0, 4.0]]), atol=1e-3)
     True
     """
     if backend not in ("auto", *BACKENDS):
         raise ValueError(f"expected `backend` auto, poselib, opencv or torch, got {backend!r}")
-    check_positive(pairs_factor=pairs_factor, threshold=threshold, max_iterations=max_iterations)
+    check_positive(matches_factor=matches_factor, threshold=threshold, max_iterations=max_iterations)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
-    chosen = top_matches(assignment, mask2d=mask2d, mask3d=mask3d, pairs_factor=pairs_factor)
+    chosen = top_matches(assignment, mask2d=mask2d, mask3d=mask3d, matches_factor=matches_factor)
     matches = Matches(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
     local, centre, scale = normalised(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
@@ -110,7 +110,7 @@ class RansacPnP(nn.Module):
     Args:
         backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
             its device), or auto (torch on cuda, else poselib).
-        pairs_factor: RANSAC sees the pairs_factor * min(m, n) most probable matches.
+        matches_factor: RANSAC sees the matches_factor * min(m, n) most probable matches.
         threshold: inlier threshold, normalised image coordinates.
         max_iterations: most hypotheses; the paper has 1000.
         seed: of the sampling.
@@ -120,13 +120,13 @@ class RansacPnP(nn.Module):
         self,
         *,
         backend: Backend = "auto",
-        pairs_factor: float = 1.5,
+        matches_factor: float = 1.5,
         threshold: float = 0.01,
         max_iterations: int = 1000,
         seed: int = 0,
     ) -> None:
         super().__init__()
-        self.backend, self.pairs_factor, self.threshold = backend, pairs_factor, threshold
+        self.backend, self.matches_factor, self.threshold = backend, matches_factor, threshold
         self.max_iterations, self.seed = max_iterations, seed
 
     def forward(
@@ -145,7 +145,7 @@ class RansacPnP(nn.Module):
             mask3d=mask3d,
             backend=self.backend,
             seed=self.seed,
-            pairs_factor=self.pairs_factor,
+            matches_factor=self.matches_factor,
             threshold=self.threshold,
             max_iterations=self.max_iterations,
         )

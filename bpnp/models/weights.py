@@ -26,6 +26,7 @@ WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 PLAIN = (bool, int, float, str, type(None))
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
+RENAMED = {"pairs_factor": "matches_factor"}  # settings in older checkpoints
 
 Net = TypeVar("Net", bound="TrainedNet")
 
@@ -201,6 +202,7 @@ def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
             f"expected the settings of {name}, got none; try a class that keeps each constructor argument as an "
             "attribute of its name"
         )
+    settings = {RENAMED.get(key, key): value for key, value in settings.items()}
     arguments = {key: built(value, classes) if is_description(value) else value for key, value in settings.items()}
     try:
         return known[name](**arguments)

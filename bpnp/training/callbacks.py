@@ -131,14 +131,14 @@ class TrainingMonitor(Callback):
     of the trainer's default_root_dir.
 
     Args:
-        pairs: how many validation problems are watched.
+        problems: how many validation problems are watched.
         every: epochs between pictures; 0 for none.
     """
 
-    def __init__(self, pairs: int = 4, every: int = 10) -> None:
-        if pairs < 1 or every < 0:
-            raise ValueError(f"expected pairs >= 1 and every >= 0, got {pairs} and {every}")
-        self.pairs, self.every = pairs, every
+    def __init__(self, problems: int = 4, every: int = 10) -> None:
+        if problems < 1 or every < 0:
+            raise ValueError(f"expected problems >= 1 and every >= 0, got {problems} and {every}")
+        self.problems, self.every = problems, every
         self.watched: Batch | None = None
         self.started = 0.0
         self.seen = 0
@@ -165,7 +165,7 @@ class TrainingMonitor(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if batch_idx == 0 and self.watched is None:
-            self.watched = first_problems(batch, self.pairs)
+            self.watched = first_problems(batch, self.problems)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.watched is None or trainer.sanity_checking:

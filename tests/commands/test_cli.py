@@ -59,6 +59,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", *MESHES, "--model.learning_rat=3"], "unrecognized arguments: --model.learning_rat"),
         (["fit", *MESHES, "--model.learning_rate=fast"], "error: expected model.learning_rate as float, got 'fast'\n"),
         (["fit", *MESHES, "--data.nonsense=3"], "error: data: Option 'nonsense' is not accepted\n"),
+        (["fit", *MESHES, "--data.train_pairs=3"], "'train_pairs' is not accepted; it is now train_problems\n"),
         (["fit", *MESHES, "--data.num_points=many"], "error: data: expected num_points as int, got 'many'\n"),
         (["fit", *MESHES, "--data.batch_size=0"], "error: expected `batch_size` of 1 or more, got 0\n"),
         (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing'\n"),
@@ -120,7 +121,7 @@ def test_a_printed_configuration_and_that_of_a_run_can_be_used_again(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = f"--trainer.default_root_dir={tmp_path}/run"
-    small = ["--data.train_pairs=2", "--data.train_shapes=2", "--data.val_shapes=2", f"--data.cache_dir={tmp_path}"]
+    small = ["--data.train_problems=2", "--data.train_shapes=2", "--data.val_shapes=2", f"--data.cache_dir={tmp_path}"]
     with contextlib.suppress(SystemExit):
         main(["fit", "--config=quickstart", *small, root, "--trainer.max_epochs=1", "--print_config"])
     printed = tmp_path / "printed.yaml"

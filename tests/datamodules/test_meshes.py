@@ -40,7 +40,14 @@ def drawn(problems: MeshSource, count: int, epoch: int = 0) -> Batch:
 
 
 def module(folder: Path, root: Path | None = None, **options) -> MeshDataModule:
-    sizes = {"num_points": 32, "pool_size": 64, "train_shapes": 6, "val_shapes": 2, "test_shapes": 3, "train_pairs": 20}
+    sizes = {
+        "num_points": 32,
+        "pool_size": 64,
+        "train_shapes": 6,
+        "val_shapes": 2,
+        "test_shapes": 3,
+        "train_problems": 20,
+    }
     return MeshDataModule(None if root is None else str(root), cache_dir=str(folder / "cache"), **(sizes | options))
 
 
@@ -104,7 +111,7 @@ def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
 
 
 def test_splits_are_by_model(folder: Path, tmp_path: Path) -> None:
-    data = module(tmp_path, folder, val_fraction=0.2, val_pairs=4, test_pairs=3)
+    data = module(tmp_path, folder, val_fraction=0.2, val_problems=4, test_problems=3)
     data.prepare_data()
     data.setup()
     names = {split: list(one.source.names(range(len(one)))) for split, one in data.datasets.items()}
@@ -139,7 +146,7 @@ def test_a_bad_mesh_is_left_out_and_a_changed_one_read_again(folder: Path, tmp_p
 def train(folder: Path, **options: object) -> list[Batch]:
     """The batches of two epochs."""
     outliers = Outliers(ratio=(0.0, 1.0), side="random")
-    data = module(folder, train_pairs=12, batch_size=4, fresh_views=True, train_outliers=outliers, **options)
+    data = module(folder, train_problems=12, batch_size=4, fresh_views=True, train_outliers=outliers, **options)
     return recorded(data, default_root_dir=folder, max_epochs=2, limit_val_batches=0)
 
 
@@ -170,7 +177,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="`noise_px`, got nan"):
         module(tmp_path, noise_px=float("nan"))
     with pytest.raises(ValueError, match="at least one train problem, got 0"):
-        module(tmp_path, train_pairs=0).setup("fit")
+        module(tmp_path, train_problems=0).setup("fit")
     with pytest.raises(ValueError, match="`val_fraction` between 0 and 1, got 1"):
         hold_out(10, 1.0, seed=0)
     with pytest.raises(ValueError, match="at least 2 training rows"):

@@ -107,7 +107,7 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
     assert len(prepared) == 12
     check(opened(tmp_path / "out" / "store"), meshes)
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["store"]
-    data = MeshDataModule(str(prepared.folder), num_points=16, pool_size=32, train_pairs=8, val_fraction=0.2)
+    data = MeshDataModule(str(prepared.folder), num_points=16, pool_size=32, train_problems=8, val_fraction=0.2)
     data.setup()
     assert (len(data.datasets["train"].source.rows), len(data.datasets["test"])) == (6, 4)
 
@@ -159,7 +159,7 @@ def test_sampled_hdf5_files(tmp_path: Path) -> None:
 
 def test_the_data_module_reads_the_store(meshes: Path, tmp_path: Path) -> None:
     run(meshes, tmp_path / "store")
-    options = {"num_points": 16, "pool_size": 32, "train_pairs": 9, "batch_size": 3, "eval_batch_size": 4}
+    options = {"num_points": 16, "pool_size": 32, "train_problems": 9, "batch_size": 3, "eval_batch_size": 4}
     outliers = Outliers(ratio=0.5)
     prepared = MeshDataModule(str(tmp_path / "store"), test_outliers=outliers, **options)
     prepared.setup("test")

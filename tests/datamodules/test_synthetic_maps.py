@@ -76,7 +76,7 @@ def test_points_lie_in_the_image_and_the_frame_is_arbitrary() -> None:
         assert np.abs(problem.points2d).max(0).min() <= half * 0.75 * (1 + 1e-6)
     for frame in ("any", "upright", "view"):
         kinds = {"facades": 1.0}
-        data = SyntheticMapDataModule(num_points=40, test_pairs=60, eval_batch_size=60, frame=frame, kinds=kinds)
+        data = SyntheticMapDataModule(num_points=40, test_problems=60, eval_batch_size=60, frame=frame, kinds=kinds)
         data.setup("test")
         (batch,) = data.test_dataloader()
         if frame == "any":
@@ -157,7 +157,7 @@ def test_a_photo_has_keypoints_where_points_repeat_face_it_and_are_near_enough()
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
     (tmp_path / "data.yaml").write_text(
         "{num_points: 48, outliers: [0, 0.5], views: [1, 2], kinds: {statue: 1, street: 2}, noise_px: 1,"
-        " train_pairs: 8, val_pairs: 3, test_pairs: 3, batch_size: 4, train_outliers: {ratio: [0, 1]}}"
+        " train_problems: 8, val_problems: 3, test_problems: 3, batch_size: 4, train_outliers: {ratio: [0, 1]}}"
     )
     parser = ArgumentParser()
     parser.add_class_arguments(SyntheticMapDataModule, "data")
@@ -177,11 +177,11 @@ def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:
 WRONG: list[tuple[str, object]] = [
     ("min_points", 3), ("min_points", 400), ("outliers", -0.1), ("outliers", (1.0, 0.5)), ("field_of_view", 170.0),
     ("noise_px", (0.0, np.inf)), ("scale_range", (0.0, 1.0)), ("views", (0, 2)), ("tilt_deg", -1.0),
-    ("kinds", {"caves": 1.0}), ("kinds", {"statue": 0.0}), ("train_pairs", 0),
+    ("kinds", {"caves": 1.0}), ("kinds", {"statue": 0.0}), ("train_problems", 0),
 ]  # fmt: skip
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
 def test_wrong_options_are_named(name: str, value: object) -> None:
-    with pytest.raises(ValueError, match="at least one train problem" if name == "train_pairs" else name):
+    with pytest.raises(ValueError, match="at least one train problem" if name == "train_problems" else name):
         SyntheticMapDataModule(**{name: value}).setup("fit")  # type: ignore[arg-type]

@@ -44,7 +44,7 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
         (ransac_pnp, {"assignment": PAIRS["assignment"][:0]}, "no empty axis"),
         (ransac_pnp, {"points3d": PLANTED.points3d.numpy()}, "expected `points3d` as a tensor"),
         (ransac_pnp, {"backend": "magsac"}, "expected `backend` .*poselib.*got 'magsac'"),
-        (ransac_pnp, {"pairs_factor": 0.0}, "expected `pairs_factor` > 0, got 0.0"),
+        (ransac_pnp, {"matches_factor": 0.0}, "expected `matches_factor` > 0, got 0.0"),
         (ransac_pnp, {"max_iterations": 0}, "expected `max_iterations` > 0, got 0"),
     ],
 )

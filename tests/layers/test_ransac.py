@@ -48,7 +48,7 @@ def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
     else:
         points2d[0] = torch.randn(12, 2, generator=torch.Generator().manual_seed(0)).double()
     r, t, stats = ransac_pnp(
-        assignment, points2d, points3d, mask2d=mask2d, backend=backend, pairs_factor=1.0, threshold=1e-6
+        assignment, points2d, points3d, mask2d=mask2d, backend=backend, matches_factor=1.0, threshold=1e-6
     )
     assert stats.converged.tolist() == [False, True, True]
     assert r[0].isnan().all()
@@ -69,7 +69,7 @@ def test_points_of_one_plane_are_no_trap(backend: str) -> None:
     generator = torch.Generator().manual_seed(0)
     seen = seen + 0.001 * torch.randn(seen.shape, generator=generator, dtype=torch.float64)
     points2d = torch.empty_like(seen).scatter_(1, planted.match3d.unsqueeze(-1).expand_as(seen), seen)
-    r, _, stats = ransac_pnp(wrong_pairs(planted, 0.2), points2d, points3d, backend=backend, pairs_factor=1.0)
+    r, _, stats = ransac_pnp(wrong_pairs(planted, 0.2), points2d, points3d, backend=backend, matches_factor=1.0)
     assert stats.converged.all()
     assert torch.rad2deg(rotation_angle(r, planted.rotation)).max() < 2
 

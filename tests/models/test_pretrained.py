@@ -108,7 +108,7 @@ def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
 
 def test_the_matcher_for_maps_finds_partners_in_the_axes_of_the_view() -> None:
     """Of synthetic maps; a partner is worth as little as any other point if the points are turned away."""
-    data = SyntheticMapDataModule(frame="view", num_points=128, outliers=0.5, test_pairs=8, seed=7)
+    data = SyntheticMapDataModule(frame="view", num_points=128, outliers=0.5, test_problems=8, seed=7)
     data.setup("test")
     batch = next(iter(data.test_dataloader()))
     net = Matcher.from_pretrained("matcher-maps")

@@ -41,7 +41,7 @@ def consensus(
         *pairs[:2],
         mask2d=pairs.real,
         mask3d=pairs.real,
-        pairs_factor=1.0,
+        matches_factor=1.0,
         backend=backend,
         threshold=THRESHOLD,
         max_iterations=hypotheses,

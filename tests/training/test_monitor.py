@@ -99,7 +99,7 @@ def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
 
 
 def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None:
-    fit(tmp_path, TrainingMonitor(pairs=2, every=2), CSVLogger(tmp_path, name="logs"))
+    fit(tmp_path, TrainingMonitor(problems=2, every=2), CSVLogger(tmp_path, name="logs"))
     rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
     assert [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]] == pytest.approx(
         [0.25] * 3
@@ -111,8 +111,8 @@ def test_a_training_logs_values_and_draws_the_same_pairs(tmp_path: Path) -> None
     assert [str(path) for path in drawn] == [f"epoch_000{e}/problem{p}.png" for e in (0, 2) for p in (0, 1)]
     first, again = (imread(tmp_path / "pictures" / f"epoch_000{epoch}" / "problem0.png") for epoch in (0, 2))
     np.testing.assert_array_equal(first, again)
-    with pytest.raises(ValueError, match="expected pairs >= 1 and every >= 0, got 0 and 1"):
-        TrainingMonitor(pairs=0, every=1)
+    with pytest.raises(ValueError, match="expected problems >= 1 and every >= 0, got 0 and 1"):
+        TrainingMonitor(problems=0, every=1)
 
 
 def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -120,7 +120,7 @@ def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: p
     monkeypatch.setenv("WANDB_SILENT", "true")
     wandb.finish()  # a run that another test left would be joined
     logger = OfflineWandbLogger(save_dir=str(tmp_path / "runs"))
-    fit(tmp_path, TrainingMonitor(pairs=2, every=1), logger, epochs=1)
+    fit(tmp_path, TrainingMonitor(problems=2, every=1), logger, epochs=1)
     assert logger.experiment.offline
     logger.experiment.finish()
     (run,) = (tmp_path / "runs" / "wandb").glob("offline-run-*")
@@ -134,7 +134,7 @@ def test_tensorboard_gets_scalars_and_pictures(tmp_path: Path) -> None:
     from lightning.pytorch.loggers import TensorBoardLogger
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-    fit(tmp_path, TrainingMonitor(pairs=2, every=2), TensorBoardLogger(tmp_path, name="board"))
+    fit(tmp_path, TrainingMonitor(problems=2, every=2), TensorBoardLogger(tmp_path, name="board"))
     events = EventAccumulator(str(tmp_path / "board" / "version_0"), size_guidance={"images": 0})
     events.Reload()
     assert [event.value for event in events.Scalars("val/true_match_mass")] == pytest.approx([0.25] * 3)

@@ -257,7 +257,7 @@ def test_overfit_batches_repeats_the_same_problems(tmp_path: Path) -> None:
             seen.append(batch.ids)
 
     run = quiet_trainer(tmp_path, callbacks=[Seen()], max_epochs=3, overfit_batches=2)
-    run.fit(BlindPnPTask(small_net()), datamodule=data(tmp_path, train_pairs=32, batch_size=4))
+    run.fit(BlindPnPTask(small_net()), datamodule=data(tmp_path, train_problems=32, batch_size=4))
     assert len(seen) == 6
     assert len(set(seen)) == 2
     assert seen[:2] * 3 == seen

@@ -276,10 +276,10 @@ class SyntheticMapDataModule(ProblemDataModule):
     `setup()`, then the loaders.
 
     Args:
-        train_pairs: training problems of an epoch.
+        train_problems: training problems of an epoch.
         fresh_views: draw new scenes and cameras every epoch; false for fixed problems.
-        val_pairs: validation problems, fixed.
-        test_pairs: problems to test and predict on, fixed.
+        val_problems: validation problems, fixed.
+        test_problems: problems to test and predict on, fixed.
         num_points: largest number of points of a side; matches and others are thinned alike where there are more.
         min_points: a scene with fewer matches is drawn anew; at least 4.
         outliers: of each side at most this share of all points has no partner; 1 for all that there are. Two numbers,
@@ -300,10 +300,10 @@ class SyntheticMapDataModule(ProblemDataModule):
     def __init__(
         self,
         *,
-        train_pairs: int = 40_000,
+        train_problems: int = 40_000,
         fresh_views: bool = True,
-        val_pairs: int = 200,
-        test_pairs: int = 200,
+        val_problems: int = 200,
+        test_problems: int = 200,
         num_points: int = 256,
         min_points: int = 16,
         outliers: Drawn = (0.25, 1.0),
@@ -329,7 +329,7 @@ class SyntheticMapDataModule(ProblemDataModule):
             field_of_view=field_of_view,
             noise_px=noise_px,
         )
-        self.problems = {"train": train_pairs, "val": val_pairs, "test": test_pairs}
+        self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.fresh = fresh_views
         self.augmentations = dict.fromkeys(PARTS, Augmentation(rotate=frame == "any"))
 

@@ -33,7 +33,7 @@ class Hungarian(nn.Module):
         self.net = BPnPNet.from_checkpoint(checkpoint) if checkpoint is not None else net or BPnPNet()
         self.ransac = RansacPnP(
             backend=ransac_backend,
-            pairs_factor=1.0,
+            matches_factor=1.0,
             threshold=getattr(self.net.ransac, "threshold", 0.01),
             max_iterations=getattr(self.net.ransac, "max_iterations", 1000),
         )
