@@ -9,10 +9,7 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import camera_centre
-from bpnp.models.baselines.branch_and_bound import (
-    Boxes,
-)
-from bpnp.models.baselines.gopac import best_rotation, count_inliers, maximise_inliers
+from bpnp.models.baselines.branch_and_bound import Boxes, best_rotation, count_inliers, maximise_inliers
 from bpnp.models.baselines.gosma import (
     RayMixture,
     SceneMixture,

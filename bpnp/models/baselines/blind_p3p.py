@@ -81,13 +81,13 @@ class RandomRansac(SingleSolver):
                 # A stride takes points from all of the image, should they be in an order.
                 some = sides[0][:: max(1, m // PREVIEW)]
                 few = agreement(some, sides[1], rotation, translation, threshold=self.threshold)
-                chosen = (few.partnered2d * n + few.partnered3d * len(some)).topk(HYPOTHESES).indices
+                chosen = (few[0] * n + few[1] * len(some)).topk(HYPOTHESES).indices
                 rotation, translation = rotation[chosen], translation[chosen]
             if len(rotation):
                 counts = agreement(*sides, rotation, translation, threshold=self.threshold)
-                i = int(counts.points.argmax())
-                if int(counts.points[i]) > most and int(counts.matches[i]) >= MIN_POINTS:
-                    best, most, matches = (rotation[i], translation[i]), int(counts.points[i]), int(counts.matches[i])
+                i = int(counts.sum(0).argmax())
+                if (points := int(counts[:, i].sum())) > most and (least := int(counts[:, i].min())) >= MIN_POINTS:
+                    best, most, matches = (rotation[i], translation[i]), points, least
         if best is None:
             return Answer(iterations=tried)
         return Answer(best, tried, 1 - most / (m + n), self._enough(matches, m, n, tried))
@@ -149,10 +149,10 @@ class Constellation(SingleSolver):
             if deadline.passed():
                 break
             rotation, translation = solutions(problem, triples2d[part[:, 0]], triples3d[part[:, 1]])
-            agreed = agreement(problem.points2d, problem.points3d, rotation, translation, threshold=self.radius)
-            best = agreed.matches.topk(min(SHORTLIST, len(rotation))).indices
-            poses.append(torch.cat([rotation, translation.unsqueeze(-1)], -1)[best])
-            counts.append(agreed.matches[best])
+            matched = agreement(*problem[:2], rotation, translation, threshold=self.radius).amin(0)
+            most = matched.topk(min(SHORTLIST, len(rotation)))
+            poses.append(torch.cat([rotation, translation.unsqueeze(-1)], -1)[most.indices])
+            counts.append(most.values)
             tried += len(part)
         if tried == 0 or len(candidates := torch.cat(poses)) == 0:
             return Answer(iterations=tried)

@@ -1,6 +1,5 @@
-"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid.
-
-The uncertainty angles bound how far a direction can turn within a box, as in GOPAC (Campbell et al., ICCV 2017).
+"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid; and GOPAC
+(Campbell et al., ICCV 2017), whose uncertainty angles bound how far a direction turns in a box.
 """
 
 import itertools
@@ -14,10 +13,16 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.loops.parallel import Deadline
+from bpnp.checks import check_positive
+from bpnp.geometry import bearings
+from bpnp.layers.pnp import weighted_pnp
+from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
+CHUNK = 2**22  # angles computed at a time
+ROUNDING = 1e-9  # of a cosine
+SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
 
 
 class Boxes(NamedTuple):
@@ -160,3 +165,144 @@ def split(boxes: Boxes, turning: Bool[Tensor, " b"]) -> Boxes:
     )
     nearest = (children.turn.abs() - children.turn_half.unsqueeze(-1)).clamp_min(0).norm(dim=-1)
     return children.pick(nearest <= math.pi)
+
+
+class GOPAC(BranchAndBound):
+    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
+
+    `residual` of the pose is the share of image points without a partner; `converged` is the certificate that no pose
+    has more inliers.
+
+    Args:
+        angle: largest angle between an inlier's ray and its scene point, radians.
+        max_boxes: most boxes, inner ones included; null for as many as the time allows.
+        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
+    """
+
+    estimates = ("gopac",)
+
+    def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
+        super().__init__(max_boxes, time_limit)
+        check_positive(angle=angle)
+        self.angle = angle
+
+    def search(
+        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
+    ) -> tuple[Found, float]:
+        limits = {"angle": self.angle, "max_boxes": self.max_boxes}
+        found = maximise_inliers(bearings(points2d), points3d, domain, deadline=deadline, **limits)
+        return found, 1 - found.value / len(points2d)
+
+
+def maximise_inliers(
+    rays: Float[Tensor, "m 3"],
+    points: Float[Tensor, "n 3"],
+    domain: Boxes,
+    *,
+    angle: float,
+    max_boxes: int | float = math.inf,
+    deadline: Deadline = NEVER,
+) -> Found:
+    """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
+
+    Outer search over the camera centre c in the one box of the domain, most promising box first; for each box two inner
+    searches over R: at its centre, for a better pose, and with every angle widened by the box's uncertainty psi_t(p_j),
+    for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
+    SMALLEST are not split: where one might hold more than the best pose, the bound stays above the count.
+    """
+    best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
+    inner = 1
+
+    def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        nonlocal best, inner
+        children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
+        bounds = []
+        for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
+            reach = torch.full_like(moving, angle)
+            here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
+            if here.rotation is not None:
+                best = _refined(rays, points, here.rotation, place, angle)
+            wide = (reach + moving).clamp_max(math.pi)
+            there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
+            inner += here.boxes + there.boxes
+            bounds.append(there.bound)
+        return children, rays.new_tensor(bounds), best[2]
+
+    left, outer = best_first(
+        domain,
+        rays.new_full((1,), len(rays)),
+        expand,
+        at_once=1,
+        small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST,
+        until=lambda done: deadline.passed() or done + inner >= max_boxes,
+    )
+    bound = max(best[2], left)
+    return Found(*best, bound, outer + inner, best[2] >= bound)
+
+
+def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
+    """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
+    count = count_inliers(rays, points, rotation, place, angle)
+    weights = within(rays, points, rotation, place, math.cos(angle)).to(rays)
+    start = (rotation, -rotation @ place)
+    turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in (weights, rays, points, *start)))
+    if bool(stats.converged[0]):
+        moved = -turned[0].mT @ shift[0]
+        if (refined := count_inliers(rays, points, turned[0], moved, angle)) >= count:
+            return turned[0], moved, refined
+    return rotation, place, count
+
+
+def best_rotation(
+    rays: Float[Tensor, "m 3"],
+    points: Float[Tensor, "n 3"],
+    place: Float[Tensor, "3"],
+    reach: Float[Tensor, " n"],
+    domain: Boxes,
+    *,
+    floor: int,
+    first: bool = False,
+    smallest: float = 1e-3,
+    deadline: Deadline = NEVER,
+) -> Found:
+    """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
+
+    Only rotations with more than `floor` rays are of interest: boxes that cannot have more are dropped. `first`: stop
+    at the first of these. Boxes of half side below `smallest` (radians) are not split; they, and the boxes left at the
+    deadline, keep the bound above the count.
+    """
+    directions = torch.nn.functional.normalize(points - place, dim=-1)
+    count, rotation = floor, None
+
+    def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
+        nonlocal count, rotation
+        children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
+        cosine = (rays @ children.rotation) @ directions.mT  # (b, m, n)
+        widened = (reach + rotation_uncertainty(children).unsqueeze(-1)).clamp_max(math.pi)
+        # Rays within reach under the rotation at each box's centre, and a bound for all rotations of the box.
+        reached = (cosine >= reach.cos() - ROUNDING).any(-1).sum(-1)
+        reachable = (cosine >= (widened.cos() - ROUNDING).unsqueeze(1)).any(-1).sum(-1).to(rays)
+        i = int(reached.argmax())
+        if int(reached[i]) > count:
+            count, rotation = int(reached[i]), children.rotation[i]
+        return children, reachable, count
+
+    left, boxes = best_first(
+        domain,
+        rays.new_full((len(domain.turn),), len(rays)),
+        expand,
+        at_once=max(1, CHUNK // (8 * len(rays) * len(directions))),
+        small=lambda boxes: boxes.turn_half < smallest,
+        until=lambda _: deadline.passed() or (first and rotation is not None),
+    )
+    return Found(rotation, place, count, max(count, left), boxes, count >= left)
+
+
+def count_inliers(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> int:
+    """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
+    return int(within(rays, points, rotation, place, math.cos(angle) - ROUNDING).any(-1).sum())
+
+
+def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, cosine: float) -> Bool[Tensor, "m n"]:
+    """[cos angle(f_i, R (p_j - c)) >= cosine]."""
+    return (rays @ rotation) @ torch.nn.functional.normalize(points - place, dim=-1).mT >= cosine

@@ -1,7 +1,6 @@
 """What the baselines share: each problem by itself, in float64, within a limit of time; and the count of partners."""
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -16,26 +15,19 @@ from bpnp.types import Batch, Pose, Prediction, SolveStats
 CHUNK = 2**22  # distances computed at a time, in float32
 
 
-@dataclass(frozen=True)
-class SingleProblem:
-    """The real points of one problem, on the batch's device, and its true pose where it is known."""
+class SingleProblem(NamedTuple):
+    """The real points of one problem, its `Batch.index`, and its true pose where it is known."""
 
     points2d: Float[Tensor, "m 2"]
     points3d: Float[Tensor, "n 3"]
-    index: int
-    rotation: Float[Tensor, "3 3"] | None = None
-    translation: Float[Tensor, "3"] | None = None
-
-    @classmethod
-    def of(cls, batch: Batch, i: int) -> "SingleProblem":
-        pose = (None if value is None else value[i].double().clone() for value in (batch.rotation, batch.translation))
-        points2d, points3d = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
-        return cls(points2d.double().clone(), points3d.double().clone(), int(batch.index[i]), *pose)
+    number: int
+    rotation: Float[Tensor, "3 3"] | None
+    translation: Float[Tensor, "3"] | None
 
     def seed(self, seed: int) -> int:
         """Seed of its random numbers, whatever batch it is in."""
         mixed = torch.Generator().manual_seed(seed)
-        return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.index
+        return int(torch.randint(2**31, (1,), generator=mixed)) * 1_000_003 + self.number
 
 
 class Answer(NamedTuple):
@@ -64,9 +56,14 @@ class SingleSolver(nn.Module):
         like, answers = batch.points3d, []
         # The trainer's inference mode would forbid a local optimiser's gradients.
         with torch.inference_mode(False), torch.no_grad():
-            for i in range(len(batch)):
-                problem = SingleProblem.of(batch, i)
-                enough = min(len(problem.points2d), len(problem.points3d)) >= MIN_POINTS
+            for i, number in enumerate(batch.index.tolist()):
+                sides = batch.points2d[i][batch.mask2d[i]], batch.points3d[i][batch.mask3d[i]]
+                points2d, points3d = (side.double().clone() for side in sides)
+                rotation, translation = (
+                    x if x is None else x[i].double().clone() for x in (batch.rotation, batch.translation)
+                )
+                problem = SingleProblem(points2d, points3d, number, rotation, translation)
+                enough = min(len(points2d), len(points3d)) >= MIN_POINTS
                 answers.append(self.solve(problem, Deadline.after(self.time_limit)) if enough else Answer())
             missing = like.new_full((3, 3), math.nan), like.new_full((3,), math.nan)
             poses = zip(*(answer.pose or missing for answer in answers), strict=True)
@@ -88,22 +85,6 @@ def weak_perspective_distance(points2d: Tensor, points3d: Tensor) -> float:
     return float(math.sqrt(2 / 3) * scene / image.clamp_min(1e-12))
 
 
-class Agreement(NamedTuple):
-    """Points of each side with a point of the other within the threshold in the image, per pose."""
-
-    partnered2d: Int[Tensor, " h"]
-    partnered3d: Int[Tensor, " h"]
-
-    @property
-    def points(self) -> Int[Tensor, " h"]:
-        return self.partnered2d + self.partnered3d
-
-    @property
-    def matches(self) -> Int[Tensor, " h"]:
-        """Upper bound on the number of one-to-one matches within the threshold."""
-        return torch.minimum(self.partnered2d, self.partnered3d)
-
-
 def agreement(
     points2d: Float[Tensor, "m 2"],
     points3d: Float[Tensor, "n 3"],
@@ -111,19 +92,19 @@ def agreement(
     translation: Float[Tensor, "h 3"],
     *,
     threshold: float,
-) -> Agreement:
-    """Count the points with a partner closer than `threshold` (normalised image units), for every pose.
+) -> Int[Tensor, "2 h"]:
+    """Points of either side with a point of the other closer than `threshold` (normalised image units), for each pose.
 
-    A 3D point behind the camera has none, and no point has one under a pose that is NaN.
+    The smaller count bounds the number of one-to-one matches. A 3D point behind the camera has no partner, and no point
+    has one under a pose that is NaN.
     """
     part = max(1, CHUNK // (len(points2d) * len(points3d)))
     x, y = points2d.float().unsqueeze(-1).unbind(1)
-    counts2d, counts3d = [], []
+    counts = []
     for turned, shift in zip(rotation.split(part), translation.split(part), strict=True):
         camera = transform(turned, shift, points3d.expand(len(turned), -1, -1))
         seen = torch.where(camera[..., 2:] > 0, project(camera), torch.inf).nan_to_num(torch.inf).float()
         squared = (seen[:, None, :, 0] - x).square_()
         squared += (seen[:, None, :, 1] - y).square_()
-        counts2d.append((squared.amin(2) < threshold**2).sum(-1))
-        counts3d.append((squared.amin(1) < threshold**2).sum(-1))
-    return Agreement(torch.cat(counts2d), torch.cat(counts3d))
+        counts.append(torch.stack([(squared.amin(axis) < threshold**2).sum(-1) for axis in (2, 1)]))
+    return torch.cat(counts, 1)

@@ -69,7 +69,7 @@ class SoftPOSIT(SingleSolver):
             found = softposit(*points, *start, max_steps=self.max_steps, deadline=deadline)
             finished = found.finished
             counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
-            score = counts.points + found.accepted * (m + n + 1)
+            score = counts.sum(0) + found.accepted * (m + n + 1)
             i = int(score.argmax())
             if int(score[i]) > most:
                 most, pose = int(score[i]), (found.rotation[i], found.translation[i])
