@@ -1,20 +1,18 @@
 """The poses that a search has found so far, and the verdict on them."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose
-from bpnp.search.annealing import finish, polished
+from bpnp.search.annealing import finish
 from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
-from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Evidence
 from bpnp.search.verdict import SearchResult, judged, missed, weighed, with_false_alarms
 
 
@@ -135,32 +133,4 @@ class Pool:
         result = judged(leaders, sets, batches=self.turns, looks=looks, rule=rule)
         if self.enumerated.log10_false_alarms < result.log10_false_alarms:
             return replace(self.enumerated, batches=self.turns)
-        return against_repetitions(result, sets, lambda: scene, rule, looks=looks)
-
-
-def against_repetitions(
-    result: SearchResult,
-    sets: PointSets,
-    entered: Callable[[], Scene],
-    rule: Evidence,
-    *,
-    looks: int = 0,
-    exhaustive: bool = False,
-) -> SearchResult:
-    """A confident result once more, beside the poses that a repeated structure would confuse with it; if one of these
-    is better, so is that one."""
-    if result.verdict != "confident":
-        return result
-    best, scale = result.best, max(result.residual, sets.image.scales[0])
-    repeated, compared = repeated_poses(sets, *best, scale, rule)
-    if not len(repeated[0]):
-        return result
-    rivals = with_false_alarms(polished(entered(), *repeated, scale), sets)
-    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale, rule.repetitions)
-    behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
-    alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
-    candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
-    beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
-    if np.array_equal(beside.best[1], best[1]):
-        return beside
-    return against_repetitions(beside, sets, entered, rule, looks=looks, exhaustive=exhaustive)
+        return against_rivals(result, sets, lambda: scene, rule, looks=looks)

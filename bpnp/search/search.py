@@ -9,8 +9,9 @@ import numpy as np
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.search import exceeds_enumeration, is_enumerable, search_by_enumeration
+from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.point_sets import PointSets
-from bpnp.search.pool import Pool, against_repetitions
+from bpnp.search.pool import Pool
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Proposals, only_proposed, turns
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -134,4 +135,4 @@ def _enumerated(
     found = search_by_enumeration(sets, deadline, settings)
     exhaustive = found.exhausted or found.safe
     result = judged(found.candidates, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
-    return against_repetitions(result, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted
+    return against_rivals(result, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted

@@ -200,7 +200,7 @@ class ImagePoints:
     beyond, only the outline fits. floor: smallest scale in spreads of the bearings, some hundredths of a pixel of an
     ordinary camera. together: distance in scales below which points are one observation. crowded: standard deviations
     by which the points around one exceed those of an even spread before it is a clump. most: that are looked at,
-    evenly spread over the given ones. lines: pairs of points whose line is tried.
+    evenly spread over the given ones.
     """
 
     scale_step: float = 2.0
@@ -209,7 +209,6 @@ class ImagePoints:
     together: float = 2.0
     crowded: float = 2.0
     most: int = 2000
-    lines: int = 2000
 
 
 @dataclass(frozen=True)
@@ -220,12 +219,10 @@ class Contested:
     times as far as a different pose; nearer ones slide along the same lines and surfaces. most: nats of evidence of an
     image point, what 100 scene points leave to one that is met to the finest scale. alone: share of the points that the
     first pose alone explains; a pose that explains so many alone is no repetition of it. same: share of a pose's
-    partners in the places of those of another from which both say the same of the scene. together: scales within which
-    image points are of one line or one clump; with 3 the middle of a surface is full of lines.
+    partners in the places of those of another from which both say the same of the scene.
     """
 
     near: float = 3.0
-    together: float = 1.0
     far: float = 5.0
     most: float = 13.0
     alone: float = 0.5
@@ -260,6 +257,26 @@ class Repetitions:
 
 
 @dataclass(frozen=True)
+class OtherFocal:
+    """Where another focal length is looked for beside a confident pose (`bpnp.search.evidence.rivals`).
+
+    zooms: over the given one, to start from; from a fifth off the steps that follow lead to one a third off. fewest:
+    matches; of fewer a seventh unknown explains too much. search: around the pose; it sees the scene as large, so that
+    a narrow and coarse one meets what there is.
+    """
+
+    zooms: tuple[float, ...] = (0.8, 1.25)
+    fewest: int = 24
+    search: RasterSearch = RasterSearch(
+        Draws(2**12, 3.0, 0.03, 2**12),
+        Screens((50, 300), (2**9, 2**5)),
+        Narrowing(0.03, 0.015, steps=1, copies=16, points=600),
+        RasterShape(cells=1.0),
+        annealed=2,
+    )
+
+
+@dataclass(frozen=True)
 class Evidence:
     """When a pose is believed (`bpnp.search.verdict`). Logarithms to base 10.
 
@@ -273,7 +290,7 @@ class Evidence:
         wrong pose miss a better one beside it; 12 of 12 met it (Laplace's rule of succession).
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
         tenth wrong is believed half as often again.
-    contested, repetitions: constants of these alternatives.
+    contested, repetitions, zoomed: constants of these alternatives.
     focal: share by which a focal length that is fitted may be off, once in a thousand.
     """
 
@@ -288,6 +305,7 @@ class Evidence:
     focal_chance: float = 0.01
     contested: Contested = Contested()
     repetitions: Repetitions = Repetitions()
+    zoomed: OtherFocal = OtherFocal()
     focal: float = 0.2
 
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import solve
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.image_statistics import observations
 from bpnp.search.point_sets import PointSets
 from bpnp.search.verdict import SearchResult, judged
 
@@ -148,26 +147,3 @@ def test_curves_of_which_either_side_has_other_points_are_not_called_confident()
         found = solve(pixels, scene, time_limit=2)
         right = Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < np.radians(3)
         assert found.verdict != "confident" or right, pair
-
-
-def test_points_of_a_line_are_one_observation_and_scattered_ones_are_their_own() -> None:
-    """Five lines of 20 points, half a reach off: either sign of a line's evidence is as likely, so that of 32 cases 6
-    have a sum of 60 or more; of independent points a sum of 37 is once in a thousand. Of 40 drawings none is confused
-    with scattered points, of which hardly two are one observation."""
-    rng = np.random.default_rng(0)
-    least = math.sqrt(2 * math.log(1000))
-    by_points, by_observations = 0, 0
-    for _ in range(40):
-        ends = rng.uniform(-1, 1, (5, 2, 2))
-        steps = np.linspace(0, 1, 20)[None, :, None]
-        places = (ends[:, :1] + steps * (ends[:, 1:] - ends[:, :1])).reshape(100, 2)
-        groups = observations(places + 1e-3 * rng.standard_normal((100, 2)), 3e-3)
-        assert len(set(groups)) <= 15
-        for _ in range(50):
-            gap = np.repeat(rng.choice([-1.0, 1.0], 5), 20)
-            sums = np.bincount(groups, gap)
-            by_points += gap.sum() >= least * np.linalg.norm(gap)
-            by_observations += sums.sum() >= least * np.linalg.norm(sums)
-        assert len(set(observations(rng.uniform(-1, 1, (100, 2)), 3e-3))) > 90
-    assert by_points > 0.15 * 40 * 50
-    assert by_observations <= 0.001 * 40 * 50

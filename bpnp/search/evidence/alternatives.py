@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
-from bpnp.search.evidence.image_statistics import label_groups, observations
-from bpnp.search.evidence.uncertainty import Linearised, systematic_misfit
+from bpnp.search.evidence.image_statistics import label_groups
+from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
 
@@ -62,7 +62,11 @@ def misfit(linear: Linearised | None, count: float, rule: Evidence) -> Alternati
     count: of the matches. Where the focal length cannot be told, the camera is believed as it was given; where another
     one is significantly better and moves the middle of the scene by more than `rule.other_shift`, the pose is in doubt.
     """
-    off = systematic_misfit(linear, count, rule)
+    return of_misfit(systematic_misfit(linear, count, rule), rule)
+
+
+def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
+    """The alternative that is so far off; None where it is the same pose."""
     if math.degrees(off.turn) <= rule.other_deg and off.shift <= rule.other_shift:
         return None
     other = f"{off.zoom:.2f} times the focal length" if off.zoom != 1 else "other proportions of the scene"
@@ -75,12 +79,12 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
 
     The number of false alarms takes image points as independent. Points on lines or curves are not: a pose that lays
     one line onto another explains all of its points, and that it explains more of them than another pose does is then
-    chance. With d_b the evidence of the image points of one observation (`observations`: of a line, a clump, or one
-    point) for the one pose less that for the other, and either sign of each d_b as likely (Hoeffding 1963)
+    chance. With d_i the evidence of image point i for the one pose less that for the other, and either sign of each
+    d_i as likely (Hoeffding 1963)
 
-        P(sum_b d_b >= z sqrt(sum_b d_b^2)) <= exp(-z^2 / 2).
+        P(sum_i d_i >= z sqrt(sum_i d_i^2)) <= exp(-z^2 / 2).
 
-    Where even equal signs of all points would be no less likely than the lead asks for, there are too few to tell.
+    Where even equal signs of all d_i would be no less likely than the lead asks for, there are too few points to tell.
 
     A pose that sees half of its partners where the first one sees its own is compared by its false alarms alone: it is
     that pose, its mirror image, or repeats it in a repeated structure. Not so if it also explains points that the first
@@ -101,14 +105,11 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
         return None
     best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
     first = _partners(sets, limits.near, *(x[0] for x in (*poses, scales)))
-    places = sets.bearings[sets.image.chosen] @ sets.image.axes
-    blocks = observations(places, limits.together * float(scales[0]))
     for k in others.tolist():
         gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
-        if float(np.abs(gap).sum()) ** 2 < least * float((gap**2).sum()):
+        squared = float((gap**2).sum())
+        if float(np.abs(gap).sum()) ** 2 < least * squared:
             continue
-        sums = np.bincount(blocks, gap)
-        squared = float((sums**2).sum())
         other = _partners(sets, limits.near, *(x[k] for x in (*poses, scales)))
         reach = limits.near * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)

@@ -23,9 +23,9 @@ from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.false_alarms import directions_of, likeliest_scale, log10_tests
 from bpnp.search.evidence.partners import facing, partners
+from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.point_sets import SIGMAS, PointSets
-from bpnp.search.pool import against_repetitions
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
 from bpnp.search.sources.multistart import multistart
@@ -79,7 +79,7 @@ def judge_claim(
     candidates = with_false_alarms(replace(candidates, log10_false_alarms=np.full(len(candidates), math.nan)), one)
     result = judged(candidates, one, batches=looks, looks=looks, exhaustive=exhaustive, rule=rule)
     scene = Scene(one, seed, settings, deadline)
-    result = against_repetitions(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
+    result = against_rivals(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
     result = _of_claim(result, candidates[:1])
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # likelihoods, Wilks 1938

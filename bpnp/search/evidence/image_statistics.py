@@ -4,10 +4,6 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
-from scipy.special import bdtrc
 
 from bpnp.search.kernels.neighbours import sums_near
 from bpnp.search.settings import ImagePoints
@@ -68,43 +64,6 @@ def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float
     steps = np.triu(1 / np.maximum(together[:, :, None], crowded[:, None, :]))
     steps[:, :, 1:] -= steps[:, :, :-1]
     return np.asarray(steps)
-
-
-def observations(places: Array, reach: float, rule: ImagePoints = DEFAULT) -> Labels:
-    """Which of the image points (k, 2) are one observation, (k,): those of a straight line, and of a clump.
-
-    A line: through two points drawn at random, one after the other those with the most points that are left within
-    `reach`, as long as fewer than one of all that were drawn is expected to have so many by chance (Desolneux, Moisan,
-    Morel, Meaningful alignments, IJCV 2000); half of the drawn ones tell how likely a point lies on one by chance. A
-    clump: points within `reach` of each other, and those of others in turn.
-
-    >>> steps = np.linspace(0, 1, 20)[:, None]
-    >>> places = np.concatenate([steps * (1, 0.3), (0, 1) + steps * (1, 0.2), np.random.default_rng(0).random((9, 2))])
-    >>> groups = observations(places, 1e-3)
-    >>> len(set(groups[:20])), len(set(groups[20:40])), len(set(groups))
-    (1, 1, 11)
-    """
-    k = len(places)
-    near = cKDTree(places).query_pairs(reach, output_type="ndarray")
-    links = [near]
-    if k > 2:
-        rng = np.random.default_rng(0)
-        first, step = rng.integers(k, size=rule.lines), rng.integers(1, k, size=rule.lines)
-        along = places[(first + step) % k] - places[first]
-        across = np.stack([-along[:, 1], along[:, 0]], -1) / np.maximum(np.linalg.norm(along, axis=-1), 1e-300)[:, None]
-        on_line = np.abs(across @ places.T - (across * places[first]).sum(-1, keepdims=True)) < reach
-        chance = max(float(np.median(on_line.sum(1) - 2)) / k, 1 / k)
-        while True:
-            counts = on_line.sum(1)
-            best = int(counts.argmax())
-            if counts[best] < 3 or rule.lines * bdtrc(counts[best] - 3, k - 2, chance) >= 1:
-                break
-            members = np.flatnonzero(on_line[best])
-            links.append(np.stack([members[:-1], members[1:]], -1))
-            on_line[:, members] = False
-    i, j = np.concatenate(links).T
-    graph = coo_array((np.ones(len(i)), (i, j)), shape=(k, k))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
 
 
 def label_groups(

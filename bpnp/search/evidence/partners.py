@@ -1,5 +1,4 @@
-"""Which scene points may be the partners of image points under a pose, and whether another focal length explains the
-image points better than the given one."""
+"""Which scene points may be the partners of image points under a pose, and the focal length that fits it best."""
 
 import math
 from typing import Any, NamedTuple
@@ -17,17 +16,9 @@ FARTHEST = 4.0  # scales from an image point within which scene points may be it
 FEW_NEIGHBOURS, NEIGHBOURS = 8, 64  # of an image point that are looked up: of most, and where more are near
 DENSE = 4096  # possible matches up to which all distances are computed
 OUTLIERS = 0.3  # share of the image points without a partner that the assignment expects
-# Of the search for another focal length.
-ZOOMS = (1.0, 0.8, 1.25)  # to start from, over the given one
-ZOOMED = 256  # image points
-FEW_PARTNERS = 2  # scene points that may be the partner of each
-WIDTHS = (8.0, 4.0, 2.0, 1.0, 0.5, 0.25)  # of the residuals, in scales of the pose, one after the other
-STEPS = 2  # at each width
-CHECKED = 4.0  # width at which a way is left along which the points fit worse than they did
+FEW_PARTNERS = 2  # scene points that may be the partner of each, where the focal length is fitted
 MOST_ZOOM, SAME_ZOOM = 0.2, 0.01  # step of the logarithm, at most; change that is none
-BLOCKS = 8  # of the image, along a side
-MOST_NATS = 2.0  # that a block says
-CHANCE = 1e-3  # of a better fit
+MOST_ROUNDS = 4
 FITTED_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # of the residuals, for steps of a pose with its focal length
 
 
@@ -126,47 +117,17 @@ def _zoomed(
     return Zoomed(rotation, middle, zoom, every, products, gradient)
 
 
-def at_other_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:
-    """A pose and a focal length that explain the image points significantly better, None if none is met.
-
-    middle: (3,) of the scene, seen from the camera. Gauss-Newton steps of both, from the pose itself, and from other
-    focal lengths with the scene at the distance where it is seen as large, with wide scales first; a way along which
-    the points fit worse than they did is left.
-    Significant is a ratio of likelihoods of 1000, in which neighbouring image points, whose places in the scene may be
-    wrong together, are one observation: the logarithm is summed up over means in blocks, of at most `MOST_NATS` each.
-    """
-    count = len(sets.image.chosen)
-    chosen = sets.image.chosen[np.linspace(0, count - 1, min(count, ZOOMED)).astype(np.int64)]
-    blocks = _blocks(sets.bearings[chosen] @ sets.image.axes)
-    size, pose = np.bincount(blocks), (rotation, middle)
-    here, wide = (_zoomed(sets, chosen, width * scale, *pose, 1.0) for width in (1.0, CHECKED))
-    if here is None or wide is None:
-        return None
-    best, gained = None, -math.log(CHANCE)
-    for zoom in ZOOMS:
-        step = _zoomed(sets, chosen, WIDTHS[0] * scale, rotation, middle * (1, 1, zoom), zoom)
-        for width in WIDTHS if zoom != 1 else WIDTHS[WIDTHS.index(1.0) :]:
-            for _ in range(STEPS):
-                step = None if step is None else _stepped(sets, chosen, width * scale, step)
-            if step is None or (width == CHECKED and np.log(step.density / wide.density).sum() < 0):
-                break
-            if width <= 1:
-                if abs(math.log(step.zoom)) < SAME_ZOOM:
-                    break
-                gain = np.bincount(blocks, np.log(step.density / here.density)) / size
-                total = float(np.clip(gain, -MOST_NATS, MOST_NATS).sum())
-                if total > gained:
-                    best, gained = step, total
-    return best
-
-
 def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:
-    """A pose with residuals of `scale`, and the focal length that fits it best, after a few Gauss-Newton steps of both;
-    None if nothing matches. middle: (3,) of the scene, seen from the camera."""
+    """A pose with residuals of `scale`, and the focal length that fits it best, after Gauss-Newton steps of both until
+    the focal length stays; None if nothing matches. middle: (3,) of the scene, seen from the camera."""
     chosen = sets.image.chosen
     step = _zoomed(sets, chosen, FITTED_WIDTHS[0] * scale, rotation, middle, 1.0)
-    for width in FITTED_WIDTHS:
-        step = None if step is None else _stepped(sets, chosen, width * scale, step)
+    for _ in range(MOST_ROUNDS):
+        before = 0.0 if step is None else math.log(step.zoom)
+        for width in FITTED_WIDTHS:
+            step = None if step is None else _stepped(sets, chosen, width * scale, step)
+        if step is None or abs(math.log(step.zoom) - before) < SAME_ZOOM:
+            break
     return step
 
 
@@ -182,13 +143,3 @@ def _stepped(sets: PointSets, chosen: Labels, scale: float, at: Zoomed) -> Zoome
     turn = Rotation.from_rotvec(step[:3]).as_matrix()
     zoom = at.zoom * math.exp(float(np.clip(step[6], -MOST_ZOOM, MOST_ZOOM)))
     return _zoomed(sets, chosen, scale, turn @ at.rotation, at.middle + step[3:6], zoom)
-
-
-def _blocks(places: Array) -> Labels:
-    """The block of each place (m, 2) in the image: in strips, and along them, of equal counts."""
-    count = min(BLOCKS, max(1, math.isqrt(len(places))))
-    blocks = np.empty(len(places), np.int64)
-    for number, strip in enumerate(np.array_split(np.argsort(places[:, 0], kind="stable"), count)):
-        for place, block in enumerate(np.array_split(strip[np.argsort(places[strip, 1], kind="stable")], count)):
-            blocks[block] = number * count + place
-    return blocks

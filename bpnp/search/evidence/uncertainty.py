@@ -2,18 +2,16 @@
 residuals, and residuals that no pose explains, but another focal length or other proportions of the scene would."""
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
-from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.distinct_poses import turned_by
 from bpnp.search.evidence.partners import (
     Zoomed,
     across,
-    at_other_focal_length,
     by_focal_length,
     facing,
     partners,
@@ -40,8 +38,6 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # numbers that are fitted with every pose
-ZOOMED_LEAD = 3.0  # decades of false alarms by which it has to explain the points better
-ZOOMED_FROM = 24  # matches from which another focal length is looked for; with fewer the linear fit decides
 
 
 def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
@@ -243,15 +239,13 @@ class Misfit(NamedTuple):
 
 
 def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = DEFAULT.evidence) -> Misfit:
-    """What is significant in the residuals of a pose, `linearised`, with `count` matches: the largest step of three.
+    """What is significant in the residuals of a pose, `linearised`, with `count` matches: the largest step of two.
 
     - Beside the pose, five strains of the scene are fitted to the residuals, weighed with the probabilities of the
       partners. Of their principal directions, the pose eliminated, those count whose F statistic chance exceeds once in
       a thousand.
     - The same with the log of the focal length, once in a hundred (`rule.focal_chance`); with other partners too
       (`with_focal_length`), since those of a linear fit hold it back.
-    - Pose and focal length that explain the points better, with other partners, of `ZOOMED_FROM` matches or more:
-      `at_other_focal_length`, if it has a thousandth of the false alarms.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -278,14 +272,9 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
     pose_of = linear.sets, linear.rotation, linear.middle, linear.scale
-    others = [with_focal_length(*pose_of)] if found[0].zoom != 1 else []
-    if count >= ZOOMED_FROM:
-        other = at_other_focal_length(*pose_of)
-        others += [other] if other is not None and _decades_ahead(other, linear) >= ZOOMED_LEAD else []
-    for each in others:
-        if each is not None:
-            turn = math.acos(np.clip((np.trace(each.rotation @ linear.rotation.T) - 1) / 2, -1, 1))
-            found.append(Misfit(turn, float(np.linalg.norm(each.middle - linear.middle)) / distance, each.zoom))
+    other = with_focal_length(*pose_of) if found[0].zoom != 1 else None
+    if other is not None:
+        found.append(misfit_of(linear.rotation, linear.middle, other))
     return Misfit(
         max(each.turn for each in found),
         max(each.shift for each in found),
@@ -293,19 +282,10 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     )
 
 
-def _decades_ahead(other: Zoomed, linear: Linearised) -> float:
-    """Decades by which a pose with another focal length has fewer false alarms than the one with the given camera."""
-    sets, stretch = linear.sets, np.array([1 / other.zoom, 1 / other.zoom, 1.0])
-    bearings = sets.bearings * stretch
-    zoomed = replace(sets, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
-    alarms = [
-        float(alarms_of(one, pose.rotation[None], (pose.middle - pose.rotation @ sets.middle)[None], scale).own[0])
-        for one, pose, scale in (
-            (sets, linear, np.array([linear.scale])),
-            (zoomed, other, np.array([linear.scale / other.zoom])),
-        )
-    ]
-    return alarms[0] - alarms[1]
+def misfit_of(rotation: Array, middle: Array, other: Zoomed) -> Misfit:
+    """How far a pose with another focal length is from a pose that sees the middle of the scene at (3,)."""
+    shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
+    return Misfit(turned_by(rotation, other.rotation), shift, other.zoom)
 
 
 def _moved(products: Array, pose: Array, fitted: slice, free: float, chance: float) -> tuple[Array, Array]:
