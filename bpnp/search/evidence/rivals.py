@@ -34,7 +34,9 @@ def against_rivals(
     exhaustive: bool = False,
 ) -> SearchResult:
     """A confident result once more, beside the poses that a repeated structure would confuse with it, and beside those
-    at other focal lengths; if one of the former is better, so is that one."""
+    at other focal lengths; if one of the former is better, so is that one.
+
+    The camera is believed as it was given unless another focal length has fewer false alarms by `rule.lead` decades."""
     result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
     if result.verdict != "confident" or sets.focal is not None:
         return result
@@ -44,7 +46,7 @@ def against_rivals(
     rotation, translation = result.best
     middle = rotation @ sets.middle + translation
     for other in _at_other_focal_lengths(result, sets, middle, entered, rule):
-        if other is not None and _alarms(sets, other, rule) < result.log10_false_alarms:
+        if other is not None and _alarms(sets, other, rule) < result.log10_false_alarms - rule.lead:
             better = of_misfit(misfit_of(rotation, middle, other), rule)
             if better is not None:
                 chance = result.reason.split(", and no alternative")[0]
