@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.alternatives import contesting, misfit, number, other_pose, rougher
+from bpnp.search.evidence.alternatives import Seen, contesting, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.uncertainty import focal_bound, linearised, rotation_bound
 from bpnp.search.evidence.unseen import log10_missed
@@ -109,11 +109,13 @@ def judged(
     looks: int = 0,
     exhaustive: bool = False,
     rule: Evidence = DEFAULT.evidence,
+    rig: Seen = (),
 ) -> SearchResult:
     """The verdict on candidates in the user's coordinates, best first.
 
     looks: how often the surroundings of the best one were searched in vain. exhaustive: whether every pose that fits
-    some points was looked at, so that none is unseen.
+    some points was looked at, so that none is unseen. rig: the candidates, best first, and the points of all cameras of
+    a rig, of which `sets` has one.
     """
     if not len(candidates):
         return no_pose("no pose was found", batches, settled=exhaustive)
@@ -141,7 +143,7 @@ def judged(
             )
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         known = f"; its rotation is known to {off:.1g} deg, but for one case in a thousand"
-        against += [misfit(linear, count, rule), contesting(candidates, sets, rule)]
+        against += [misfit(linear, count, rule), contesting(rig or [(candidates, sets)], rule)]
     doubts = [one for one in against if one is not None and one.decades < rule.lead]
     if certain and not doubts:
         return SearchResult(candidates, "confident", f"{chance}, and no alternative comes near{known}", batches, True)

@@ -69,6 +69,19 @@ def test_many_points_are_searched_and_joined() -> None:
     assert solution.log10_false_alarms < one.log10_false_alarms - 20
 
 
+def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
+    """0.8 pixels, far above the smallest that is believed; points without a partner contest it in no camera alone."""
+    for seed in (0, 3):
+        images, scene, mounts, pose, _ = planted_rig(seed, (60, 60, 60), points=150)
+        rng = np.random.default_rng(seed)
+        noisy = [image + 0.8 * rng.standard_normal(image.shape) for image in images]
+        images = [np.concatenate([image, rng.uniform(image.min(0), image.max(0), (60, 2))]) for image in noisy]
+        solution = bpnp.solve(images, scene, [CAMERA] * 3, rig=mounts, time_limit=60)
+        assert solution.verdict == "confident"
+        assert solution.log10_false_alarms < -80
+        assert degrees_between(solution.rotation, pose[0]) < 0.5
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

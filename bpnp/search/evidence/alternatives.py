@@ -6,6 +6,7 @@ then other poses like those that were met.
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,9 @@ from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
+
+
+Seen = Sequence[tuple[Candidates, PointSets]]
 
 
 class Alternative(NamedTuple):
@@ -74,7 +78,7 @@ def of_misfit(off: Misfit, rule: Evidence) -> Alternative | None:
     return Alternative(-math.inf, f"with {other} they fit significantly better, {away}")
 
 
-def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alternative | None:
+def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
     """The far candidate over which the first one leads least, if points that depend on each other are counted once.
 
     The number of false alarms takes image points as independent. Points on lines or curves are not: a pose that lays
@@ -90,27 +94,30 @@ def contesting(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
     that pose, its mirror image, or repeats it in a repeated structure. Not so if it also explains points that the first
     one does not, half as many as it leaves unexplained: both then slide along a curve.
 
+    seen: the candidates and the points of a camera, of each camera of a rig; those with too few points are left out.
+
     Source: W. Hoeffding, Probability inequalities for sums of bounded random variables, JASA 1963.
     """
-    poses, limits = (candidates.rotation, candidates.translation), rule.contested
-    others = np.flatnonzero(~sets.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
-    least = 2 * math.log(10) * rule.lead
-    if not len(others) or len(sets.image.chosen) < least:
+    limits, least = rule.contested, 2 * math.log(10) * rule.lead
+    seen = [(candidates, sets) for candidates, sets in seen if len(sets.image.chosen) >= least]
+    if not seen:
         return None
-    scales = np.maximum(candidates.scale, sets.image.scales[0])
+    candidates, sets = seen[0]
+    poses, chosen = (candidates.rotation, candidates.translation), sum(len(each.image.chosen) for _, each in seen)
+    others = np.flatnonzero(~sets.same_pose(*poses, limits.far * rule.other_deg, limits.far * rule.other_shift))
     # A lead that would be no chance if all gaps were as large as they can be needs no second look.
-    decisive = limits.most * math.sqrt(least * len(sets.image.chosen)) / math.log(10)
+    decisive = limits.most * math.sqrt(least * chosen) / math.log(10)
     others = others[candidates.log10_false_alarms[others] - candidates.log10_false_alarms[0] < decisive]
     if not len(others):
         return None
-    best = own_evidence(sets, *(x[0] for x in (*poses, scales)))
-    first = _partners(sets, limits.near, *(x[0] for x in (*poses, scales)))
+    scales = np.maximum(candidates.scale, sets.image.scales[0])
+    best, first = _explained(seen, 0, scales[0], limits.near)
     for k in others.tolist():
-        gap = best - own_evidence(sets, *(x[k] for x in (*poses, scales)))
+        evidence, other = _explained(seen, k, scales[k], limits.near)
+        gap = best - evidence
         squared = float((gap**2).sum())
         if float(np.abs(gap).sum()) ** 2 < least * squared:
             continue
-        other = _partners(sets, limits.near, *(x[k] for x in (*poses, scales)))
         reach = limits.near * max(scales[0], scales[k]) * np.linalg.norm(first.places, axis=-1)
         same = (first.points == other.points) | (np.linalg.norm(first.places - other.places, axis=-1) < reach)
         alone, others_alone = int((first.near & ~other.near).sum()), int((other.near & ~first.near).sum())
@@ -141,7 +148,15 @@ class _Partners(NamedTuple):
     near: NDArray[np.bool_]
 
 
-def _partners(sets: PointSets, near: float, rotation: Array, translation: Array, scale: float) -> _Partners:
+def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _Partners]:
+    """The evidence of the image points of all cameras for candidate k, with residuals of a scale, and their partners
+    within `near` scales."""
+    poses = [(sets, candidates.rotation[k], candidates.translation[k], scale) for candidates, sets in seen]
+    parts = zip(*(_partners(near, *pose) for pose in poses), strict=True)
+    return np.concatenate([own_evidence(*pose) for pose in poses]), _Partners(*map(np.concatenate, parts))
+
+
+def _partners(near: float, sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
     seen, chosen = directions_of(sets, rotation, translation), sets.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
     for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, len(seen)):

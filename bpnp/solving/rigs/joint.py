@@ -6,7 +6,7 @@ cameras together, for each of them proposes poses from its own triples.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -30,7 +30,7 @@ Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all cameras that are refined
 WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
-COOLING, STEPS = 0.6, 9  # from a scale to the next one, and Gauss-Newton steps
+STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the last of them that are weighed
 
 
 class Rig:
@@ -50,6 +50,12 @@ class Rig:
         turn, shift = self.mounts[k]
         return turn.T @ rotation, (translation - shift) @ turn
 
+    def seen(self, k: int, poses: Candidates) -> Candidates:
+        """Poses of the rig as those of camera k, whose alternatives that need a derivative are asked of one camera."""
+        turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
+        share = poses.matched / min(len(self.sets[k].bearings), len(self.sets[k].points3d))
+        return replace(poses, rotation=turns, translation=shifts, matched=share)
+
     def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
         """Each camera that sees a point near an image point, and the turn (6, 6) of a step of the rig into its axes."""
         found = []
@@ -59,26 +65,23 @@ class Rig:
                 found.append((np.asarray(np.kron(np.eye(2), self.mounts[k][0]), np.float64), linear))
         return found
 
-    def refined(self, rotation: Array, translation: Array) -> tuple[Array, Array, float, float]:
-        """The optimum beside a pose, the scale of its residuals, radians, and the expected number of its matches."""
-        scale, middle, count = WIDE * self.floor, self.sets[0].middle, 0.0
-        for _ in range(STEPS):
-            information, gradient, squared, count = 1e-9 * np.eye(6), np.zeros(6), 0.0, 0.0
+    def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
+        """The optimum beside a pose at ever smaller scales, radians, with that scale and the number of matches."""
+        middle = self.sets[0].middle
+        for scale in np.geomspace(WIDE, 1.0, STEPS) * self.floor:
+            information, gradient, count = 1e-9 * np.eye(6), np.zeros(6), 0.0
             for turn, linear in self.linearised(rotation, translation, scale):
                 rows = linear.jacobian @ turn
                 information = information + np.einsum("k,kia,kib->ab", linear.probability, rows, rows)
                 gradient = gradient + np.einsum("k,kia,ki->a", linear.probability, rows, linear.residual)
-                squared += float(linear.probability @ (linear.residual**2).sum(-1)) * scale**2
                 count += float(linear.probability.sum()) * len(linear.sets.bearings) / len(linear.sets.image.chosen)
             if count <= 3:
-                break
+                return
             step = np.linalg.solve(information, gradient)
             moved = rotation @ middle + translation + step[3:]
             rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
             translation = moved - rotation @ middle
-            own = math.sqrt(squared / max(2 * count - 6, 1.0))
-            scale = max(self.floor, min(COOLING * scale, own) if own < scale else COOLING * scale)
-        return rotation, translation, scale, count
+            yield rotation, translation, float(scale), count
 
     def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
         """log10 of the number of false alarms at the scale of the residuals, and at rougher ones."""
@@ -106,41 +109,50 @@ def search_rig(
     rig: Rig, *, clutter: float | None, seed: int, deadline: Deadline, settings: SearchSettings = DEFAULT
 ) -> SearchResult:
     """Distinct poses of the rig, best first, and the verdict on the first one."""
-    rotations, translations, hits, exhaustive = [], [], [], True
+    rotations, translations, hits, sure, exhaustive = [], [], [], [], True
     for k, sets in enumerate(rig.sets):
         until = Deadline((Deadline.after(0.0).at * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k))
         if is_enumerable(sets):
             radius = ENUMERATION.radius if sets.floor is None else ENUMERATION.floors * sets.floor
-            rule = replace(ENUMERATION, kept=PROPOSED)
-            poses = enumerate_poses(sets, radius=radius, deadline=until.at, is_safe=lambda _: False, settings=rule)
+            chosen = replace(ENUMERATION, kept=PROPOSED)
+            poses = enumerate_poses(sets, radius=radius, deadline=until.at, is_safe=lambda _: False, settings=chosen)
             exhaustive &= poses.ended == "exhausted"
-            proposed, own = (poses.rotation, poses.translation), np.zeros(len(poses.rotation), np.int64)
+            proposed, starts = (poses.rotation, poses.translation), np.zeros(len(poses.rotation), np.int64)
         else:
-            found = search_poses(sets, clutter=clutter, seed=seed, deadline=until, settings=settings).candidates
-            proposed, own, exhaustive = (found.rotation, found.translation), found.hits, False
+            result = search_poses(sets, clutter=clutter, seed=seed, deadline=until, settings=settings)
+            found, exhaustive = result.candidates, False
+            proposed, starts = (found.rotation, found.translation), found.hits
+            sure += [rig.rig_of(k, found.rotation[:1], found.translation[:1])] * (result.verdict == "confident")
         rotation, translation = rig.rig_of(k, *proposed)
         rotations.append(rotation)
         translations.append(translation)
-        hits.append(own)
+        hits.append(starts)
     rotation, translation = np.concatenate(rotations), np.concatenate(translations)
-    if not len(rotation):
-        return no_pose("no pose was found")
     order = np.argsort(-_screened(rig, rotation, translation), kind="stable")[:REFINED]
     found = _candidates(rig, rotation[order], translation[order], np.concatenate(hits)[order])
-    best = int(np.argmin(found.log10_false_alarms))
-    pose = found.rotation[best], found.translation[best]
-    strongest = max(range(len(rig.sets)), key=lambda k: len(rig.sets[k].bearings))
-    sets, scale = rig.sets[strongest], float(found.scale[best])
-    (turns, shifts), _ = repeated_poses(sets, *rig.pose_of(strongest, *pose), scale, settings.evidence)
-    if len(turns):
-        repeated = _candidates(rig, *rig.rig_of(strongest, turns, shifts), np.zeros(len(turns), np.int64))
-        found = Candidates.concatenated([found, repeated])
+    if not len(found):
+        return no_pose("no pose was found")
     found = found[np.argsort(found.log10_false_alarms, kind="stable")]
-    # The alternatives that need the derivative of one camera are asked of the one with most points.
-    turns, shifts = rig.pose_of(strongest, found.rotation, found.translation)
-    share = found.matched / min(len(sets.bearings), len(sets.points3d))
-    seen = replace(found, rotation=turns, translation=shifts, matched=share)
-    result = judged(seen, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
+    strongest = max(range(len(rig.sets)), key=lambda k: len(rig.sets[k].bearings))
+    best = rig.pose_of(strongest, found.rotation[0], found.translation[0])
+    (turns, shifts), _ = repeated_poses(rig.sets[strongest], *best, float(found.scale[0]), settings.evidence)
+    repeated = _candidates(rig, *rig.rig_of(strongest, turns, shifts), np.zeros(len(turns), np.int64))
+    found = Candidates.concatenated([found, repeated])
+    found = found[np.argsort(found.log10_false_alarms, kind="stable")]
+    rule = settings.evidence
+    same = rig.sets[0].same_pose(*rig.pose_of(0, found.rotation, found.translation), rule.other_deg, rule.other_shift)
+    found.hits[0] = found.hits[same].sum()  # of the cameras, which search for themselves
+    for turn, shift in sure:  # nothing better than this pose was missed
+        both = np.concatenate([found.rotation[:1], turn]), np.concatenate([found.translation[:1], shift])
+        exhaustive |= bool(rig.sets[0].same_pose(*rig.pose_of(0, *both), rule.other_deg, rule.other_shift)[1])
+    result = judged(
+        rig.seen(strongest, found),
+        rig.sets[strongest],
+        batches=0,
+        exhaustive=exhaustive,
+        rule=rule,
+        rig=[(rig.seen(k, found), sets) for k, sets in enumerate(rig.sets)],
+    )
     turns, shifts = rig.rig_of(strongest, result.candidates.rotation, result.candidates.translation)
     return replace(result, candidates=replace(result.candidates, rotation=turns, translation=shifts))
 
@@ -160,12 +172,17 @@ def _screened(rig: Rig, rotations: Array, translations: Array) -> Array:
 
 
 def _candidates(rig: Rig, rotations: Array, translations: Array, hits: NDArray[np.int64]) -> Candidates:
-    """Poses refined on all cameras, with their false alarms; `matched` is their expected number of matches."""
-    ends = [rig.refined(r, t) for r, t in zip(rotations, translations, strict=True)]
-    alarms = np.array([rig.alarms(r, t, scale) for r, t, scale, _ in ends])
-    start = Candidates.unscored(np.stack([end[0] for end in ends]), np.stack([end[1] for end in ends]))
-    counts, scales = np.array([end[3] for end in ends]), np.array([end[2] for end in ends])
-    own, rough = alarms.T
+    """Poses refined on all cameras to the scale at which their false alarms are fewest, those that end together as one;
+    `matched` is their expected number of matches."""
+    ends = []
+    for k in range(len(rotations)):
+        weighed = [(*rig.alarms(*end[:3]), *end) for end in [*rig.refined(rotations[k], translations[k])][-WEIGHED:]]
+        if weighed:
+            ends.append((*min(weighed, key=lambda each: each[0]), int(hits[k])))
+    if not ends:
+        return Candidates.none()
+    own, rough, turns, shifts, scales, counts, known = map(np.array, zip(*ends, strict=True))
     return replace(
-        start, matched=counts, scale=scales, hits=hits, score=-own, log10_false_alarms=own, log10_rough=rough
-    )
+        Candidates.unscored(turns, shifts),
+        matched=counts, scale=scales, hits=known, score=-own, log10_false_alarms=own, log10_rough=rough,
+    )  # fmt: skip
