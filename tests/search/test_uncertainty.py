@@ -235,3 +235,22 @@ def test_a_focal_length_needs_no_more_points_than_its_own_fit() -> None:
             believed.append(np.degrees((Rotation.from_matrix(solution.rotation) * turn.inv()).magnitude()))
     assert len(believed) <= 1  # the test is one at a thousandth: seven points cannot tell more
     assert all(error < 3 for error in believed)
+
+
+def test_points_between_two_partners_leave_what_the_others_say() -> None:
+    """Far enough from both, they bend the likelihood the other way, more strongly than matches do theirs."""
+    scale, rng, ahead = 2e-3, np.random.default_rng(5), np.array([0, 0, 6.0])
+    single = rng.uniform(-1, 1, (30, 3)) + ahead
+    seen = directions(single)
+    seen = directions(seen + scale * np.cross(seen, rng.standard_normal((30, 3))))
+    places = rng.uniform(-1, 1, (20, 3)) + ahead
+    aside = 3.2 * scale * directions(np.cross(places, rng.standard_normal((20, 3))))
+    depth = np.linalg.norm(places, axis=-1, keepdims=True)
+    scene = np.concatenate([single, places + depth * aside, places - depth * aside])
+    every = PointSets(np.concatenate([seen, directions(places)]), scene)
+    found, known = (
+        local_covariance(linearised(sets, np.eye(3), np.zeros(3), scale)) for sets in (every, PointSets(seen, single))
+    )
+    assert found is not None
+    assert known is not None
+    assert 1 <= np.sqrt(np.trace(found[:3, :3]) / np.trace(known[:3, :3])) < 2

@@ -126,13 +126,24 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
     where scene points lie as close as the residuals, what their partners leave open is subtracted. What a prior knows
     of the pose counts as a measurement beside the points. The sandwich H^-1 (sum_i g_i g_i^T) H^-1 (White 1982) allows
     for residuals that are not as the model says. With H^-1 = L L^T, the larger of both counts along each of the common
-    axes, the eigenvectors of L^T (sum_i g_i g_i^T) L.
+    axes, the eigenvectors of L^T (sum_i g_i g_i^T) L. Where H is not positive definite, since points that lie between
+    two partners outweigh the others, that of half the variance s^2 counts, at which fewer have two, times two.
 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     H. White, Maximum likelihood estimation of misspecified models, Econometrica 1982.
     """
     if linear is None:
         return None
+    covariance = _of_louis(linear)
+    if covariance is not None:
+        return covariance
+    sharper = linearised(linear.sets, linear.rotation, linear.translation, linear.scale / math.sqrt(2))
+    covariance = None if sharper is None else _of_louis(sharper)
+    return None if covariance is None else 2 * covariance
+
+
+def _of_louis(linear: "Linearised") -> Array | None:
+    """See `local_covariance`; None where the information is not positive definite."""
     sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
     rows = (np.sqrt(probability)[:, None, None] * linear.jacobian).reshape(-1, linear.jacobian.shape[-1])
