@@ -3,8 +3,8 @@
     python -m benchmarks stars --limit 250 --only "2000, 20 deg" noise
 
 Right is a rotation within 0.2 degrees. Every tenth frame has a new catalogue, which is why p50 is without its index.
-noise, mirror: images of no sky, where every confident answer is wrong. wrong focal: off by 0.3 to 20 %. --peers:
-tetra3rs too, where it is installed.
+noise, mirror: images of no sky, where every confident answer is wrong. wrong focal: off by 0.3 to 20 %; unknown
+focal: known to a tenth. --peers: tetra3rs too, where it is installed.
 """
 
 import importlib
@@ -32,6 +32,7 @@ NARROW, IN_VIEW = (
     15.0,
 )  # degrees up to which a catalogue covers a belt of the sky in which a field has so many stars
 FOCAL = (0.8, 0.95, 0.98, 1.003, 1.02, 1.05, 1.2)
+FOCAL_ERROR = 0.1
 
 
 class Frame(NamedTuple):
@@ -100,9 +101,10 @@ def frame(count: int, field: float, seed: int, i: int) -> Frame:
     return Frame(rng.permutation(np.concatenate([found, others])), directions, rotation, field)
 
 
-def by_search(shown: Frame, seed: int, factor: float = 1.0) -> bpnp.Solution:
+def by_search(shown: Frame, seed: int, factor: float = 1.0, focal_error: float | None = None) -> bpnp.Solution:
+    about = camera(shown.field, factor)
     return bpnp.solve(
-        shown.pixels, shown.directions, camera(shown.field, factor), at_infinity=True, seed=seed, time_limit=60
+        shown.pixels, shown.directions, about, at_infinity=True, focal_error=focal_error, seed=seed, time_limit=60
     )
 
 
@@ -110,7 +112,7 @@ def outcomes(count: int, field: float, limit: int, seed: int, kind: str = "") ->
     """Of true fields, or of what a confident answer to is wrong: nothing is right there."""
     rows = []
     for i in range(limit):
-        shown, factor = frame(count, field, seed, i), 1.0
+        shown, factor, error = frame(count, field, seed, i), 1.0, None
         if kind == "noise":
             places = anywhere(np.random.default_rng([seed, i]), len(shown.pixels), field)
             shown = shown._replace(pixels=places, rotation=np.full((3, 3), np.nan))
@@ -119,7 +121,9 @@ def outcomes(count: int, field: float, limit: int, seed: int, kind: str = "") ->
             shown = shown._replace(pixels=mirrored, rotation=np.full((3, 3), np.nan))
         elif kind == "wrong focal":
             factor = FOCAL[i % len(FOCAL)]
-        rows.append(solved(f"{i}", shown.rotation, np.zeros(3), partial(by_search, shown, i, factor)))
+        elif kind == "unknown focal":
+            factor, error = np.exp(FOCAL_ERROR * np.random.default_rng([seed, i]).standard_normal()), FOCAL_ERROR
+        rows.append(solved(f"{i}", shown.rotation, np.zeros(3), partial(by_search, shown, i, factor, error)))
     times = [row.cpu_seconds for row in rows]
     print(f"p50 {1000 * np.median(times):.0f} ms, p95 {1000 * np.percentile(times, 95):.0f} ms", end="; ")
     return rows
@@ -169,7 +173,7 @@ def rows(limit: int, seed: int, *, peers: bool) -> Iterator[tuple[str, Callable[
             yield f"{count}, {field:.0f} deg", partial(outcomes, count, field, limit, seed)
             if peers and field < WIDE:
                 yield f"tetra3rs: {count}, {field:.0f} deg", partial(by_tetra, count, field, limit, seed)
-    for kind in ("noise", "mirror", "wrong focal"):
+    for kind in ("noise", "mirror", "wrong focal", "unknown focal"):
         for field in FIELDS:
             yield f"{kind}, {field:.0f} deg", partial(outcomes, CATALOGUES[0], field, limit, seed, kind)
 

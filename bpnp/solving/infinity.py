@@ -3,16 +3,20 @@
 import math
 import time
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
-from bpnp.cameras import Camera, camera_from, in_front
+from bpnp.cameras import Camera, camera_from, in_front, zoomed_camera
 from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.search.infinity.evidence import how_well_known
+from bpnp.search.evidence.uncertainty import ONE_SIGMA
+from bpnp.search.infinity.evidence import Known, how_well_known
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
-from bpnp.search.infinity.settings import DEFAULT
+from bpnp.search.infinity.settings import DEFAULT, InfinitySettings
 from bpnp.solving.arguments import (
     UNIT_NORM,
     Array,
@@ -24,6 +28,7 @@ from bpnp.solving.arguments import (
     one_row_each,
     unit_bearings,
 )
+from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.matches import SCALES, count_one_to_one, one_to_one
 from bpnp.solving.problem import Unit
 from bpnp.solving.solution import Candidate, Solution, SolutionStats
@@ -44,6 +49,7 @@ def solve_directions(
     directions: Any,
     camera: Any,
     *,
+    unknown: UnknownCamera | None = None,
     scores2d: Any,
     inlier_threshold: float | None,
     seed: int,
@@ -51,12 +57,15 @@ def solve_directions(
 ) -> Solution:
     """The rotation under which unit directions (n, 3) are seen at image points; arguments as for `bpnp.solve`.
 
+    unknown: of a camera whose focal length is looked for: at focal lengths so near to each other that points half an
+    image from its middle stay within reach, at a rougher noise; then fitted to the matches, and searched again there.
+
     Raises ValueError for wrong shapes, fewer than 3 points, directions that are not unit vectors, pixels without a
     camera or the reverse.
     """
     begun, deadline = time.perf_counter(), Deadline.after(time_limit)
     image, scene = keypoints(points2d, ""), one_row_each(numbers("points3d", directions, ""))
-    lens = None if camera is None else camera_from(camera)
+    lens = unknown.reference if unknown is not None else None if camera is None else camera_from(camera)
     check_points("points2d", image, (2, 3) if lens is None else (2,), FEWEST, "")
     check_points("points3d", scene, (3,), FEWEST, "")
     length = np.linalg.norm(scene, axis=-1)
@@ -68,6 +77,70 @@ def solve_directions(
         )
     scene = np.ascontiguousarray(scene / length[:, None])
     scores = checked_scores("scores2d", scores2d, len(image), "")
+    known = Given(image, scene, scores, inlier_threshold, seed, begun)
+    if unknown is None:
+        return _seen_by(lens, known, deadline)
+    best = None
+    for rung in unknown.ladder(DEFAULT.zoom):
+        found = _seen_by(rung, known, deadline, unknown, DEFAULT.of_a_rung())
+        camera = rung
+        for _ in range(DEFAULT.zoom_rounds if found.verdict != "failed" else 0):
+            before, camera = camera.focal, _fitted(camera, known, found)
+            found = _seen_by(camera, known, deadline, unknown)
+            if not found.found or abs(camera.focal / before - 1) < DEFAULT.zoom_same:
+                break
+        if best is None or found.log10_false_alarms < best.log10_false_alarms:
+            best = found
+        if best.verdict == "confident" or deadline.passed():
+            break
+    assert best is not None  # a ladder has a rung
+    return best
+
+
+class Given(NamedTuple):
+    """Of one problem, checked: image points (m, 2), unit directions (n, 3), and options of `bpnp.solve`; when it was
+    begun."""
+
+    image: Array
+    scene: Array
+    scores: Array | None
+    inlier_threshold: float | None
+    seed: int
+    begun: float
+
+
+def _fitted(camera: Camera, known: Given, solution: Solution) -> Camera:
+    """The camera with the focal length that fits the matches best, with a turn beside it."""
+    pixels, seen = known.image[solution.matches[:, 0]], known.scene[solution.matches[:, 1]] @ solution.rotation.T
+
+    def residuals(step: Array) -> Array:
+        bearings, _, pixel = _bearings(pixels, zoomed_camera(camera, math.exp(step[3])))
+        off = bearings - Rotation.from_rotvec(step[:3]).apply(seen)
+        return np.asarray((off / pixel[:, None]).ravel())
+
+    return zoomed_camera(camera, math.exp(least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.01).x[3]))
+
+
+def _with_focal_length(camera: Camera, pixels: Array, seen: Array, known: Known) -> Array:
+    """Covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions `seen` (k, 3)."""
+    step = 1e-5
+    ends = [_bearings(pixels, zoomed_camera(camera, math.exp(sign * step))) for sign in (1, -1)]
+    turned = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2)
+    rows = np.concatenate([turned, (ends[1][0] - ends[0][0])[:, :, None] / (2 * step)], -1) / ends[0][2][:, None, None]
+    rows = rows.reshape(-1, 4) * [1, 1, 1, 1 / camera.focal]
+    free = max(2 * len(seen) - 4, 1)
+    return np.asarray((known.noise * stdtrit(free, ONE_SIGMA)) ** 2 * np.linalg.pinv(rows.T @ rows, rcond=1e-15))
+
+
+def _seen_by(
+    lens: Camera | None,
+    given: Given,
+    deadline: Deadline,
+    unknown: UnknownCamera | None = None,
+    settings: InfinitySettings = DEFAULT,
+) -> Solution:
+    """The rotation of a camera. unknown: the cameras of which it is one."""
+    image, scene, inlier_threshold = given.image, given.scene, given.inlier_threshold
     unit: Unit = "rad" if image.shape[1] == 3 else "normalised" if lens is None else "px"
     bearings, plane, pixel = _bearings(image, lens)
     usable = np.flatnonzero(np.isfinite(bearings).all(-1) & np.isfinite(pixel))
@@ -76,15 +149,17 @@ def solve_directions(
     bearings, pixel = np.ascontiguousarray(bearings[usable]), np.ascontiguousarray(pixel[usable])
     middle = float(np.median(pixel))  # radians a pixel
     per_radian = 1.0 if lens is None else 1 / middle
-    noise = None if inlier_threshold is None else inlier_threshold / per_radian / middle / DEFAULT.reach
+    noise = None if inlier_threshold is None else inlier_threshold / per_radian / middle / settings.reach
     with one_blas_thread:
         result = search_rotation(
             Image(bearings, pixel),
             scene,
-            scores=None if scores is None else scores[usable],
-            noise=noise,
-            seed=seed,
+            scores=None if given.scores is None else given.scores[usable],
+            noise=noise if settings is DEFAULT else None,
+            zooms=0.0 if unknown is None else math.log(unknown.largest / unknown.smallest),
+            seed=given.seed,
             deadline=deadline,
+            settings=settings,
         )
     failed = Solution(
         verdict="failed",
@@ -92,7 +167,7 @@ def solve_directions(
         unit=unit,
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,
         stats=SolutionStats(result.turns, dropped2d=len(image) - len(usable)),
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - given.begun,
         points2d=plane,
         points3d=scene,
         camera=lens,
@@ -106,6 +181,11 @@ def solve_directions(
     matches = one_to_one(bearings, seen[0], threshold / per_radian)
     i, j = matches.T
     known = how_well_known(seen[0][j], bearings[i], pixel[i], bearings)
+    covariance = (
+        known.covariance
+        if unknown is None or lens is None
+        else _with_focal_length(lens, image[usable[i]], seen[0][j], known)
+    )
     sine = np.linalg.norm(np.cross(bearings[i], seen[0][j]), axis=-1)
     angles = np.arctan2(sine, (bearings[i] * seen[0][j]).sum(-1))
     counts = [len(matches), *(count_one_to_one(bearings, each, threshold / per_radian) for each in seen[1:])]
@@ -119,7 +199,7 @@ def solve_directions(
         inlier_threshold=threshold,
         reprojection_error=float((angles * per_radian).mean()) if len(matches) else math.nan,
         reprojection_error_deg=float(np.degrees(angles.mean())) if len(matches) else math.nan,
-        covariance=np.full((3, 3), math.nan) if result.verdict == "failed" else known.covariance,
+        covariance=np.full_like(covariance, math.nan) if result.verdict == "failed" else covariance,
         candidates=tuple(
             Candidate(
                 one.rotation, np.zeros(3), float(one.decades.mean() * math.log(10)), count, one.log10_false_alarms
@@ -129,7 +209,7 @@ def solve_directions(
         verdict=result.verdict,
         log10_false_alarms=best.log10_false_alarms,
         stats=SolutionStats(result.turns, residual * middle, result.verdict == "confident", failed.stats.dropped2d),
-        seconds=time.perf_counter() - begun,
+        seconds=time.perf_counter() - given.begun,
     )
 
 

@@ -133,7 +133,7 @@ class Solution:
     @property
     def centre_std(self) -> float:
         """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
-        if len(self.covariance) == ROTATION:
+        if len(self.covariance) in (ROTATION, ROTATION + 1):
             return math.nan
         return _largest(centre_covariance(self.covariance, self.translation))
 
@@ -145,7 +145,7 @@ class Solution:
     @property
     def focal_length_std(self) -> float:
         """Standard deviation of a focal length that was found, pixels; 0 for one that was given."""
-        return math.sqrt(self.covariance[6, 6]) if len(self.covariance) == 7 else 0.0
+        return math.sqrt(self.covariance[-1, -1]) if len(self.covariance) in (ROTATION + 1, 7) else 0.0
 
     @property
     def found(self) -> bool:

@@ -91,7 +91,7 @@ def solve(
         of the other points is believed sooner.
     at_infinity: `points3d` are unit directions, such as of stars: the rotation alone is found, and the translation is
         zero. Pixels of a fisheye may lie 90 degrees and more off its axis. Points with the largest `scores2d` are tried
-        first. See docs/stars.md.
+        first. An `image_size` or `focal_error` is for an unknown focal length here too. See docs/stars.md.
     rig: cam_from_rig, (3, 4), (4, 4) or (R, t), of each of several cameras that are fixed to each other. `points2d` and
         `labels2d` are then lists with one array each, `camera` too or one for all; the pose is rig_from_world, in the
         unit of the rig and of the scene, and `matches` count the 2D points of one camera after those of the other.
@@ -118,8 +118,6 @@ def solve(
     if at_infinity:
         module = None if solver in ("auto", "search") else solver
         refuse_at_infinity(
-            image_size=image_size,
-            focal_error=focal_error,
             distortion=distortion or None,
             normals3d=normals3d,
             labels2d=labels2d,
@@ -134,6 +132,9 @@ def solve(
             pixels_from(points2d, camera),
             points3d,
             camera,
+            unknown=None
+            if image_size is None and focal_error is None
+            else unknown_camera(camera, image_size, focal_error),
             scores2d=scores2d,
             inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
             seed=seed,

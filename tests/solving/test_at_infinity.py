@@ -125,6 +125,34 @@ def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float) -> N
             assert solution.verdict != "confident" or turned(solution.rotation, rotation) < 0.1
 
 
+@pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 1.3), (12.0, 4000, 0.85), (180.0, 300, 1.1)])
+def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count: int, factor: float) -> None:
+    image, directions, rotation, _ = sky(4, field=field, count=count)
+    model, params = lens(field)
+    rough = model, (*(factor * x if k < 1 + (field > 100) else x for k, x in enumerate(params)),)
+    solution = look(image, directions, rough, focal_error=0.1)
+    assert solution.verdict == "confident", solution.reason
+    assert turned(solution.rotation, rotation) < 0.05
+    assert solution.covariance.shape == (4, 4)
+    assert abs(solution.focal_length - params[0]) < 4 * solution.focal_length_std < 0.002 * params[0]
+    assert math.isnan(solution.centre_std)
+
+
+def test_an_image_of_nothing_known_but_its_size() -> None:
+    image, directions, rotation, _ = sky(5, field=52.0)
+    solution = look(image, directions, image_size=(SIZE, SIZE))
+    assert solution.verdict == "confident", solution.reason
+    assert turned(solution.rotation, rotation) < 0.05
+    assert solution.focal_length == pytest.approx(lens(52.0)[1][0], rel=1e-3)
+
+
+def test_no_focal_length_explains_what_is_no_sky() -> None:
+    for seed in range(3):
+        image, directions, *_ = sky(seed)
+        lights = np.random.default_rng(seed).uniform(0, SIZE, (len(image), 2))
+        assert look(lights, directions, lens(40.0), focal_error=0.03).verdict != "confident"
+
+
 def test_the_covariance_is_that_of_the_errors() -> None:
     sigmas = []
     for seed in range(40):

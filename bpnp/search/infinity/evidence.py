@@ -47,11 +47,15 @@ class Background(NamedTuple):
     pixel: Array
 
 
-def background_of(bearings: Array, pixel: Array, count: int, noise: float) -> Background:
-    """Of image points and `count` directions; noise: the largest s, pixels."""
+def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms: float = 0.0) -> Background:
+    """Of image points and `count` directions; noise: the largest s, pixels; zooms: of an unknown focal length, the log
+    of the largest over the smallest one."""
     m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     cells = 8 * math.pi**2 * spread / (scales * np.median(pixel)) ** 3
+    cells = cells * np.maximum(
+        zooms * spread / (scales * np.median(pixel)), 1.0
+    )  # focal lengths that can be told apart
     tests = np.log(np.maximum(np.minimum(cells, m * (m - 1) / 2 * count * (count - 1)), 1.0))
     tree, reach = cKDTree(bearings), 2 * scales * np.median(pixel)
     together = np.stack([tree.query_ball_point(bearings, r, return_length=True) for r in reach], -1)

@@ -103,6 +103,7 @@ def search_rotation(
     *,
     scores: Array | None = None,
     noise: float | None = None,
+    zooms: float = 0.0,
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: InfinitySettings = DEFAULT,
@@ -110,27 +111,31 @@ def search_rotation(
     """The rotation under which image points (m) see unit directions (n, 3).
 
     scores (m,): pairs of points with the largest ones are tried first. noise: standard deviation of the image points,
-    pixels, if it is known.
+    pixels, if it is known. zooms: of a focal length that is one of several, the log of the largest over the smallest.
     """
     catalogue = catalogue_of(directions, settings.table)
     result = RotationResult([], "failed", "no rotation was found")
     for scale in settings.noise if noise is None else (noise,):
         if result.turns and deadline.passed():
             break
-        turns, result = result.turns, _search(image, catalogue, scale, scores, seed, deadline, settings)
+        turns, result = result.turns, _search(image, catalogue, scale, zooms, scores, seed, deadline, settings)
         result = replace(result, turns=result.turns + turns)
-        if result.found and result.verdict != "failed" and not _is_rougher(result, image, catalogue, scale, settings):
+        if (
+            result.found
+            and result.verdict != "failed"
+            and not _is_rougher(result, image, catalogue, scale, zooms, settings)
+        ):
             break
     return result
 
 
 def _is_rougher(
-    result: RotationResult, image: Image, catalogue: Catalogue, noise: float, settings: InfinitySettings
+    result: RotationResult, image: Image, catalogue: Catalogue, noise: float, zooms: float, settings: InfinitySettings
 ) -> bool:
     """Whether the best rotation explains the points better at a noise that was not yet searched for."""
     best = result.found[0]
     for rougher in (scale for scale in settings.noise if scale > noise):
-        sight = _sight(image, catalogue, rougher, 0, settings)
+        sight = _sight(image, catalogue, rougher, zooms, 0, settings)
         weight = _information(image, np.flatnonzero(best.match >= 0))
         if _fitted(sight, best.rotation, weight, settings).log10_false_alarms < best.log10_false_alarms:
             return True
@@ -151,11 +156,13 @@ def _fitted(sight: Sight, rotation: Array, weight: Array, settings: InfinitySett
     return _weighed(sight, state)
 
 
-def _sight(image: Image, catalogue: Catalogue, noise: float, seed: int, settings: InfinitySettings) -> Sight:
+def _sight(
+    image: Image, catalogue: Catalogue, noise: float, zooms: float, seed: int, settings: InfinitySettings
+) -> Sight:
     """What is looked for at a noise of so many pixels."""
     reach = settings.reach * noise
     cell = settings.cell * reach * float(np.median(image.pixel))
-    background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise)
+    background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise, zooms)
     sample = np.random.default_rng(seed).permutation(len(image.bearings))[: settings.sample]
     return Sight(image, catalogue, catalogue.sky(cell), background, reach, sample)
 
@@ -164,12 +171,13 @@ def _search(
     image: Image,
     catalogue: Catalogue,
     noise: float,
+    zooms: float,
     scores: Array | None,
     seed: int,
     deadline: Deadline,
     settings: InfinitySettings,
 ) -> RotationResult:
-    sight, bearings = _sight(image, catalogue, noise, seed, settings), image.bearings
+    sight, bearings = _sight(image, catalogue, noise, zooms, seed, settings), image.bearings
     found: list[Rotated] = []
     tried = Enumerated()
     result = _judged(found, sight, tried, settings)

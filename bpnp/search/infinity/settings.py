@@ -1,6 +1,6 @@
 """Every constant that tunes the search for a rotation, in one argument: what it is, its unit, and why."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,15 @@ class InfinitySettings:
     power: float = 0.9
     turns: int = 400
     least_share: float = 0.25
+    zoom: float = 1.02
+    zoom_noise: float = 3.0
+    zoom_share: float = 0.4
+    zoom_rounds: int = 6
+    zoom_same: float = 1e-4
+
+    def of_a_rung(self) -> "InfinitySettings":
+        """These settings where the focal length is only about right."""
+        return replace(self, noise=(self.zoom_noise,), least_share=self.zoom_share)
 
 
 DEFAULT = InfinitySettings()
