@@ -1,18 +1,20 @@
 """Photos localised by the workers of a Dask cluster; needs the extra `cluster`."""
 
+import asyncio
 import uuid
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from itertools import islice
 
 from distributed import Client, Future, LocalCluster, WorkerPlugin, as_completed, get_worker
+from distributed.comm import connect
 
 from bpnp.maps.many_photos import Attempt, PhotoTask, attempt
 from bpnp.maps.scene_map import SceneMap
 from bpnp.solving.solution import Solution
 
 QUEUED = 4  # photos for each thread of the workers: none waits for the next one, and the scheduler holds few
-PATIENCE = "10s"  # until a scheduler answers
+PATIENCE = 10  # seconds until a scheduler answers
 
 
 class MapOfWorker(WorkerPlugin):
@@ -59,12 +61,18 @@ def connected(cluster: str) -> Iterator[Client]:
         with processes, Client(processes) as client:
             yield client
         return
-    try:
-        scheduler = Client(cluster, timeout=PATIENCE)
+    try:  # first: a client that fails to connect leaves threads that wait for each other
+        asyncio.run(_answers(cluster))
     except (OSError, ValueError) as error:
         raise ValueError(f"expected the address of a Dask scheduler or a number, got {cluster}: {error}") from error
-    with scheduler as client:
+    with Client(cluster, timeout=PATIENCE) as client:
         yield client
+
+
+async def _answers(address: str) -> None:
+    """Raise OSError or ValueError where no scheduler answers."""
+    comm = await connect(address, timeout=PATIENCE)
+    await comm.close()
 
 
 def _attempt(plugin: str, task: PhotoTask) -> Solution | str:
