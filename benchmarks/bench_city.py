@@ -44,7 +44,7 @@ def outcome(scene: SceneMap, photo: CityPhoto, seed: int, limit: float) -> Outco
 def opened(scene: SceneMap) -> float:
     """CPU seconds of what a map does before its first photo."""
     start = time.process_time()
-    _ = scene.cones, scene.visibility
+    _ = scene.cones, scene.pictures
     return time.process_time() - start
 
 

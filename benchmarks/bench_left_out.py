@@ -48,10 +48,10 @@ def photo_outcomes(
 ) -> dict[str, Outcome]:  # fmt: skip
     """By method, of one photo that is left out of its map."""
     place = SceneMap.from_colmap(scene.without(photo))
-    shared = full.visibility @ full.visibility[[full.view_numbers[photo]]].toarray()[0]
+    (true,) = full.named([photo])
+    shared = np.array([np.isin(view.points, true.points).sum() for view in full.views])
     likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
     views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
-    (true,) = full.named([photo])
     distance = float(np.median(np.linalg.norm(full.points3d[true.points] - true.centre, axis=1)))
     rotation, centre = aligned(full, place).pose(true.rotation, true.translation)
     unit = distance * aligned(full, place).scale

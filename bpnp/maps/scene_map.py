@@ -1,15 +1,14 @@
 """A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from torch import nn
 
 from bpnp.cameras import CENTRE, Camera, camera_from, is_opencv, same_shape, scaled_camera
@@ -20,8 +19,9 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
+from bpnp.maps.ranking import RUNG, STEP, Pictures, pictures_of_views, places_first, scores_of_views
 from bpnp.maps.twins import Photo, without_twins
-from bpnp.maps.views import Array, Cones, View, covering_order, viewing_cones
+from bpnp.maps.views import Array, Cones, View, viewing_cones
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import check_inside, pixels_from, source_from
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
@@ -31,6 +31,14 @@ from bpnp.solving.sources import Options
 LEAST_TRACK = 2  # views that fix a point; with one left it would not be in the map
 UNKNOWN = "unknown"  # focal length
 SAME_FOCAL = 1.05  # largest ratio of the focal lengths of views whose camera is taken for that of a photo
+
+
+class Place(NamedTuple):
+    """A view to look near, the points (k,) to look among, and what is known of the photo's camera there."""
+
+    view: View
+    points: NDArray[np.integer]
+    lens: Camera | UnknownCamera
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,12 +83,9 @@ class SceneMap:
         return f"SceneMap({len(self.views):,} views, {len(self.points3d):,} points)"
 
     @cached_property
-    def visibility(self) -> csr_array:
-        """(views, n) with 1 where a view sees a point."""
-        counts = [len(view.points) for view in self.views]
-        columns = np.concatenate([view.points for view in self.views])
-        entries = np.ones(len(columns), np.int32), columns, np.concatenate([[0], np.cumsum(counts)])
-        return csr_array(entries, shape=(len(self.views), len(self.points3d)))
+    def pictures(self) -> Pictures:
+        """(views, cells^2) what the views' ranks are told from."""
+        return pictures_of_views(self.points3d, self.views)
 
     @cached_property
     def cones(self) -> Cones:
@@ -121,21 +126,34 @@ class SceneMap:
         views = tuple(replace(view, points=place[view.points[enough[view.points]]]) for view in self.views)
         return SceneMap(self.points3d[enough], self.point_ids[enough], tracks[enough], views)
 
-    def regions(self, views: Iterable[str] | None = None) -> Iterator[Region]:
-        """What to look near: each of the given views, in their order, with the points that any of them sees, since they
-        show one place; or each view of the map with its own points, those first that together see most of the map. None
-        with fewer points than fix a pose.
+    def places(self, views: Iterable[str] | None, keypoints: Any, lens: Camera | UnknownCamera) -> "list[Place]":
+        """What to look near a photo's keypoints, in this order.
+
+        Each of the given views, in their order, with the points that any of them sees, since they show one place; or
+        all views of the map, each with its own points, by their rank (`bpnp.maps.ranking`). Of an unknown focal length
+        several in turns, from the likeliest, the next one after `RUNG` views with that before. None with fewer points
+        than fix a pose.
 
         Raises ValueError for unknown names, or if there is none.
         """
-        if views is None:
-            order = covering_order(self.views, self.visibility)
-            return (self._region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
-        named = self.named(views)
-        if not named:
-            raise ValueError("expected names of views to try, got none; try views=None for all of the map")
-        points = np.unique(np.concatenate([view.points for view in named]))
-        return (self._region(view, points) for view in named if len(view.points) and len(points) >= MIN_POINTS)
+        if views is not None:
+            named = self.named(views)
+            if not named:
+                raise ValueError("expected names of views to try, got none; try views=None for all of the map")
+            points = np.unique(np.concatenate([view.points for view in named]))
+            return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
+        cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]
+        pixels, turns = np.asarray(keypoints, np.float64), list[tuple[int, int, int]]()
+        for rung, camera in enumerate(cameras):
+            scores = scores_of_views(camera.normalise(pixels), self.pictures)
+            order = places_first(self.views, scores, len(self.points3d))
+            turns += [(place + RUNG * rung, rung, k) for place, k in enumerate(order)]
+        tried = [lens.near(one)._replace(alone=True) if isinstance(lens, UnknownCamera) else lens for one in cameras]
+        return [
+            Place(view, view.points, tried[rung])
+            for _, rung, k in sorted(turns)
+            if len((view := self.views[k]).points) >= MIN_POINTS
+        ]
 
     def _region(self, view: View, points: NDArray[np.integer]) -> Region:
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
@@ -169,7 +187,7 @@ class SceneMap:
         distortion: whether one radial coefficient is unknown too, as for `bpnp.solve`.
         views: names of views of the map that may show the same place, best first, from any image retrieval: the points
             that any of them sees are used near each; None to try the points of one view of the whole map after the
-            other, those first that together see most of it.
+            other, those first where the density of its points is most like that of the keypoints.
         scores: (m,) strength of the keypoints; the strongest are used first.
         prior: what is known of the photo's pose; None to expect it near that of the view that is tried.
         solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
@@ -185,7 +203,7 @@ class SceneMap:
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
-        start, best = Clock.now(), list[tuple[Region, Solution]]()
+        start, best = Clock.now(), list[tuple[Place, Solution]]()
         pixels, lens = (
             pixels_from(keypoints, image_size or camera),
             self._lens(camera, image_size, focal_error, distortion),
@@ -197,37 +215,36 @@ class SceneMap:
             raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
-        module, regions, tries, over = source_from(solver), self.regions(views), 0, False
+        module, places, over = source_from(solver), self.places(views, used, lens), False
         deadline = Deadline(math.inf if time_limit is None else start + time_limit)
-        met, fewest = list[Solution](), 0.0
+        met = list[Solution]()
 
-        def near(camera: Any, options: Options, tries: int, region: Region, expected: PosePrior | None) -> Solution:
+        regions, tries = partial(map, lambda place: self._region(place.view, place.points), places), len(places)
+
+        def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
             return counted(near_view(region, used, camera, expected, options), tries)
 
         for settings in (BRIEF, LONGER):
-            for region in regions:
+            for place in places:
                 remaining = None if time_limit is None else time_limit - (Clock.now() - start)
                 if over := over or (bool(best) and remaining is not None and remaining <= 0):
                     break
-                tries += 1
                 limit = None if remaining is None else max(remaining, 1e-3)
                 asks = solver == "auto" and settings is LONGER  # not of every view of the map
                 options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
-                solution = near(lens, options, tries, region, prior)
+                region = self._region(place.view, place.points)
+                solution = near(place.lens, options, region, prior)
                 if over := solution.verdict == "confident":
                     if prior is None:  # which would tell twins apart
-                        place = self._region(region.view, np.arange(len(self.points3d))) if views is None else region
-                        photo = Photo(used, solution.camera, place, partial(self.regions, views), seed, deadline)
-                        search = partial(near, solution.camera, options, tries)
+                        every = self._region(place.view, np.arange(len(self.points3d))) if views is None else region
+                        photo = Photo(used, solution.camera, every, regions, seed, deadline)
+                        search = partial(near, solution.camera, options)
                         solution = without_twins(photo, solution, met, search)
-                    best = [(region, solution)]
+                    best = [(place, solution)]
                     break
-                if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < fewest:
-                    fewest, lens = solution.log10_false_alarms, lens.near(camera_from(solution.camera))
                 met.append(solution)
-                best = sorted([*best, (region, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
-            regions = iter([region for region, _ in best])
-            lens = lens._replace(alone=fewest < 0) if isinstance(lens, UnknownCamera) else lens
+                best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
+            places = [place._replace(lens=_near(lens, solution)) for place, solution in best]
         if not best:
             raise ValueError("expected a map with views that see 4 or more points, got none")
         solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels)
@@ -246,7 +263,7 @@ class SceneMap:
             return unknown
         known = [view.camera.focal / max(size) for view in self.views if (size := image_size_of(view.camera))]
         smallest, largest = min([unknown.smallest, *known]), max([unknown.largest, *known])
-        return unknown._replace(smallest=smallest, largest=largest)
+        return unknown._replace(smallest=smallest, largest=largest, usual=float(np.median(known or [unknown.usual])))
 
     def localize_photo(
         self,
@@ -329,3 +346,11 @@ class SceneMap:
             )
         camera, name = fitting[len(fitting) // 2]
         return camera, f"view {name} of the map"
+
+
+def _near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:
+    """The camera for a longer search about a solution: an unknown one has the focal length found, if that is more than
+    chance, else all of them are tried."""
+    if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < 0:
+        return lens.near(camera_from(solution.camera))._replace(alone=True)
+    return lens

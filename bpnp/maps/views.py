@@ -1,12 +1,11 @@
-"""The views of a map: which points they see and from where, and in which order they cover the map."""
+"""The views of a map: which points they see and from where."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from bpnp.cameras import Camera
 
@@ -65,23 +64,6 @@ def viewing_cones(points3d: Array, views: Iterable[tuple[Array, NDArray[np.integ
     cosines = np.cos(np.radians(np.minimum(half, 180.0)))
     unseen = np.asarray(~sums.any(-1))
     return Cones(np.where(unseen[:, None], [0.0, 0, 1], axes), np.where(unseen, -1.0, cosines))
-
-
-def covering_order(views: Sequence[View], visibility: csr_array) -> Iterator[View]:
-    """The views that see points, each time the one that sees most points that none before saw.
-
-    visibility: (views, points) with 1 where a view sees a point. Greedy maximum coverage; views that see nothing new
-    follow, largest first.
-    """
-    sizes = np.diff(visibility.indptr).astype(np.int64)
-    fresh_counts, waiting, unseen = sizes.copy(), sizes > 0, np.ones(visibility.shape[1], bool)
-    while waiting.any():
-        best = int(np.lexsort((sizes, fresh_counts, waiting))[-1])
-        waiting[best] = False
-        fresh = views[best].points[unseen[views[best].points]]
-        unseen[fresh] = False
-        fresh_counts = fresh_counts - np.asarray(visibility[:, fresh].sum(1)).ravel()
-        yield views[best]
 
 
 def _directions(points: Array, centre: Array) -> Array:

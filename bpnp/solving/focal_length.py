@@ -207,7 +207,7 @@ class _Ladder:
         for _ in range(rule.rounds):
             middle = rotation @ (problem.sets.middle + problem.origin) + translation
             fitted = with_focal_length(problem.sets, rotation, middle, scale)
-            if fitted is None or not 1 / rule.step < camera.focal * fitted.zoom / given / rule.step < 1:
+            if fitted is None or not 1 / rule.step < camera.focal * fitted.zoom / given < rule.step:
                 break
             camera = zoomed_camera(camera, fitted.zoom)
             problem = self.problem(camera)

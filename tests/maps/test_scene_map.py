@@ -1,6 +1,7 @@
 """Maps are read with the points, tracks and views that the model has, whichever its form."""
 
 import struct
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from planted_model import OPENCV, Planted, plant_model
 
 from bpnp import SceneMap
+from bpnp.cameras import camera_from
 from bpnp.maps.many_photos import read_views
 
 
@@ -50,35 +52,25 @@ def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -
     assert len(scene.views) == 4
 
 
-def test_regions_cover_the_map_and_the_largest_gain_comes_first(planted: tuple[Path, Planted]) -> None:
-    scene, _ = SceneMap.from_colmap(planted[0]), planted[1]
-    regions = list(scene.regions())
-    assert sorted(region.view.name for region in regions) == [view.name for view in scene.views]
-    for region in regions:
-        np.testing.assert_array_equal(region.point_ids, scene.point_ids[region.view.points])
-        np.testing.assert_array_equal(region.points3d, scene.points3d[region.view.points])
-        np.testing.assert_array_equal(region.cones.axes, scene.cones.axes[region.view.points])
-    covered: set[int] = set()
-    left = list(scene.views)
-    for region in regions:
-        gain = len(set(region.view.points.tolist()) - covered)
-        assert gain == max(len(set(view.points.tolist()) - covered) for view in left)
-        covered |= set(region.view.points.tolist())
-        left.remove(region.view)
-    assert len(covered) == len(scene.points3d)
+def test_every_view_is_looked_near_with_its_own_points(planted: tuple[Path, Planted]) -> None:
+    scene = SceneMap.from_colmap(planted[0])
+    places = scene.places(None, np.zeros((4, 2)), camera_from(np.eye(3)))
+    assert sorted(place.view.name for place in places) == [view.name for view in scene.views]
+    for view, points, _ in places:
+        np.testing.assert_array_equal(points, view.points)
 
 
 def test_views_are_found_by_their_names(planted: tuple[Path, Planted]) -> None:
     scene = SceneMap.from_colmap(planted[0])
-    regions = list(scene.regions(["photo 2.jpg", "photo 0.jpg"]))
-    assert [region.view.name for region in regions] == ["photo 2.jpg", "photo 0.jpg"]
-    shown = np.union1d(scene.views[2].points, scene.views[0].points)
-    for region in regions:
-        np.testing.assert_array_equal(region.point_ids, scene.point_ids[shown])
+    named = partial(scene.places, keypoints=np.zeros((4, 2)), lens=camera_from(np.eye(3)))
+    places = named(["photo 2.jpg", "photo 0.jpg"])
+    assert [place.view.name for place in places] == ["photo 2.jpg", "photo 0.jpg"]
+    for place in places:
+        np.testing.assert_array_equal(place.points, np.union1d(scene.views[2].points, scene.views[0].points))
     with pytest.raises(ValueError, match=r"expected names of views of the map, got a\.jpg; try photo 0\.jpg"):
-        scene.regions(["photo 0.jpg", "a.jpg"])
+        named(["photo 0.jpg", "a.jpg"])
     with pytest.raises(ValueError, match="got none; try views=None"):
-        scene.regions([])
+        named([])
 
 
 def test_views_of_a_retrieval(tmp_path: Path) -> None:

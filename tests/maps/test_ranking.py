@@ -1,0 +1,82 @@
+"""The rank of views: planted places of clumped points, photos beside one of them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp import SceneMap
+from bpnp.cameras import camera_from
+from bpnp.maps.ranking import STEP, contrast, pictures_of_views, places_first, scores_of_views
+from bpnp.maps.views import View
+from bpnp.solving.focal_length import UnknownCamera
+
+Array = NDArray[np.float64]
+PLACES, POINTS = 60, 300
+
+
+def city(seed: int) -> SceneMap:
+    """Each place a view of its own points, in clumps before the camera."""
+    rng, points, views = np.random.default_rng(seed), [], []
+    for k in range(PLACES):
+        clumps = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (25, 3))
+        camera = clumps[rng.integers(25, size=POINTS)] + 0.15 * rng.standard_normal((POINTS, 3))
+        turn, centre = Rotation.random(rng=rng).as_matrix(), 100 * rng.standard_normal(3)
+        points.append(camera @ turn + centre)
+        seen = np.arange(k * POINTS, (k + 1) * POINTS, dtype=np.int32)
+        views.append(View(f"{k}", camera_from(np.eye(3)), turn, -turn @ centre, seen))
+    every = np.concatenate(points)
+    return SceneMap(every, np.arange(len(every)), np.ones(len(every), np.int32), tuple(views))
+
+
+def photo(scene: SceneMap, k: int, seed: int, turned_deg: float = 6.0) -> Array:
+    """Half of the points of a view, from beside it, and as many keypoints of nothing."""
+    rng, view = np.random.default_rng([seed, k]), scene.views[k]
+    camera = scene.points3d[view.points] @ view.rotation.T + view.translation
+    turn = Rotation.from_rotvec(np.radians(turned_deg) * rng.standard_normal(3)).as_matrix()
+    camera = camera[rng.random(POINTS) < 0.5] @ turn.T + turned_deg / 20 * rng.standard_normal(3)
+    seen = camera[:, :2] / camera[:, 2:]
+    return np.concatenate([seen, rng.uniform(-0.6, 0.6, seen.shape)])
+
+
+def test_the_view_beside_a_photo_is_among_the_first() -> None:
+    scene = city(0)
+    ranks = []
+    for k in range(0, PLACES, 5):
+        scores = scores_of_views(photo(scene, k, 1), scene.pictures)
+        ranks.append(int((scores > scores[k]).sum()))
+    assert np.median(ranks) < PLACES / 12  # half by chance
+    assert max(ranks) < PLACES / 4
+
+
+def test_focal_lengths_take_turns_from_the_likeliest() -> None:
+    scene = city(0)
+    views = [replace(view, camera=camera_from(("SIMPLE_PINHOLE", 800, 600, (960, 400, 300)))) for view in scene.views]
+    scene = replace(scene, views=tuple(views))  # 1.2 of the larger side
+    lens = scene._lens(None, (1000, 1000), None, False)
+    assert isinstance(lens, UnknownCamera)
+    places = scene.places(None, 1200 * photo(scene, 10, 2) + 500, lens)
+    tried = [place.lens.reference.focal * place.lens.usual for place in places]  # type: ignore[union-attr]
+    assert tried[:4] == pytest.approx([1200] * 4)
+    assert set(np.round(tried[:15])) == {1200, 960, 1500}
+    assert len({(place.view.name, round(focal)) for place, focal in zip(places, tried, strict=True)}) == len(places)
+    assert len(places) == PLACES * len(lens.ladder(STEP))
+
+
+def test_views_of_one_place_come_after_all_other_places() -> None:
+    scene = city(0)
+    twice = (*scene.views, *scene.views[:10])
+    scores = np.linspace(1, 0, len(twice), dtype=np.float32)
+    order = list(places_first(twice, scores, len(scene.points3d)))
+    assert order == list(range(len(twice)))
+    best_last = list(places_first(twice, scores[::-1].copy(), len(scene.points3d)))
+    assert best_last[:10] == list(range(len(twice) - 1, len(twice) - 11, -1))
+    assert sorted(best_last[-10:]) == list(range(10))
+
+
+def test_contrast_is_of_length_one_and_empty_for_no_points() -> None:
+    assert np.linalg.norm(contrast(np.random.default_rng(0).normal(0, 0.2, (50, 2)))) == pytest.approx(1, abs=1e-5)
+    assert not contrast(np.empty((0, 2))).any()
+    assert pictures_of_views(np.zeros((3, 3)), []).shape[0] == 0
