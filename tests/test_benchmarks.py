@@ -26,9 +26,8 @@ from bpnp.maps.views import View
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    "bench_city", "bench_constellation", "bench_layers", "bench_search", "cities", "descriptor_poses", "gpu",
-    "paper_layers", "problems",
-    "rebuilt_maps", "record", "reliability", "results", "steps", "timing",
+    "bench_city", "bench_constellation", "bench_focal", "bench_layers", "bench_search", "cities", "descriptor_poses",
+    "gpu", "paper_layers", "problems", "rebuilt_maps", "record", "reliability", "results", "steps", "timing",
 )  # fmt: skip
 
 
@@ -336,3 +335,16 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNames
         camera = larger.points3d[view.points] @ view.rotation.T + view.translation
         np.testing.assert_allclose(np.linalg.det(view.rotation), 1)
         assert (np.abs(camera[:, :2] / camera[:, 2:]) < 1).all()
+
+
+def test_an_unknown_focal_length_is_told_nothing(bench: SimpleNamespace) -> None:
+    """The image holds all keypoints about its middle, and a camera of the wrong factor sees the same pixels."""
+    points2d = np.random.default_rng(0).uniform(-0.4, 0.5, (50, 2))
+    problem = bench.bench_focal.ViewProblem(
+        "", points2d, np.empty((0, 3)), np.empty(0, np.int64), np.eye(3), np.zeros(3), (), 800.0, None
+    )
+    pixels, (width, height) = bench.bench_focal.image_of(problem)
+    assert ((pixels >= 0) & (pixels <= [width, height])).all()
+    np.testing.assert_allclose((pixels - [width / 2, height / 2]) / 800, points2d)
+    told = replace(problem, focal=1.2 * 800, points2d=points2d / 1.2)
+    np.testing.assert_allclose(bench.bench_focal.image_of(told)[0], pixels)
