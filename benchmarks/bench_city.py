@@ -6,25 +6,31 @@
 The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views
 (`cities.py`). Photos of the scenes of --photos are left out with all points that then fewer than two views see. Right
 is within 5 degrees, the centre within a tenth of the distance. --twice: every place is there twice, this share of the
-points of the second one gone; a confident pose in it is wrong, and no pose there is right.
+points of the second one gone; a confident pose in it is wrong, and no pose there is right. A row begins with the rank
+of the views (`bpnp.maps.ranking`): of how many photos one of the first 1, 10 and 50 views is turned by less than 30
+degrees and lies within half the distance.
 """
 
 import argparse
 import resource
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from bench_views import REPORTED
 from cities import CityPhoto, city
-from record import TIME_LIMIT, Outcome, measured, parser, solved
+from record import TIME_LIMIT, Outcome, degrees, measured, parser, solved
 
 from bpnp import SceneMap, Solution, warm_up
+from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.maps.views import View
 
 RIGHT_DEG, RIGHT_SHIFT = 5.0, 0.1
+NEAR_DEG, NEAR_SHIFT = 30.0, 0.5  # of a view that shows about what a photo shows
+FIRST = (1, 10, 50)
 VIEWS = (477, 1000, 3000, 10_000)
 
 
@@ -48,18 +54,40 @@ def opened(scene: SceneMap) -> float:
     return time.process_time() - start
 
 
+def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
+    """Shares of the photos that have a view near by among the first of the rank, and its milliseconds a view."""
+    places, start = [], time.process_time()
+    for photo in photos:
+        places.append(scene.places(None, photo.points2d, camera_from(np.eye(3))))
+    seconds = (time.process_time() - start) / len(photos) / len(scene.views)
+    first = [
+        min((k for k, place in enumerate(order) if is_near(place.view, photo)), default=len(order))
+        for photo, order in zip(photos, places, strict=True)
+    ]
+    shares = " / ".join(f"{np.mean(np.array(first) < most):.0%}" for most in FIRST)
+    return f"rank {shares} in {1e3 * seconds:.2g} ms a view"
+
+
+def is_near(view: View, photo: CityPhoto) -> bool:
+    return any(
+        degrees(view.rotation, rotation) < NEAR_DEG
+        and np.linalg.norm(view.centre + rotation.T @ translation) < NEAR_SHIFT * photo.distance
+        for rotation, translation in photo.poses
+    )
+
+
 def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
     scenes = [read_reconstruction(folder, name=folder.parents[1].name) for folder in folders(options)]
     each = -(-options.limit // len(options.photos))
     for views in options.views if options.twice is None else [0]:
         wanted = dict.fromkeys(options.photos, each)
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
-        seconds = opened(scene)
+        seconds, rank = opened(scene), ranked(scene, photos[: options.limit])
         outcomes = [outcome(scene, photo, options.seed, options.time_limit) for photo in photos[: options.limit]]
         memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
         median = np.median([one.cpu_seconds for one in outcomes])
         yield (
-            f"{len(scene.views):,} views, {len(scene.points3d):,} points, opened in {seconds:.2g} CPU s, "
+            f"{rank}, {len(scene.views):,} views, {len(scene.points3d):,} points, opened in {seconds:.2g} CPU s, "
             f"{memory:.2g} GB, median {median:.3g} CPU s", outcomes,
         )  # fmt: skip
 
