@@ -5,9 +5,9 @@
 
 What: maps (photos left out of their map, which view is not told; beside it with the focal length known), views (photos
 against the points of one view), leds (10 or more of them seen), wrong (as maps, told a camera whose focal length is
-wrong by each factor). The cameras of the views are not told. Right is within 1.5 degrees, of LEDs within 3, and of
-wrong cameras with the centre within a twentieth of the distance too. A line says for how many the focal length is
-within 3 %, and how many confident poses are more than 3 degrees off. --limit: problems a scene or setting.
+wrong by each factor). Right is within 1.5 degrees, of LEDs within 3, and of wrong cameras with the centre within a
+twentieth of the distance too. A line says for how many the focal length is within 3 %, and how many confident poses
+are more than 3 degrees off. --limit: problems a scene or setting.
 """
 
 import argparse
@@ -23,6 +23,7 @@ from record import TIME_LIMIT, Array, Outcome, measured, parser, solved
 from view_problems import ViewProblem, scene_problems
 
 from bpnp import Solution, solve, warm_up
+from bpnp.cameras import image_size
 
 RIGHT = {"maps": (1.5, np.inf), "views": (1.5, np.inf), "leds": (3.0, np.inf), "wrong": (1.5, 0.05)}  # degrees, share
 FAR_DEG, NEAR_FOCAL = 3.0, 0.03
@@ -70,9 +71,11 @@ def of_photo(problem: ViewProblem, search: Callable[..., Solution], what: str) -
 
 
 def image_of(problem: ViewProblem) -> tuple[Array, tuple[int, int]]:
-    """Keypoints (m, 2), pixels, and width and height of the smallest image about the principal point that has them."""
+    """Keypoints (m, 2), pixels, and width and height of an image about the principal point that has them, of the size
+    of the map's images where they lie within it."""
     pixels = problem.focal * problem.points2d
-    width, height = (2 * np.ceil(np.abs(pixels).max(0))).astype(int).tolist()
+    sizes = [size for view in problem.scene.views if (size := image_size(view.camera))]
+    width, height = np.max([2 * np.ceil(np.abs(pixels).max(0)), *sizes[:1]], 0).astype(int).tolist()
     return pixels + np.array([width / 2, height / 2]), (width, height)
 
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.maps.scene_map import SceneMap
 from bpnp.maps.views import View
@@ -127,10 +126,13 @@ def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64])
     """The map of some points, in their order, and of all views but the photo."""
     place = np.full(len(scene.points3d), -1, np.int32)
     place[points] = np.arange(len(points))
-    camera = camera_from(np.eye(3))
     views = tuple(
         View(
-            view.name, camera, view.rotation, view.translation, np.sort(place[view.observed[place[view.observed] >= 0]])
+            view.name,
+            view.camera,
+            view.rotation,
+            view.translation,
+            np.sort(place[view.observed[place[view.observed] >= 0]]),
         )
         for view in scene.images
         if view is not query

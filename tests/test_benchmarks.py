@@ -341,7 +341,15 @@ def test_an_unknown_focal_length_is_told_nothing(bench: SimpleNamespace) -> None
     """The image holds all keypoints about its middle, and a camera of the wrong factor sees the same pixels."""
     points2d = np.random.default_rng(0).uniform(-0.4, 0.5, (50, 2))
     problem = bench.bench_focal.ViewProblem(
-        "", points2d, np.empty((0, 3)), np.empty(0, np.int64), np.eye(3), np.zeros(3), (), 800.0, None
+        "",
+        points2d,
+        np.empty((0, 3)),
+        np.empty(0, np.int64),
+        np.eye(3),
+        np.zeros(3),
+        (),
+        800.0,
+        SimpleNamespace(views=()),
     )
     pixels, (width, height) = bench.bench_focal.image_of(problem)
     assert ((pixels >= 0) & (pixels <= [width, height])).all()

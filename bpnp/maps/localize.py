@@ -26,6 +26,7 @@ VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to 
 BRIEF = DEFAULT.limited(1)  # one raster search
 LONGER = DEFAULT.limited(8)
 PROMISING = 3  # views that are tried longer if none is confident
+LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
 
 

@@ -1,6 +1,7 @@
 """A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
 import math
+from collections import deque
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -17,7 +18,18 @@ from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.maps.localize import BRIEF, LONGER, PROMISING, Region, among_all, counted, near_view, rank, strongest_of
+from bpnp.maps.localize import (
+    BRIEF,
+    LIKELY,
+    LONGER,
+    PROMISING,
+    Region,
+    among_all,
+    counted,
+    near_view,
+    rank,
+    strongest_of,
+)
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
 from bpnp.maps.ranking import RUNG, STEP, Pictures, pictures_of_views, places_first, scores_of_views
 from bpnp.maps.twins import Photo, without_twins
@@ -195,10 +207,11 @@ class SceneMap:
         seed: of the search.
         time_limit: seconds for all views together, after which no search begins; None for no limit.
 
-        Poses near each view are tried briefly until one is confident, then the most promising ones longer; else the
-        pose with the fewest false alarms is returned. A confident pose is compared with those that explain the same
-        image points elsewhere in the map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are
-        the first `candidates`; not if a prior is given. `solution.view` is the view near which it was found.
+        Poses near each view are tried briefly until one is confident, longer at once where hardly any unrelated points
+        would fit as well, and at the end near the most promising views longer; else the pose with the fewest false
+        alarms is returned. A confident pose is compared with those that explain the same image points elsewhere in the
+        map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are the first `candidates`; not if a
+        prior is given. `solution.view` is the view near which it was found.
         `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
@@ -215,7 +228,7 @@ class SceneMap:
             raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
-        module, places, over = source_from(solver), self.places(views, used, lens), False
+        module, places = source_from(solver), self.places(views, used, lens)
         deadline = Deadline(math.inf if time_limit is None else start + time_limit)
         met = list[Solution]()
 
@@ -224,27 +237,33 @@ class SceneMap:
         def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
             return counted(near_view(region, used, camera, expected, options), tries)
 
-        for settings in (BRIEF, LONGER):
-            for place in places:
-                remaining = None if time_limit is None else time_limit - (Clock.now() - start)
-                if over := over or (bool(best) and remaining is not None and remaining <= 0):
-                    break
-                limit = None if remaining is None else max(remaining, 1e-3)
-                asks = solver == "auto" and settings is LONGER  # not of every view of the map
-                options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
-                region = self._region(place.view, place.points)
-                solution = near(place.lens, options, region, prior)
-                if over := solution.verdict == "confident":
-                    if prior is None:  # which would tell twins apart
-                        every = self._region(place.view, np.arange(len(self.points3d))) if views is None else region
-                        photo = Photo(used, solution.camera, every, regions, seed, deadline)
-                        search = partial(near, solution.camera, options)
-                        solution = without_twins(photo, solution, met, search)
-                    best = [(place, solution)]
-                    break
-                met.append(solution)
-                best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
-            places = [place._replace(lens=_near(lens, solution)) for place, solution in best]
+        waiting, longer = deque((place, BRIEF) for place in places), set[str]()
+        while waiting:
+            place, settings = waiting.popleft()
+            remaining = None if time_limit is None else time_limit - (Clock.now() - start)
+            if best and remaining is not None and remaining <= 0:
+                break
+            limit = None if remaining is None else max(remaining, 1e-3)
+            asks = solver == "auto" and settings is LONGER  # not of every view of the map
+            options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
+            region = self._region(place.view, place.points)
+            solution = near(place.lens, options, region, prior)
+            if solution.verdict == "confident":
+                if prior is None:  # which would tell twins apart
+                    every = self._region(place.view, np.arange(len(self.points3d))) if views is None else region
+                    photo = Photo(used, solution.camera, every, regions, seed, deadline)
+                    search = partial(near, solution.camera, options)
+                    solution = without_twins(photo, solution, met, search)
+                best = [(place, solution)]
+                break
+            met.append(solution)
+            best = sorted([*best, (place, solution)], key=lambda item: rank(item[1]), reverse=True)[:PROMISING]
+            likely = solution.log10_false_alarms < LIKELY and len(longer) < PROMISING
+            again = best if not waiting else [(place, solution)] if likely else []
+            for one, found in reversed(again):
+                if one.view.name not in longer:
+                    longer.add(one.view.name)
+                    waiting.appendleft((one._replace(lens=_near(lens, found)), LONGER))
         if not best:
             raise ValueError("expected a map with views that see 4 or more points, got none")
         solution = best[0][1] if strongest is None else among_all(best[0][1], strongest, pixels)
