@@ -4,15 +4,14 @@ module of all sources."""
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 from lightning import LightningDataModule
 from numpy.typing import NDArray
-from torch import Tensor, distributed
-from torch.utils.data import DataLoader, Dataset, DistributedSampler
+from torch import distributed
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
@@ -23,19 +22,11 @@ Key = tuple[int, int]  # (epoch, index): with the seed, all that a problem depen
 POOL_BATCHES = 50  # training batches are cut from pools of this many, sorted by size
 
 
-class ProblemKeys(NamedTuple):
-    """A batch to be made: the position of each problem in its data set, and its name."""
-
-    epoch: int
-    numbers: Int[Tensor, " b"]
-    ids: tuple[str, ...]
-
-
-class ProblemDataset(Dataset[Any]):
+class ProblemDataset(Dataset[Batch]):
     """Maps a list of (epoch, index) keys to a batch, so that workers, resuming and order change nothing.
 
     augmentation: what is done to the problems of `source`. seed: a problem is a function of (seed, index), and of the
-    epoch too if `fresh`. keys_only: give `ProblemKeys`, for `batch` to be called where the batch is needed.
+    epoch too if `fresh`.
     """
 
     def __init__(
@@ -47,27 +38,20 @@ class ProblemDataset(Dataset[Any]):
         fresh: bool = False,
     ) -> None:
         self.source, self.augmentation = source, augmentation or Augmentation()
-        self.seed, self.fresh, self.keys_only = tuple(seed), fresh, False
+        self.seed, self.fresh = tuple(seed), fresh
         self.sizes = self.augmentation.sizes(source.counts)
 
     def __len__(self) -> int:
         return len(self.sizes)
 
-    def __getitem__(self, keys: Sequence[Key]) -> Batch | ProblemKeys:
-        index = [index for _, index in keys]
-        chosen = ProblemKeys(keys[0][0], torch.tensor(index), self.source.names(index))
-        return chosen if self.keys_only else self.batch(chosen)
-
-    def batch(self, keys: ProblemKeys) -> Batch:
-        """The problems of `keys`, made on the device of its index."""
-        epoch = keys.epoch if self.fresh else 0
-        problems = replace(self.source.batch(keys.numbers, epoch), ids=tuple(keys.ids))  # a list after a DataLoader
-        problems = augment(problems, self.augmentation, row_keys(keys.numbers, *self.seed, epoch))
+    def __getitem__(self, keys: Sequence[Key]) -> Batch:
+        index, epoch = torch.tensor([index for _, index in keys]), keys[0][0] if self.fresh else 0
+        problems = augment(self.source.batch(index, epoch), self.augmentation, row_keys(index, *self.seed, epoch))
         return replace(problems, **{name: getattr(problems, name).float() for name in ("rotation", "translation")})
 
     def problem(self, index: int, epoch: int = 0) -> Batch:
         """One problem alone."""
-        return self.batch(ProblemKeys(epoch, torch.tensor([index]), self.source.names([index])))
+        return self[[(epoch, index)]]
 
 
 class BucketSampler(DistributedSampler[list[Key]]):
@@ -174,12 +158,10 @@ class ProblemLoader(DataLoader[Batch]):
     resumed: dict[str, int] | None = None
 
     def __iter__(self) -> Iterator[Batch]:  # type: ignore[override]
-        sampler = self.sampler
-        if not isinstance(sampler, BucketSampler):
-            raise ValueError(f"expected the loader's BucketSampler, got {type(sampler).__name__}")
+        assert isinstance(self.sampler, BucketSampler)
         resumed, self.resumed = self.resumed, None
-        self.served = resumed["served"] if resumed is not None and resumed["epoch"] == sampler.epoch else 0
-        sampler.first_batch = self.served
+        self.served = resumed["served"] if resumed is not None and resumed["epoch"] == self.sampler.epoch else 0
+        self.sampler.first_batch = self.served
         for batch in super().__iter__():
             self.served += 1
             yield batch
@@ -189,19 +171,6 @@ class ProblemLoader(DataLoader[Batch]):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.resumed = dict(state_dict)
-
-
-class FixedBatches(Dataset[Any]):
-    """The batches of a loader's first epoch, by their number: Lightning takes them in their order."""
-
-    def __init__(self, dataset: ProblemDataset, sampler: BucketSampler) -> None:
-        self.dataset, self.keys = dataset, list(sampler)
-
-    def __len__(self) -> int:
-        return len(self.keys)
-
-    def __getitem__(self, number: int) -> Batch | ProblemKeys:
-        return self.dataset[self.keys[number]]
 
 
 def problem_loader(
@@ -230,7 +199,8 @@ def problem_loader(
         max_cells=max_cells,
     )
     if overfit:
-        return DataLoader(FixedBatches(dataset, sampler), batch_size=None, num_workers=num_workers)
+        batches: list[Any] = list(sampler)  # of the first epoch; Lightning takes them in their order
+        return DataLoader(Subset(dataset, batches), batch_size=None, num_workers=num_workers)
     return ProblemLoader(
         dataset,
         sampler=sampler,
@@ -314,10 +284,6 @@ class ProblemDataModule(LightningDataModule):
 
     def predict_dataloader(self) -> DataLoader[Batch]:
         return self._loader("predict")
-
-    def on_after_batch_transfer(self, batch: Any, dataloader_idx: int) -> Any:
-        """The training problems of a batch of keys, made on the device; other batches as they are."""
-        return self.datasets["train"].batch(batch) if isinstance(batch, ProblemKeys) else batch
 
     def _loader(self, part: str) -> DataLoader[Batch]:
         if part not in self.datasets:

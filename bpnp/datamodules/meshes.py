@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.utils.data import DataLoader
 
 from bpnp.datamodules.augment import picked
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
@@ -105,16 +104,11 @@ class MeshSource:
             rows = np.sort(np.random.default_rng(seed[0]).choice(rows, self.count, replace=False))
         self.store, self.rows, self.num_points, self.pool_size = store, rows, num_points, pool_size
         self.cameras, self.seed = cameras, tuple(seed)
-        self._on_device: Tensor | None = None
 
     @property
     def counts(self) -> Counts:
         points = np.full(self.count, self.num_points)
         return Counts(points, points, points)
-
-    def names(self, index: Sequence[int]) -> tuple[str, ...]:
-        views = (divmod(i, len(self.rows)) for i in index)
-        return tuple(f"{self.store.name(int(self.rows[mesh]))}#{view}" for view, mesh in views)
 
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
         """A random camera's view of `num_points` samples of each mesh, drawn without replacement.
@@ -122,9 +116,12 @@ class MeshSource:
         2D points are x/z and y/z plus noise, computed in float64. A point behind the camera, or less than 0.1 in front
         of it, has no 2D point and -1 in match3d. Raises ValueError that names a problem of which fewer than 4 are left.
         """
-        count, size, device = self.num_points, len(index), index.device
+        count, size = self.num_points, len(index)
         keys = row_keys(index, *self.seed, epoch)
-        samples = self._samples(index % len(self.rows))
+        views = [divmod(i, len(self.rows)) for i in index.tolist()]
+        rows = [int(self.rows[mesh]) for _, mesh in views]
+        ids = tuple(f"{self.store.name(row)}#{view}" for row, (view, _) in zip(rows, views, strict=True))
+        samples = torch.from_numpy(np.stack([self.store.row(row)[POINTS][: self.pool_size] for row in rows]))
         points3d = picked(samples, permutations(stream(keys, Purpose.SUBSET), samples.shape[1])[:, :count])
         rotation, translation = self.cameras.poses(stream(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
@@ -133,7 +130,7 @@ class MeshSource:
             first = int(few.nonzero()[0, 0])
             raise ValueError(
                 f"expected at least {MIN_POINTS} points in front of the camera, got {int(seen[first].sum())} in "
-                f"{self.names(index.tolist())[first]}; try normalisation unit_sphere or a larger `distance`"
+                f"{ids[first]}; try normalisation unit_sphere or a larger `distance`"
             )
         noise = normal(stream(keys, Purpose.NOISE), 2 * count).view(size, count, 2)
         points2d = project(camera) + noise * (self.cameras.noise_px / self.cameras.focal)
@@ -142,30 +139,14 @@ class MeshSource:
             points3d=points3d,
             mask2d=seen,
             mask3d=torch.ones_like(seen),
-            focal=torch.full((size,), self.cameras.focal, device=device),
+            focal=torch.full((size,), self.cameras.focal),
             index=index,
-            ids=(),
+            ids=ids,
             rotation=rotation,
             translation=translation,
-            match3d=torch.arange(count, device=device).where(seen, -1),
-            origin=torch.zeros(size, 3, dtype=torch.float64, device=device),
+            match3d=torch.arange(count).where(seen, -1),
+            origin=torch.zeros(size, 3, dtype=torch.float64),
         )
-
-    def free(self) -> None:
-        """Forget the samples on the device."""
-        self._on_device = None
-
-    def _samples(self, mesh: Int[Tensor, " b"]) -> Float[Tensor, "b k 3"]:
-        """Surface samples of each mesh: from the mapped files, or on another device from all samples, copied once."""
-        if mesh.device.type == "cpu":
-            return self._stacked(mesh.tolist())
-        if self._on_device is None or self._on_device.device != mesh.device:
-            self._on_device = self._stacked(range(len(self.rows))).to(mesh.device)
-        return self._on_device[mesh]
-
-    def _stacked(self, meshes: Sequence[int]) -> Float[Tensor, "b k 3"]:
-        rows = (self.store.row(int(self.rows[mesh])) for mesh in meshes)
-        return torch.from_numpy(np.stack([row[POINTS][: self.pool_size] for row in rows]))
 
 
 MESHES_A_PART = 64
@@ -184,8 +165,6 @@ class MeshDataModule(ProblemDataModule):
             <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
         train_problems: training problems; problem i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
-        views_on_device: let a Trainer make the training views in batches on its device; none for wherever that is not a
-            CPU. They are those that the loader makes, up to rounding.
         val_fraction: share of the training meshes that is held out for validation.
         val_problems: validation problems, fixed; none for one per held-out mesh.
         test_problems: test problems, fixed; none for one per test mesh. Fewer are a random choice of meshes, more are
@@ -214,7 +193,6 @@ class MeshDataModule(ProblemDataModule):
         *,
         train_problems: int = 40_000,
         fresh_views: bool = False,
-        views_on_device: bool | None = None,
         val_fraction: float = 0.05,
         val_problems: int | None = None,
         test_problems: int | None = None,
@@ -245,24 +223,13 @@ class MeshDataModule(ProblemDataModule):
         self.cameras = RandomCameras(rotation, euler_range, translation_range, distance, focal, noise_px)
         self.num_points, self.pool_size, self.normalisation = num_points, pool_size, normalisation
         self._stores: dict[str, Store] = {}
-        self.fresh, self.views_on_device, self.val_fraction = fresh_views, views_on_device, val_fraction
+        self.fresh, self.val_fraction = fresh_views, val_fraction
 
     def prepare_data(self) -> None:
         """Build the caches in one process, for `setup` to open in all."""
         state = None if self.trainer is None else self.trainer.state.fn
         for part in STAGES[state]:
             self._store(part)
-
-    def train_dataloader(self) -> DataLoader[Batch]:
-        if self.trainer is not None and "train" in self.datasets:
-            elsewhere = self.trainer.strategy.root_device.type != "cpu"
-            self.datasets["train"].keys_only = elsewhere if self.views_on_device is None else self.views_on_device
-        return super().train_dataloader()
-
-    def teardown(self, stage: str) -> None:
-        """Free the samples on the device."""
-        if "train" in self.datasets and isinstance(source := self.datasets["train"].source, MeshSource):
-            source.free()
 
     def _source(self, split: str, seed: tuple[int, int]) -> MeshSource:
         store = self._store(split)

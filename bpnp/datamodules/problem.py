@@ -98,8 +98,6 @@ class ProblemSource(Protocol):
     def counts(self) -> Counts:
         """Points of each problem."""
 
-    def names(self, index: Sequence[int]) -> tuple[str, ...]: ...
-
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
         """Problems as `stacked` makes them: each a function of its index, the epoch and the source's seed."""
 

@@ -70,9 +70,6 @@ class StoredProblems:
         matched = self.store.columns["matched"][self.rows]
         return Counts(matched, *(self.store.counts(name)[self.rows] for name in WIDTHS))
 
-    def names(self, index: Sequence[int]) -> tuple[str, ...]:
-        return tuple(self.store.name(int(self.rows[i])) for i in index)
-
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
         return stacked([stored_problem(self.store, int(self.rows[i])) for i in index.tolist()], index)
 

@@ -31,7 +31,7 @@ def test_an_image_is_its_keypoints_and_the_points_it_sees(tmp_path: Path) -> Non
     truth = plant_model(tmp_path / "m")
     problems = source(tmp_path / "m")
     assert isinstance(problems, ProblemSource)
-    assert problems.names(range(3)) == tuple(f"castle/photo {i}.jpg" for i in range(3))
+    assert problems.batch(torch.arange(3), 0).ids == tuple(f"castle/photo {i}.jpg" for i in range(3))
     for i in range(3):
         problem = problems.problem(i)
         assert residuals(problem).max() < 1e-6

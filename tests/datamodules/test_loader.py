@@ -10,9 +10,9 @@ import torch
 from lightning import LightningDataModule
 from lightning.pytorch.callbacks import ModelCheckpoint
 from small_data import recorded
-from torch.utils.data import DataLoader, SequentialSampler
+from torch.utils.data import DataLoader
 
-from bpnp.datamodules.loader import BucketSampler, ProblemDataset, ProblemLoader, problem_loader
+from bpnp.datamodules.loader import BucketSampler, ProblemDataset, problem_loader
 from bpnp.datamodules.problem import Counts, Problem, stacked
 from bpnp.types import Batch
 
@@ -26,9 +26,6 @@ class Numbered:
     @property
     def counts(self) -> Counts:
         return Counts(self.sizes, self.sizes, self.sizes)
-
-    def names(self, index: Sequence[int]) -> tuple[str, ...]:
-        return tuple(map(str, index))
 
     def batch(self, index: torch.Tensor, epoch: int) -> Batch:
         return stacked([self.problem(i, epoch) for i in index.tolist()], index)
@@ -135,9 +132,6 @@ def test_errors_name_what_is_wrong() -> None:
         sampler([], batch_size=4, shuffle=False)
     with pytest.raises(ValueError, match=r"max_cells.*shuffle=False"):
         sampler([4], batch_size=4, shuffle=True, max_cells=100)
-    problems = dataset([4, 4])
-    with pytest.raises(ValueError, match="expected the loader's BucketSampler, got SequentialSampler"):
-        next(iter(ProblemLoader(problems, sampler=SequentialSampler(problems), batch_size=None)))
 
 
 @pytest.mark.parametrize("workers", [0, 1])

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from small_data import check_pairs, recorded
 
 from bpnp.datamodules.augment import Augmentation, Outliers
-from bpnp.datamodules.loader import ProblemDataset, ProblemKeys, hold_out
+from bpnp.datamodules.loader import ProblemDataset, hold_out
 from bpnp.datamodules.meshes import POINTS, SURFACES, MeshDataModule, MeshSource, RandomCameras
 from bpnp.datamodules.store import Store, new_store, open_store
 from bpnp.types import Batch
@@ -92,9 +92,7 @@ def test_poses_have_the_distributions_of_the_paper(tmp_path: Path) -> None:
 def test_points_behind_the_camera_have_no_image(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="reach 1 from their origin"):
         inside = source(tmp_path, RandomCameras(distance=0.0, noise_px=0.0), count=5)
-    batch = ProblemDataset(inside, Augmentation(outliers=Outliers(ratio=0.2))).batch(
-        ProblemKeys(0, torch.arange(5), inside.names(range(5)))
-    )
+    batch = ProblemDataset(inside, Augmentation(outliers=Outliers(ratio=0.2)))[[(0, i) for i in range(5)]]
     natural = drawn(inside, 5)
     depth = (natural.points3d.double() @ natural.rotation.mT + natural.translation[:, None])[..., 2]
     assert torch.equal(natural.match3d >= 0, depth > 0.1)
@@ -114,7 +112,7 @@ def test_splits_are_by_model(folder: Path, tmp_path: Path) -> None:
     data = module(tmp_path, folder, val_fraction=0.2, val_problems=4, test_problems=3)
     data.prepare_data()
     data.setup()
-    names = {split: list(one.source.names(range(len(one)))) for split, one in data.datasets.items()}
+    names = {split: [one.problem(i).ids[0] for i in range(len(one))] for split, one in data.datasets.items()}
     models = {split: {name.split("#")[0] for name in some} for split, some in names.items()}
     assert [len(models[split]) for split in ("train", "val", "test")] == [8, 2, 3]
     assert [len(names[split]) for split in ("train", "val", "test")] == [20, 4, 3]
@@ -139,34 +137,29 @@ def test_a_bad_mesh_is_left_out_and_a_changed_one_read_again(folder: Path, tmp_p
     bad.write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
     data = module(tmp_path, folder)
     data.setup("test")
-    source = data.datasets["test"].source
-    assert "box1/test/box1_0099#0" in source.names(range(len(data.datasets["test"])))
+    assert "box1/test/box1_0099#0" in {name for batch in data.test_dataloader() for name in batch.ids}
 
 
 def train(folder: Path, **options: object) -> list[Batch]:
     """The batches of two epochs."""
     outliers = Outliers(ratio=(0.0, 1.0), side="random")
-    data = module(folder, train_problems=12, batch_size=4, fresh_views=True, train_outliers=outliers, **options)
+    data = module(folder, train_problems=12, batch_size=4, train_outliers=outliers, **options)
     return recorded(data, default_root_dir=folder, max_epochs=2, limit_val_batches=0)
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_views_made_on_the_device_are_those_of_the_loader(tmp_path: Path) -> None:
-    batches = train(tmp_path, views_on_device=True)
+@pytest.mark.parametrize("fresh", [True, False])
+def test_views_are_drawn_anew_each_epoch_or_fixed_in_any_number_of_processes(tmp_path: Path, fresh: bool) -> None:
+    batches = train(tmp_path, fresh_views=fresh)
     assert [len(batch) for batch in batches] == [4] * 6
     epochs = [torch.cat([b.index for b in batches[:3]]), torch.cat([b.index for b in batches[3:]])]
     assert all(torch.equal(epoch.sort().values, torch.arange(12)) for epoch in epochs)
     poses = {tuple(r.flatten().tolist()) for batch in batches for r in batch.rotation}
-    assert len(poses) == 24
-    for others in (
-        train(tmp_path, views_on_device=True, num_workers=1),
-        train(tmp_path),
-        train(tmp_path, num_workers=2),
-    ):
-        for one, other in zip(batches, others, strict=True):
-            assert one.ids == other.ids
-            assert one.rotation.dtype == torch.float32
-            assert all(torch.equal(getattr(one, f), getattr(other, f)) for f in ("points2d", "points3d", "match3d"))
+    assert len(poses) == (24 if fresh else 12)
+    for one, other in zip(batches, train(tmp_path, fresh_views=fresh, num_workers=2), strict=True):
+        assert one.ids == other.ids
+        assert one.rotation.dtype == torch.float32
+        assert all(torch.equal(getattr(one, f), getattr(other, f)) for f in ("points2d", "points3d", "match3d"))
 
 
 def test_wrong_arguments_are_named(tmp_path: Path) -> None:

@@ -115,9 +115,6 @@ class ColmapSource:
         free = np.array([self._free(scene, image) for scene, image in self.images])
         return Counts(matched, matched + free[:, 0], matched + free[:, 1])
 
-    def names(self, index: Sequence[int]) -> tuple[str, ...]:
-        return tuple(f"{scene.name}/{image.name}" for scene, image in (self.images[i] for i in index))
-
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
         return stacked([self.problem(i, epoch) for i in index.tolist()], index)
 

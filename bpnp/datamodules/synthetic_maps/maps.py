@@ -256,15 +256,9 @@ class MapSource:
         most = np.full(self.count, self.options.num_points)
         return Counts(most, most, most)
 
-    def names(self, index: Sequence[int]) -> tuple[str, ...]:
-        return tuple(f"map/{self.label}/{i:06d}" for i in index)
-
     def batch(self, index: Int[Tensor, " b"], epoch: int) -> Batch:
-        problems = [
-            draw_map_problem(name, self.options, np.random.default_rng([*self.seed, epoch, i]))
-            for name, i in zip(self.names(index.tolist()), index.tolist(), strict=True)
-        ]
-        return stacked(problems, index)
+        rngs = ((i, np.random.default_rng([*self.seed, epoch, i])) for i in index.tolist())
+        return stacked([draw_map_problem(f"map/{self.label}/{i:06d}", self.options, rng) for i, rng in rngs], index)
 
 
 class SyntheticMapDataModule(ProblemDataModule):
