@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import solve
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
-from bpnp.datamodules.surfaces import normalise, procedural_shape, sample_surface
+from bpnp.datamodules.shapes import procedural_shape
+from bpnp.datamodules.surfaces import normalise, sample_surface
 
 Problem = tuple[str, Array, Array, Array, Array]  # name, points2d, points3d, rotation, translation
 POINTS, NOISE = 400, 2 / 800

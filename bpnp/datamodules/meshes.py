@@ -18,13 +18,15 @@ from bpnp.datamodules.augment import picked
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
+from bpnp.datamodules.shapes import Sampler, Shapes, open_shapes, procedural_shapes
 from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store, prepare
-from bpnp.datamodules.surfaces import MeshError, MeshFiles, Normalisation, ProceduralShapes, open_archive
+from bpnp.datamodules.surfaces import MeshError, Normalisation, normalise
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 
 POINTS = "points"  # the bulk column of a store of surface samples
 SURFACES = "surfaces"  # the kind of such a store
+MESHES_A_PART = 64  # sampled by a process at a time
 MIN_DEPTH = 0.1  # scene units; nothing nearer to the camera is seen
 
 
@@ -149,10 +151,6 @@ class MeshSource:
         )
 
 
-MESHES_A_PART = 64
-MeshArchive = MeshFiles | ProceduralShapes
-
-
 class MeshDataModule(ProblemDataModule):
     """Virtual cameras around meshes, by default as in Campbell et al. (ECCV 2020), or around procedural shapes.
 
@@ -266,71 +264,60 @@ class MeshDataModule(ProblemDataModule):
         """The surface samples of a part, opened once, and made now if they are not there."""
         split = "all" if self.root is not None else "test" if part == "predict" else part
         if split not in self._stores:
-            self._stores[split] = open_surfaces(
-                self.root or ProceduralShapes(split, self.seed, range(self.num_shapes[split])),
-                points=self.pool_size,
-                normalisation=self.normalisation,
-                cache_dir=self.cache_dir,
-            )
+            self._stores[split] = self._opened(split)
         return self._stores[split]
+
+    def _opened(self, split: str) -> Store:
+        if self.root is None:
+            shapes = procedural_shapes(split, self.num_shapes[split], seed=self.seed)
+            label = f"procedural-{split}"
+        elif not is_store(self.root):
+            shapes, label = open_shapes(self.root), self.root.resolve().name
+        else:
+            store = open_store(self.root, SURFACES)
+            if (stored := store.parameters["normalisation"]) != self.normalisation:
+                raise StoreError(
+                    f"expected meshes of `normalisation` {self.normalisation}, got {stored} in {self.root}; try "
+                    f"{stored}, or preparing again with --normalisation {self.normalisation}"
+                )
+            return store
+        recipe = surfaces_recipe(shapes, points=self.pool_size, normalisation=self.normalisation, label=label)
+        return cached(recipe, label, self.cache_dir)
 
 
 def prepare_meshes(source: Path, output: Path, *, points: int, normalisation: Normalisation, processes: int) -> Store:
-    """Keep `points` surface samples of every mesh of `source` (see `open_archive`), for `MeshDataModule(root=output)`.
+    """Keep `points` surface samples of every mesh of `source` (see `open_shapes`), for `MeshDataModule(root=output)`.
 
     Meshes that cannot be used are left out and listed. If `output` has been made from the same source in the same way
     it is left as it is. Raises ValueError, StoreError or OSError: unusable source, no usable mesh, another `output`.
     """
-    recipe = surfaces_recipe(open_archive(source), points=points, normalisation=normalisation, label=str(source))
+    recipe = surfaces_recipe(open_shapes(source), points=points, normalisation=normalisation, label=str(source))
     return prepare(recipe, output, processes=processes)
 
 
-def surfaces_recipe(archive: MeshArchive, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
-    """How the store of an archive's meshes is made. label: what the meshes are, for messages."""
-    starts = range(0, len(archive.names), MESHES_A_PART)
+def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
+    """How the store of surface samples is made. label: what the shapes are, for messages."""
+    samplers = list(shapes.samplers.items())
+    starts = range(0, len(samplers), MESHES_A_PART)
     return Recipe(
         kind=SURFACES,
         widths={POINTS: 3},
-        parameters={"points": points, "normalisation": normalisation, "source": archive.identity},
-        jobs=[(archive.part(start, start + MESHES_A_PART), points, normalisation) for start in starts],
-        work=sampled_rows,
+        parameters={"points": points, "normalisation": normalisation, "source": shapes.identity},
+        jobs=[(samplers[start : start + MESHES_A_PART], points, normalisation) for start in starts],
+        work=_sampled_rows,
         what="mesh",
         source=label,
     )
 
 
-def sampled_rows(archive: MeshArchive, count: int, mode: Normalisation) -> Made:
-    """Samples of all meshes of an archive."""
+def _sampled_rows(samplers: Sequence[tuple[str, Sampler]], count: int, mode: Normalisation) -> Made:
     rows: list[Row] = []
     skipped = {}
-    for name in archive.names:
+    for name, sampler in samplers:
         try:
-            samples = archive.samples(name, count, mode)
+            samples = normalise(sampler(count), mode)
         except (MeshError, OSError) as error:
             skipped[name] = str(error)
         else:
             rows.append((name, {POINTS: samples}, {"radius": float(np.linalg.norm(samples, axis=-1).max())}))
     return rows, skipped
-
-
-def open_surfaces(
-    source: Path | ProceduralShapes, *, points: int, normalisation: Normalisation, cache_dir: str | None
-) -> Store:
-    """The store `source`, or the cached store of its meshes, made if it is not there.
-
-    Raises ValueError as `open_archive`; StoreError for a store of another `normalisation`.
-    """
-    if isinstance(source, ProceduralShapes):
-        archive: MeshArchive = source
-        label = f"procedural-{source.split}"
-    elif not is_store(source):
-        archive, label = open_archive(source), source.resolve().name
-    else:
-        store = open_store(source, SURFACES)
-        if (stored := store.parameters["normalisation"]) != normalisation:
-            raise StoreError(
-                f"expected meshes of `normalisation` {normalisation}, got {stored} in {source}; try {stored}, or "
-                f"preparing again with --normalisation {normalisation}"
-            )
-        return store
-    return cached(surfaces_recipe(archive, points=points, normalisation=normalisation, label=label), label, cache_dir)

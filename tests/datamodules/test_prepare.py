@@ -24,7 +24,7 @@ from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.colmap.module import prepare_colmap
 from bpnp.datamodules.meshes import POINTS, SURFACES, prepare_meshes
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
-from bpnp.datamodules.surfaces import MeshFiles, normalise, read_mesh, sample_surface
+from bpnp.datamodules.surfaces import Mesh, normalise, read_mesh, sample_surface
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",
@@ -254,25 +254,24 @@ def test_no_kill_leaves_a_wrong_store(
 
 
 class Stopping:
-    """Samples meshes of any archive until `left` have been sampled; counts them by name."""
+    """Samples meshes until `left` have been sampled; counts them."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, left: int = 1000) -> None:
-        self.names: list[str] = []
-        whole = MeshFiles.samples
+        self.count = 0
 
-        def samples(archive: MeshFiles, name: str, count: int, mode: str) -> np.ndarray:
-            if len(self.names) == left:
+        def samples(mesh: Mesh, count: int, rng: np.random.Generator) -> np.ndarray:
+            if self.count == left:
                 raise KeyboardInterrupt
-            self.names.append(name)
-            return whole(archive, name, count, mode)
+            self.count += 1
+            return sample_surface(mesh, count, rng)
 
-        monkeypatch.setattr(MeshFiles, "samples", samples)
+        monkeypatch.setattr("bpnp.datamodules.shapes.sample_surface", samples)
 
 
 def test_ctrl_c_says_that_nothing_was_written(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    Stopping(monkeypatch, 9)
+    Stopping(monkeypatch, 3)
     with pytest.raises(SystemExit) as ended:
         main(["prepare", "modelnet40", str(meshes), "--output", str(tmp_path / "store"), "--processes", "1"])
     assert ended.value.code == 130
@@ -294,7 +293,7 @@ def end_worker(parent: int) -> Made:
 
 
 def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(MeshFiles, "samples", lambda *_: run(meshes, tmp_path / "store"))
+    monkeypatch.setattr("bpnp.datamodules.shapes.sample_surface", lambda *_: run(meshes, tmp_path / "store"))
     with pytest.raises(ValueError, match="no other process writes to"):
         run(meshes, tmp_path / "store")
 
@@ -387,7 +386,7 @@ def test_meshes_that_were_not_prepared_are_sampled_into_the_cache_once(
     (folder,) = (tmp_path / "cache").iterdir()
     check(opened(folder), meshes)
     module(meshes, tmp_path / "cache")
-    assert len(counted.names) == 19
+    assert counted.count == 12
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     for name in ("points.npy", "radius.npy", "manifest.json"):
         damaged = bytearray(before[name])
@@ -396,7 +395,7 @@ def test_meshes_that_were_not_prepared_are_sampled_into_the_cache_once(
         with pytest.warns(UserWarning, match=rf"the cached store {folder} is damaged .*; making it again"):
             module(meshes, tmp_path / "cache")
         assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
-    assert len(counted.names) == 4 * 19
+    assert counted.count == 4 * 12
 
 
 def test_the_cache_is_the_users_wherever_the_work_is(

@@ -1,27 +1,24 @@
 """Procedural shapes: reproducible, disjoint between splits, varied, and without a symmetry that would hide the pose."""
 
-from pathlib import Path
-
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
-from bpnp.datamodules.meshes import POINTS, open_surfaces
-from bpnp.datamodules.store import Store
-from bpnp.datamodules.surfaces import ProceduralShapes, normalise, procedural_shape, sample_surface
+from bpnp.datamodules.shapes import procedural_shape, procedural_shapes
+from bpnp.datamodules.surfaces import normalise, sample_surface
 
 
-def shapes(folder: Path, split: str, count: int, *, seed: int = 0) -> Store:
-    drawn = ProceduralShapes(split, seed, range(count))
-    return open_surfaces(drawn, points=64, normalisation="unit_sphere", cache_dir=str(folder))
+def samples(split: str, count: int, *, seed: int = 0) -> np.ndarray:
+    shapes = procedural_shapes(split, count, seed=seed)
+    assert list(shapes.samplers) == [f"procedural/{split}/00000{i}" for i in range(count)]
+    return np.stack([sampler(64) for sampler in shapes.samplers.values()])
 
 
-def test_a_shape_depends_on_seed_split_and_number_alone(tmp_path: Path) -> None:
-    few, many = shapes(tmp_path / "0", "train", 3), shapes(tmp_path / "1", "train", 6)
-    np.testing.assert_array_equal(few.bulk[POINTS], many.bulk[POINTS][: 3 * 64])
-    assert [few.name(i) for i in range(3)] == [f"procedural/train/00000{i}" for i in range(3)]
-    others = [shapes(tmp_path, "test", 3), shapes(tmp_path, "val", 3), shapes(tmp_path, "train", 3, seed=1)]
-    drawn = np.concatenate([many.bulk[POINTS], *(other.bulk[POINTS] for other in others)]).reshape(15, -1)
+def test_a_shape_depends_on_seed_split_and_number_alone() -> None:
+    few, many = samples("train", 3), samples("train", 6)
+    np.testing.assert_array_equal(few, many[:3])
+    others = samples("test", 3), samples("val", 3), samples("train", 3, seed=1)
+    drawn = np.concatenate([many, *others]).reshape(15, -1)
     assert len(np.unique(drawn, axis=0)) == 15
 
 

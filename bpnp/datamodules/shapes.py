@@ -1,0 +1,196 @@
+"""Collections of shapes to sample: procedural ones, and meshes in a folder, in a zip or as rows of HDF5 files."""
+
+import importlib
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cache, lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from bpnp.datamodules.surfaces import SUFFIXES, Mesh, MeshError, parse_mesh, read_mesh, sample_surface
+from bpnp.files import files_as_they_are, fingerprint
+from bpnp.geometry import random_rotations
+
+VERSION = 1  # of procedural shapes, raised whenever the same seed makes another one
+PARTS = ("train", "val", "test")
+SPLITS = ("train", "test")
+LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
+ENTRY = re.compile(rf"(?:.*/)?([^/]+)/(train|test)/([^/.][^/]*)(?:{'|'.join(map(re.escape, SUFFIXES))})", re.I)
+Sampler = Callable[[int], NDArray[np.float64]]
+
+
+@dataclass(frozen=True)
+class Shapes:
+    """By the name of each shape a function that gives so many samples (k, 3) of its surface, or raises MeshError.
+
+    The samples are a function of the shape and its name. identity: another one if any shape is another.
+    """
+
+    samplers: Mapping[str, Sampler]
+    identity: str
+
+
+def procedural_shapes(split: str, count: int, *, seed: int) -> Shapes:
+    """The shapes of a split: train, val or test. No shape belongs to two splits or two seeds.
+
+    Shape i does not depend on their number. Raises ValueError for none.
+    """
+    if count < 1:
+        raise ValueError(f"expected at least one procedural {split} shape, got {count}")
+    samplers = {
+        f"procedural/{split}/{i:06d}": partial(_procedural_samples, (seed, PARTS.index(split), i)) for i in range(count)
+    }
+    return Shapes(samplers, fingerprint(["procedural", VERSION, split, seed, list(range(count))]))
+
+
+def _procedural_samples(seed: tuple[int, ...], count: int) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    return sample_surface(procedural_shape(rng), count, rng)
+
+
+def procedural_shape(rng: np.random.Generator) -> Mesh:
+    """2 to 6 primitives, each stretched, tapered, turned and centred on the surface of an earlier one.
+
+    Nothing is mirrored or repeated, so that a shape has one pose only, up to chance.
+    """
+    parts = [_part(rng, 1.0)]
+    for _ in range(rng.integers(1, 6)):
+        host = parts[rng.integers(len(parts))]
+        part = _part(rng, rng.uniform(0.4, 0.9))
+        parts.append(Mesh(part.vertices + sample_surface(host, 1, rng), part.faces))
+    offsets = np.cumsum([0] + [len(part.vertices) for part in parts[:-1]])
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + offset for part, offset in zip(parts, offsets, strict=True)]),
+    )
+
+
+def _part(rng: np.random.Generator, size: float) -> Mesh:
+    solid = primitives()[rng.integers(len(primitives()))]
+    vertices = size * rng.uniform(0.2, 1.0, 3) * solid.vertices
+    along = vertices[:, 2:] / np.abs(vertices[:, 2]).max()
+    vertices = np.hstack([vertices[:, :2] * (1 + rng.uniform(-0.6, 0.6) * along), vertices[:, 2:]])
+    return Mesh(vertices @ random_rotations(1, rng)[0].numpy().T, solid.faces)
+
+
+@cache
+def primitives() -> tuple[Mesh, ...]:
+    """Solids of about unit radius: box, wedge, cylinder, cone, capsule, two tori, ball, tube, vase."""
+    create = trimesh.creation
+    profile = np.array([[0.0, -1.0], [0.7, -1.0], [0.3, -0.2], [0.9, 0.5], [0.5, 1.0], [0.0, 1.0]])
+    solids = [
+        create.box(extents=(2, 2, 2)),
+        create.extrude_triangulation(np.array([[-1.0, -1.0], [1.0, -1.0], [-1.0, 1.0]]), np.array([[0, 1, 2]]), 1.5),
+        create.cylinder(radius=1, height=2, sections=24),
+        create.cone(radius=1, height=2, sections=24),
+        create.capsule(radius=0.6, height=1, count=(12, 12)),
+        create.torus(0.75, 0.25, 24, 10),
+        create.torus(0.9, 0.1, 24, 8),
+        create.icosphere(subdivisions=2),
+        create.annulus(r_min=0.7, r_max=1, height=1.5, sections=24),
+        create.revolve(profile, sections=24),
+    ]
+    return tuple(Mesh(np.asarray(s.vertices, np.float64), np.asarray(s.faces, np.int64)) for s in solids)
+
+
+def open_shapes(source: Path) -> Shapes:
+    """The meshes of `source`: ModelNet40.zip, its folder, the folder of its HDF5 files, or any folder in its layout.
+
+    Their names are ``<class>/<split>/<stem>``; the training meshes come first. Raises ValueError that names the file or
+    folder: missing, empty, foreign, or h5py not installed.
+    """
+    if source.is_file():
+        try:
+            entries = _named(_open(source).namelist())
+        except (zipfile.BadZipFile, OSError) as error:
+            raise ValueError(f"expected a zip of meshes, got {source} ({error}); try downloading it again") from error
+        if not entries:
+            raise ValueError(f"expected meshes {LAYOUT} in {source}, got none; try ModelNet40.zip")
+        return _of_files({name: partial(_packed_mesh, source, entry) for name, entry in entries.items()}, [source])
+    if not source.is_dir():
+        raise ValueError(f"expected a folder with {LAYOUT}, or ModelNet40.zip, got {source}, which is not there")
+    for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
+        if list(folder.glob("ply_data_*.h5")):
+            return _sampled_shapes(folder)
+        if entries := _named(str(path) for path in folder.glob("*/*/*") if path.is_file()):
+            paths = [Path(path) for path in entries.values()]
+            return _of_files({name: partial(read_mesh, Path(path)) for name, path in entries.items()}, paths)
+    raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
+
+
+def _of_files(meshes: Mapping[str, Callable[[], Mesh]], files: Iterable[Path]) -> Shapes:
+    samplers = {name: partial(_mesh_samples, name, mesh) for name, mesh in meshes.items()}
+    return Shapes(samplers, fingerprint([list(meshes), files_as_they_are(files)]))
+
+
+def _mesh_samples(name: str, mesh: Callable[[], Mesh], count: int) -> NDArray[np.float64]:
+    return sample_surface(mesh(), count, np.random.default_rng(zlib.crc32(name.encode())))
+
+
+def _packed_mesh(archive: Path, entry: str) -> Mesh:
+    try:
+        return parse_mesh(_open(archive).read(entry), Path(entry).suffix)
+    except (MeshError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
+        raise MeshError(f"{archive}/{entry}: {error}") from error
+
+
+def _named(paths: Iterable[str]) -> dict[str, str]:
+    """Path of each mesh by its name; others are no meshes."""
+    meshes = (ENTRY.fullmatch(path) for path in paths if "__MACOSX" not in path)
+    entries = {f"{mesh[1]}/{mesh[2].lower()}/{mesh[3]}": mesh[0] for mesh in meshes if mesh}
+    order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
+    return {name: entries[name] for name in order}
+
+
+def _sampled_shapes(folder: Path) -> Shapes:
+    """The rows of points in the HDF5 files of ``modelnet40_ply_hdf5_2048``."""
+    names = folder / "shape_names.txt"
+    if not names.is_file():
+        raise ValueError(f"expected {names} beside the HDF5 files, got none; try unpacking the archive again")
+    classes = names.read_text(encoding="utf-8").split()
+    samplers: dict[str, Sampler] = {}
+    paths = [path for split in SPLITS for path in sorted(folder.glob(f"ply_data_{split}*.h5"))]
+    for path in paths:
+        try:
+            file, split = _open(path), path.stem.removeprefix("ply_data_").rstrip("0123456789")
+            labels, shape = np.asarray(file["label"]).reshape(-1), file["data"].shape
+            if len(shape) != 3 or len(labels) != shape[0]:
+                raise ValueError(f"{len(labels)} labels for {shape}")
+            rows = [f"{classes[label]}/{split}/{path.stem}-{row:04d}" for row, label in enumerate(labels)]
+        except (OSError, KeyError, IndexError, ValueError) as error:
+            raise ValueError(
+                f"expected `data` (k, points, 3) and k of `label` in {path}, got something else ({error}); try "
+                "unpacking the archive again"
+            ) from error
+        samplers |= {name: partial(_stored_samples, name, path, row) for row, name in enumerate(rows)}
+    return Shapes(samplers, fingerprint([list(samplers), files_as_they_are(paths)]))
+
+
+def _stored_samples(name: str, path: Path, row: int, count: int) -> NDArray[np.float64]:
+    points = np.asarray(_open(path)["data"][row], np.float64)
+    if points.shape[0] < count or points.shape[1:] != (3,) or not np.isfinite(points).all():
+        raise MeshError(f"{path}: expected {count} finite points, got shape {points.shape} in row {row}")
+    return np.random.default_rng(zlib.crc32(name.encode())).permutation(points)[:count]
+
+
+def _open(path: Path) -> Any:
+    """A file of many meshes, kept open for the next one of this process; a file that has changed is another."""
+    return _opened(path, os.getpid(), *files_as_they_are([path]))
+
+
+@lru_cache(maxsize=8)
+def _opened(path: Path, process: int, stamp: tuple[str, int, int]) -> Any:
+    if path.suffix != ".h5":
+        return zipfile.ZipFile(path)
+    try:
+        return importlib.import_module("h5py").File(path, "r")  # optional
+    except ImportError as error:
+        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error
