@@ -86,14 +86,14 @@ def _check(name: str, value: Any, kind: Any, sizes: dict[str, tuple[int, str]]) 
 def listed(name: str, values: Arrays, ndim: int) -> list[Tensor]:
     """One array of `ndim` axes, a stack of them, or a sequence of them, as a list of CPU tensors."""
     if isinstance(values, (list, tuple)) and values and np.ndim(values[0]) == ndim:
-        return [_as_tensor(name, v) for v in values]
-    array = _as_tensor(name, values)
+        return [as_tensor(name, v) for v in values]
+    array = as_tensor(name, values)
     if array.numel() == 0 and array.ndim != ndim:
         raise ValueError(f"expected at least one problem, got an empty `{name}`")
     return list(array) if array.ndim == ndim + 1 else [array]
 
 
-def _as_tensor(name: str, values: Arrays) -> Tensor:
+def as_tensor(name: str, values: Arrays) -> Tensor:
     if isinstance(values, Tensor):
         return values.cpu()
     try:
@@ -103,7 +103,7 @@ def _as_tensor(name: str, values: Arrays) -> Tensor:
         raise ValueError(f"expected `{name}` as an array of numbers or a list of them, got {values!r:.80}") from error
 
 
-def checked_points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
+def checked_points(name: str, i: int | str, points: Tensor, dim: int) -> Tensor:
     """The points of problem i, (k, dim). Raises ValueError for another shape, none of them, NaN or infinity."""
     if points.ndim != 2 or points.shape[1] != dim:
         hint = " (are points2d and points3d swapped?)" if points.ndim == 2 and points.shape[1] in (2, 3) else ""
@@ -116,7 +116,7 @@ def checked_points(name: str, i: int, points: Tensor, dim: int) -> Tensor:
     return points
 
 
-def checked_match(i: int, match: Tensor, m: int, n: int) -> Tensor:
+def checked_match(i: int | str, match: Tensor, m: int, n: int) -> Tensor:
     """The match3d of problem i, (n,). Raises ValueError for another shape, no integers, or what is no 2D point."""
     if match.shape != (n,):
         raise ValueError(f"expected `match3d` of shape ({n},), one a 3D point, got {tuple(match.shape)} in problem {i}")
@@ -125,7 +125,8 @@ def checked_match(i: int, match: Tensor, m: int, n: int) -> Tensor:
             f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in problem {i}; try .astype(int)"
         )
     if int(match.min()) < -1 or int(match.max()) >= m:
-        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {int(match.min())} to {int(match.max())}")
+        reach = f"{int(match.min())} to {int(match.max())}"
+        raise ValueError(f"expected `match3d` between -1 and {m - 1}, got {reach} in problem {i}")
     return match.long()
 
 

@@ -10,6 +10,7 @@ from jaxtyping import Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.checks import as_tensor, checked_match, checked_points
 from bpnp.types import Batch
 
 
@@ -49,31 +50,21 @@ class Problem:
         Raises ValueError that names the problem: shapes that do not fit, NaN or infinity, or a match3d that holds no
         integers, an index that is no 2D point, or one 2D point twice.
         """
-        m, n, match = len(points2d), len(points3d), np.asarray(match3d)
-        shapes = np.shape(points2d), np.shape(points3d), match.shape
-        if shapes != ((m, 2), (n, 3), (n,)):
-            raise ValueError(
-                f"expected `points2d` (m, 2), `points3d` (n, 3) and `match3d` (n,), got {shapes} in {name!r}"
-            )
-        if not np.issubdtype(match.dtype, np.integer):
-            raise ValueError(
-                f"expected `match3d` as integers, indices of 2D points, got {match.dtype} in {name!r}; try .astype(int)"
-            )
-        if n and not -1 <= match.min() <= match.max() < m:
-            raise ValueError(
-                f"expected `match3d` between -1 and {m - 1}, got {match.min()} to {match.max()} in {name!r}"
-            )
-        numbers = (points2d, points3d, rotation, translation, focal, 0.0 if origin is None else origin)
-        if not all(np.isfinite(values).all() for values in numbers):
-            raise ValueError(f"expected finite points, pose and focal, got NaN or infinity in {name!r}")
+        which = repr(name)
+        set2d = checked_points("points2d", which, as_tensor("points2d", points2d), 2).numpy()
+        set3d = checked_points("points3d", which, as_tensor("points3d", points3d), 3).numpy()
+        match = checked_match(which, as_tensor("match3d", match3d), len(set2d), len(set3d)).numpy()
+        origins = () if origin is None else (origin,)
+        if not all(np.isfinite(values).all() for values in (rotation, translation, focal, *origins)):
+            raise ValueError(f"expected a finite pose, focal and origin, got NaN or infinity in problem {which}")
         matched3d = np.flatnonzero(match >= 0)
         matched2d = match[matched3d]
         if len(np.unique(matched2d)) < len(matched2d):
-            raise ValueError(f"expected at most one 3D point for each 2D point, got two in `match3d` of {name!r}")
+            raise ValueError(f"expected at most one 3D point for each 2D point, got two in `match3d` of {which}")
         return cls(
             name,
-            points2d[np.concatenate([matched2d, np.setdiff1d(np.arange(m), matched2d)])].astype(np.float32),
-            points3d[np.concatenate([matched3d, np.flatnonzero(match < 0)])].astype(np.float32),
+            set2d[np.concatenate([matched2d, np.setdiff1d(np.arange(len(set2d)), matched2d)])].astype(np.float32),
+            set3d[np.concatenate([matched3d, np.flatnonzero(match < 0)])].astype(np.float32),
             len(matched3d),
             np.asarray(rotation, np.float64),
             np.asarray(translation, np.float64),

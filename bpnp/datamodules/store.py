@@ -11,7 +11,7 @@ import warnings
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -94,16 +94,10 @@ def open_store(folder: str | Path, kind: str) -> Store:
 
 def _mapped(folder: Path, kind: str) -> Store:
     manifest = _manifest(folder, kind)
-    bulk = {name: np.asarray(_loaded(folder / f"{name}.npy")) for name in manifest["bulk"]}
+    bulk = {name: np.asarray(np.load(folder / f"{name}.npy", mmap_mode="r")) for name in manifest["bulk"]}
     starts = {name: np.load(folder / f"{name}_start.npy") for name in manifest["bulk"]}
     columns = {name: np.load(folder / f"{name}.npy") for name in manifest["columns"]}
     return Store(folder, kind, bulk, starts, columns, manifest["parameters"], manifest["skipped"])
-
-
-def _loaded(file: Path) -> NDArray[Any]:
-    with suppress(ValueError):  # no file can be mapped that has no points
-        return np.load(file, mmap_mode="r")
-    return np.load(file)
 
 
 def _manifest(folder: Path, kind: str) -> dict[str, Any]:
@@ -133,13 +127,13 @@ class StoreWriter:
     parameters: kept in the manifest, must be JSON. skipped: what was left out, and why; may be added to.
     """
 
-    def __init__(self, folder: Path, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
-        self.folder, self._files, self._widths = folder, files, widths
+    def __init__(self, files: Mapping[str, BinaryIO], widths: Mapping[str, int]) -> None:
+        self._files, self._widths = files, widths
         self._columns: dict[str, list[Any]] = defaultdict(list, {f"{name}_start": [0] for name in widths}, name=[])
         self.parameters: dict[str, Any] = {}
         self.skipped: dict[str, str] = {}
         for name, width in widths.items():
-            _write_header(files[name], (0, width))
+            _write_header(files[name], BULK, (0, width))
 
     def __len__(self) -> int:
         return len(self._columns["name"])
@@ -153,23 +147,23 @@ class StoreWriter:
         for key, value in {"name": name.encode(), **columns}.items():
             self._columns[key].append(value.encode() if isinstance(value, str) else value)
 
-    def finish(self, kind: str) -> None:
+    def finish(self, folder: Path, kind: str) -> None:
         """Write what is left: the small columns, and the manifest last."""
         for key, file in self._files.items():
             file.seek(0)
-            _write_header(file, (self._columns[f"{key}_start"][-1], self._widths[key]))
+            _write_header(file, BULK, (self._columns[f"{key}_start"][-1], self._widths[key]))
             file.flush()
         for key, values in self._columns.items():
             column = np.array(values) if values else np.empty(0, "S1")
-            with (self.folder / f"{key}.npy").open("wb") as file:  # np.save hides the reason why a write fails
-                np.lib.format.write_array_header_1_0(file, np.lib.format.header_data_from_array_1_0(column))
-                file.write(np.ascontiguousarray(column).data)
-        files = {path.name: [path.stat().st_size, _checksum(path)] for path in sorted(self.folder.glob("*.npy"))}
+            with (folder / f"{key}.npy").open("wb") as file:  # np.save hides the reason why a write fails
+                _write_header(file, column.dtype, column.shape)
+                file.write(column.data)
+        files = {path.name: [path.stat().st_size, _checksum(path)] for path in sorted(folder.glob("*.npy"))}
         small = [key for key in self._columns if key.removesuffix("_start") not in self._widths]
         manifest = {"format": FORMAT, "kind": kind, "rows": len(self), "bulk": list(self._widths), "columns": small}
         manifest |= {"files": files, "parameters": self.parameters, "skipped": self.skipped}
         content = json.dumps(manifest | {"checksum": fingerprint(manifest)}, indent=1)
-        (self.folder / MANIFEST).write_text(content, encoding="utf-8")
+        (folder / MANIFEST).write_text(content, encoding="utf-8")
 
 
 @contextmanager
@@ -185,14 +179,14 @@ def new_store(folder: Path, kind: str, widths: Mapping[str, int]) -> Iterator[St
         temporary.mkdir()
         with ExitStack() as stack:
             files = {name: stack.enter_context((temporary / f"{name}.npy").open("wb")) for name in widths}
-            writer = StoreWriter(temporary, files, widths)
+            writer = StoreWriter(files, widths)
             yield writer
-            writer.finish(kind)
+            writer.finish(temporary, kind)
 
 
-def _write_header(file: BinaryIO, shape: tuple[int, ...]) -> None:
+def _write_header(file: BinaryIO, dtype: np.dtype[Any], shape: tuple[int, ...]) -> None:
     """Write the header of a .npy file; numpy pads it to the same size for any number of rows."""
-    np.lib.format.write_array_header_1_0(file, {"descr": BULK.str, "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype.str, "fortran_order": False, "shape": shape})
 
 
 @dataclass(frozen=True)
@@ -286,23 +280,14 @@ def _make(recipe: Recipe, output: Path, processes: int) -> None:
 
 def _made(recipe: Recipe, processes: int) -> Iterator[Made]:
     """What the jobs give, in their order. A loader's workers end with this process, however it ends."""
-    if processes == 1:
-        return (recipe[number] for number in range(len(recipe)))
-    workers = min(processes, len(recipe))
+    workers = 0 if processes == 1 else min(processes, len(recipe))
     generator = torch.Generator()  # else the seeds of the workers are drawn from the global one
-    loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=_unchanged, generator=generator)
+    loader = DataLoader(recipe, batch_size=None, num_workers=workers, collate_fn=tuple, generator=generator)
     with interruptions_later():  # the workers leave Ctrl-C to this process
-        return _of_workers(iter(loader), recipe.source)
-
-
-def _of_workers(made: Iterator[Made], source: str) -> Iterator[Made]:
+        made = iter(loader)
     try:
         yield from made
     except RuntimeError as error:
         raise OSError(
-            f"a process that was reading {source} ended, possibly out of memory ({error}); try fewer --processes"
+            f"a process that was reading {recipe.source} ended, possibly out of memory ({error}); try fewer --processes"
         ) from error
-
-
-def _unchanged(made: Any) -> Any:
-    return made

@@ -117,7 +117,11 @@ class StoredDataModule(ProblemDataModule):
         **loading: Any,
     ) -> None:
         super().__init__(**loading)
-        check_limits(min_points, max_points, eval_max_points)
+        if min_points < MIN_POINTS:
+            raise ValueError(f"expected `min_points` of {MIN_POINTS} or more, got {min_points}; fewer fix no pose")
+        for most in (max_points, eval_max_points):
+            if most is not None and most < min_points:
+                raise ValueError(f"expected `max_points` of at least `min_points` = {min_points}, got {most}")
         if not clutter < np.inf:
             raise ValueError(f"expected a finite `clutter`, got {clutter}; 0.5 adds half as many points")
         self.root, self.min_points, self.clutter, self.fresh = root, min_points, clutter, fresh_subsets
@@ -186,8 +190,7 @@ def split_scenes(
 
     Raises ValueError for a name that is not in `scenes`, a scene in two lists, or a fraction outside [0, 1].
     """
-    lists = {"train": train, "val": val, "test": test}
-    split = {part: list(names) for part, names in lists.items() if names is not None}
+    split = {part: list(names) for part, names in (("train", train), ("val", val), ("test", test)) if names is not None}
     fractions = {"test": test_fraction, "val": val_fraction}
     named = [name for names in split.values() for name in names]
     if unknown := [name for name in named if name not in scenes]:
@@ -205,15 +208,6 @@ def split_scenes(
             share = min(share, len(rest) - (part == "val" and train is None)) if rest else 0
             split[part], rest = sorted(rest[:share]), rest[share:]
     return {"train": sorted(rest), **split}
-
-
-def check_limits(min_points: int, *max_points: int | None) -> None:
-    """Raises ValueError for fewer than 4 points, or a largest number below the smallest."""
-    if min_points < MIN_POINTS:
-        raise ValueError(f"expected `min_points` of {MIN_POINTS} or more, got {min_points}: fewer do not fix a pose")
-    for most in max_points:
-        if most is not None and most < min_points:
-            raise ValueError(f"expected `max_points` of at least `min_points` = {min_points}, got {most}")
 
 
 def large_enough(matched: NDArray[np.int64], min_points: int, where: str) -> NDArray[np.int64]:

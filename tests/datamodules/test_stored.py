@@ -60,12 +60,12 @@ def test_pairs_come_back(store: Store) -> None:
 
 
 WRONG = [
-    ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in 'a/1'; try .astype"),
-    ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in 'a/1'"),
-    ({"match3d": np.arange(3)}, r"`match3d` \(n,\), got .* in 'a/1'"),
+    ({"match3d": np.array([0.0, 1.5, -1.0, 2.0])}, "`match3d` as integers.*float64 in problem 'a/1'; try .astype"),
+    ({"match3d": np.array([0, 1, -1, 4])}, "`match3d` between -1 and 3, got -1 to 4 in problem 'a/1'"),
+    ({"match3d": np.arange(3)}, r"`match3d` of shape \(4,\).* in problem 'a/1'"),
     ({"match3d": np.array([0, 1, 1, 2])}, "at most one 3D point for each 2D point, got two in `match3d` of 'a/1'"),
-    ({"points2d": np.full((4, 2), np.nan)}, "finite points, pose and focal.*'a/1'"),
-    ({"translation": np.full(3, np.inf)}, "finite points, pose and focal.*'a/1'"),
+    ({"points2d": np.full((4, 2), np.nan)}, "finite `points2d`.*'a/1'"),
+    ({"translation": np.full(3, np.inf)}, "finite pose, focal and origin.*'a/1'"),
 ]
 
 
