@@ -26,9 +26,12 @@ def written_whole(path: Path) -> Iterator[Path]:
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        with named(path):
-            yield temporary
-            os.replace(temporary, path)
+        yield temporary
+        os.replace(temporary, path)
+    except OSError as error:
+        if error.filename is None and error.errno is not None:  # a write to a full disk does not say to which file
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
     finally:
         if temporary.is_dir():
             shutil.rmtree(temporary)
@@ -41,17 +44,6 @@ def write_text(path: Path, text: str) -> Path:
     with written_whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="")
     return path
-
-
-@contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Errors of the disk that name no file name `path`: a write to a full disk does not say which file it was."""
-    try:
-        yield
-    except OSError as error:
-        if error.filename is None and error.errno is not None:
-            raise OSError(error.errno, error.strerror, str(path)) from error
-        raise
 
 
 @contextmanager

@@ -12,7 +12,6 @@ Source: https://colmap.github.io/format.html
 import mmap
 import re
 import struct
-from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -181,7 +180,6 @@ class _Cursor:
 _COUNT = struct.Struct("<Q")
 _CAMERA = struct.Struct("<Ii2Q")
 _IMAGE = struct.Struct("<I7dI")
-CHUNK = 2**16  # points that are copied at a time
 
 
 def _cameras(cursor: _Cursor) -> Iterator[tuple[int, CameraRecord]]:
@@ -199,26 +197,17 @@ def _cameras(cursor: _Cursor) -> Iterator[tuple[int, CameraRecord]]:
 
 def _images(cursor: _Cursor) -> Iterator[ImageRecord]:
     for _ in cursor.records():
-        image_id, *pose, camera_id = cursor.take(_IMAGE)
-        name = cursor.string()
+        image_id, *numbers, camera_id = cursor.take(_IMAGE)
+        name, pose = cursor.string(), np.array(numbers)
         keypoints = cursor.array(KEYPOINT, cursor.take(_COUNT)[0])
-        quaternion, translation = np.array(pose[:4]), np.array(pose[4:])
-        yield ImageRecord(
-            name, image_id, camera_id, quaternion, translation, keypoints["position"], keypoints["point_id"]
-        )
+        yield ImageRecord(name, image_id, camera_id, pose[:4], pose[4:], keypoints["position"], keypoints["point_id"])
 
 
 def _points(cursor: _Cursor) -> NDArray[Any]:
-    starts = array("q")
+    points = bytearray()
     for _ in cursor.records():
-        starts.append(cursor.skip(POINT.itemsize + COLOUR_AND_ERROR))
+        start = cursor.skip(POINT.itemsize + COLOUR_AND_ERROR)
+        points += cursor.content[start : start + POINT.itemsize]
         (track_length,) = cursor.take(_COUNT)
         cursor.skip(TRACK_ELEMENT * track_length)
-    content = np.frombuffer(cursor.content, np.uint8)
-    points = np.empty(len(starts), POINT)
-    places = np.frombuffer(starts, np.int64) if len(starts) else np.empty(0, np.int64)
-    rows = points.view(np.uint8).reshape(len(points), POINT.itemsize)
-    for first in range(0, len(points), CHUNK):
-        part = slice(first, first + CHUNK)
-        rows[part] = content[places[part, None] + np.arange(POINT.itemsize)]
-    return points
+    return np.frombuffer(bytes(points), POINT)

@@ -21,22 +21,20 @@ logger = logging.getLogger(__name__)
 class ImagePoints:
     """One registered image; camera = rotation p + translation (cam_from_world), 2D points normalised and undistorted.
 
-    points2d (k, 2) sees the scene's points3d[seen], seen (k,) without repetition. clutter2d (c, 2): the keypoints
-    without a 3D point. All three are empty where keypoints were not read. observed: every 3D point the image has a
-    keypoint of, ascending: `seen` and those that were dropped.
-    image_id, camera_id: of the model.
+    observed: every 3D point the image has a keypoint of, ascending. points2d (k, 2) sees the scene's points3d[seen],
+    seen (k,) the observed points that were not dropped, without repetition. clutter2d (c, 2): the keypoints without a
+    3D point. The last three are empty where keypoints were not read.
     """
 
     name: str
     image_id: int
-    camera_id: int
+    camera: Camera
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    observed: NDArray[np.int64]
     points2d: NDArray[np.float32]
     seen: NDArray[np.int64]
     clutter2d: NDArray[np.float32]
-    observed: NDArray[np.int64]
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    camera: Camera
 
 
 @dataclass(frozen=True)
@@ -90,9 +88,7 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
         if record.camera_id not in cameras:
             where = f"camera {record.camera_id} of image {record.name!r} in {path}"
             cameras[record.camera_id] = _camera_of(records.cameras.get(record.camera_id), where)
-        camera = cameras[record.camera_id]
-        image = _registered(record, camera, ids)
-        images.append(_with_keypoints(image, record, ids, points3d, lost) if keypoints else image)
+        images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost, keypoints=keypoints))
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
     reconstruction = Reconstruction(path.name if name is None else name, points3d, tuple(images), dict(+lost), ids)
@@ -111,33 +107,36 @@ def _camera_of(record: CameraRecord | None, where: str) -> Camera:
         raise ColmapError(f"{where}: {error}; try another model") from error
 
 
-def _registered(record: ImageRecord, camera: Camera, ids: NDArray[np.int64]) -> ImagePoints:
-    """The image without its keypoints."""
-    observed = np.unique(record.point_ids[record.point_ids >= 0])
+def _image_points(
+    record: ImageRecord,
+    camera: Camera,
+    ids: NDArray[np.int64],
+    points3d: NDArray[np.float64],
+    lost: Counter[str],
+    *,
+    keypoints: bool,
+) -> ImagePoints:
+    has_point = record.point_ids >= 0
+    observed = np.unique(record.point_ids[has_point])
     place = np.minimum(np.searchsorted(ids, observed), len(ids) - 1)
     none = np.empty((0, 2), np.float32)
-    return ImagePoints(
+    image = ImagePoints(
         name=record.name,
         image_id=record.image_id,
-        camera_id=record.camera_id,
+        camera=camera,
+        rotation=Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix(),
+        translation=record.translation,
+        observed=place[ids[place] == observed],
         points2d=none,
         seen=place[:0],
         clutter2d=none,
-        observed=place[ids[place] == observed],
-        rotation=Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix(),
-        translation=record.translation,
-        camera=camera,
     )
-
-
-def _with_keypoints(
-    image: ImagePoints, record: ImageRecord, ids: NDArray[np.int64], points3d: NDArray[np.float64], lost: Counter[str]
-) -> ImagePoints:
-    undistorted = image.camera.normalise(record.keypoints)
+    if not keypoints:
+        return image
+    undistorted = camera.normalise(record.keypoints)
     usable = np.isfinite(undistorted).all(-1)
     lost["keypoints that could not be undistorted"] += int((~usable).sum())
 
-    has_point = record.point_ids >= 0
     place = np.minimum(np.searchsorted(ids, record.point_ids), len(ids) - 1)
     known = has_point & (ids[place] == record.point_ids)
     lost["keypoints of a point that is missing"] += int((has_point & ~known).sum())
