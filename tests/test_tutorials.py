@@ -14,6 +14,7 @@ from bpnp.cli import main
 ROOT = Path(__file__).parents[1]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
+VALUE = re.compile(rf"(?<!\w){NUMBER.pattern}(?!\.?\w)")  # not the number within a name such as 04.png
 SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 2}}
 SMALLER = [argument for argument in SMALL_NET if "=bpnp" not in argument]
 
@@ -40,7 +41,7 @@ def shows(printed: str, expected: str, *, numbers: bool) -> None:
         same = next((p for p in lines if " ".join(NUMBER.sub("#", p).split()).startswith(words)), None)
         assert same is not None, f"expected {line!r} in\n{printed}"
         if numbers:
-            values, shown = ([float(x) for x in NUMBER.findall(text)] for text in (same, line))
+            values, shown = ([float(x) for x in VALUE.findall(text)] for text in (same, line))
             assert values == pytest.approx(shown, rel=0.5, abs=0.02)
 
 
