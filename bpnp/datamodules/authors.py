@@ -72,7 +72,7 @@ class AuthorsDataModule(StoredDataModule):
 
 
 def prepare_authors(source: Path, output: Path, *, dataset: str | None = None) -> Store:
-    """The authors' pickles below `source` (see `find_parts`) as a store with the scenes train and test.
+    """The authors' pickles below `source` as a store with the scenes train and test.
 
     Samples that cannot be used are left out and listed. Raises ValueError, StoreError, OSError or PickleError: nothing
     to convert, a bad pickle, no usable sample, another `output`.
@@ -82,14 +82,14 @@ def prepare_authors(source: Path, output: Path, *, dataset: str | None = None) -
 
 def authors_recipe(source: Path, dataset: str | None) -> Recipe:
     """How the store of the authors' files below `source` is made."""
-    name, parts = find_parts(source, dataset)
+    name, parts = _find_parts(source, dataset)
     files = [file for _, part in parts for file in part]
     return Recipe(
         kind=PROBLEMS,
         widths=WIDTHS,
         parameters={"dataset": name, "source": fingerprint(files_as_they_are(files))},
         jobs=[(scene, part, FOCAL.get(name, 1.0)) for scene, part in parts],
-        work=convert_part,
+        work=_converted,
         what="sample",
         source=str(source),
     )
@@ -101,11 +101,8 @@ def split_rows(store: Store, split: str) -> NDArray[np.int64]:
     return np.sort(np.concatenate([*rows, np.empty(0, np.int64)]))
 
 
-def find_parts(root: Path, dataset: str | None = None) -> tuple[str, list[tuple[str, list[Path]]]]:
-    """The name of the data set below `root`, and of each scene its pickles.
-
-    Raises ValueError: nothing found, several data sets and no `dataset`, or a pickle of a folder missing.
-    """
+def _find_parts(root: Path, dataset: str | None) -> tuple[str, list[tuple[str, list[Path]]]]:
+    """The name of the data set below `root`, and of each scene its pickles."""
     if not root.is_dir():
         raise ValueError(f"expected a folder with <dataset>_train and <dataset>_test, got {root}, which is no folder")
     names = sorted({path.name.rpartition("_")[0] for split in ("train", "test") for path in root.glob(f"*_{split}")})
@@ -131,7 +128,7 @@ def find_parts(root: Path, dataset: str | None = None) -> tuple[str, list[tuple[
     return chosen, parts
 
 
-def convert_part(scene: str, files: Sequence[Path], focal: float) -> Made:
+def _converted(scene: str, files: Sequence[Path], focal: float) -> Made:
     """Every sample of a scene, or the reason why it cannot be used.
 
     Copies that fill small sets up to 1000 points are dropped. W_gt may hold the 2D point of each 3D point or, as for
@@ -170,18 +167,7 @@ def _column(file: Path) -> dict[int, Any]:
 
 def _indexed_by_2d(folder: Path, samples: Sequence[Mapping[str, Any]]) -> bool:
     """Whether W_gt is an m-vector: which reading projects the 3D points nearer to their 2D points."""
-
-    def error(sample: Mapping[str, Any], by_2d: bool) -> float:
-        try:
-            problem = _problem("", sample, by_2d=by_2d, focal=1.0)
-        except ValueError:
-            return np.inf
-        camera = problem.points3d[: problem.matched] @ problem.rotation.T + problem.translation
-        with np.errstate(divide="ignore", invalid="ignore"):
-            offset = camera[:, :2] / camera[:, 2:] - problem.points2d[: problem.matched]
-        return float(np.median(np.linalg.norm(np.nan_to_num(offset, nan=np.inf), axis=-1)))
-
-    direct, inverse = (float(np.median([error(sample, by_2d) for sample in samples])) for by_2d in (False, True))
+    direct, inverse = (float(np.median([_error(sample, by_2d) for sample in samples])) for by_2d in (False, True))
     if AGREEMENT < min(direct, inverse) < np.inf:
         raise PickleError(
             f"expected the poses in {folder} to project 3D points onto their 2D points, got a median distance of "
@@ -190,21 +176,33 @@ def _indexed_by_2d(folder: Path, samples: Sequence[Mapping[str, Any]]) -> bool:
     return inverse < direct
 
 
+def _error(sample: Mapping[str, Any], by_2d: bool) -> float:
+    """Median distance of the projected 3D points to their 2D points."""
+    try:
+        problem = _problem("", sample, by_2d=by_2d, focal=1.0)
+    except ValueError:
+        return np.inf
+    camera = problem.points3d[: problem.matched] @ problem.rotation.T + problem.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        offset = camera[:, :2] / camera[:, 2:] - problem.points2d[: problem.matched]
+    return float(np.median(np.linalg.norm(np.nan_to_num(offset, nan=np.inf), axis=-1)))
+
+
 def _problem(name: str, sample: Mapping[str, Any], *, by_2d: bool, focal: float) -> Problem:
     """Raises ValueError for a sample that cannot be used."""
     if "matches" in sample:
         matches = _numbers(sample["matches"], "matches", 5)
         points2d, points3d, match3d = matches[:, :2], matches[:, 2:], np.arange(len(matches))
+        rotation, translation = sample["R"], sample["t"]
     else:
         m, n = (int(np.asarray(sample[f"num_points_{d}d"]).reshape(-1)[0]) for d in (2, 3))
         points2d, points3d = _numbers(sample["p2d"], "p2d", 2)[:m], _numbers(sample["p3d"], "p3d", 3)[:n]
         match3d = _match3d(sample["W_gt"], len(points2d), len(points3d), by_2d=by_2d)
-    rotation = _numbers(sample["R" if "R" in sample else "R_gt"], "R", 3)
-    translation = np.asarray(sample["t" if "t" in sample else "t_gt"], np.float64).reshape(-1)
-    if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3):
-        raise ValueError("expected a rotation matrix, got another matrix")
-    if np.linalg.det(rotation) < 0 or translation.shape != (3,):
-        raise ValueError("expected a rotation and a translation, got a reflection or something else")
+        rotation, translation = sample["R_gt"], sample["t_gt"]
+    rotation, translation = _numbers(rotation, "R", 3), np.asarray(translation, np.float64).reshape(-1)
+    proper = rotation.shape == (3, 3) and np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3)
+    if not proper or np.linalg.det(rotation) < 0 or translation.shape != (3,):
+        raise ValueError("expected a rotation and a translation, got another matrix, a reflection or something else")
     _, first = np.unique(match3d, return_index=True)  # of several 3D points that were seen as one 2D point
     once = np.full_like(match3d, -1)
     once[first] = match3d[first]

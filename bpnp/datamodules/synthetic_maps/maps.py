@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Int
@@ -18,7 +18,6 @@ from bpnp.datamodules.synthetic_maps.kinds import facades, statue, street
 from bpnp.datamodules.synthetic_maps.scene import (
     Array,
     Camera,
-    Kind,
     Scene,
     Viewpoint,
     camera_at,
@@ -37,25 +36,10 @@ CHANGED = 0.8  # share of the points that were not matched of which the photo ha
 ATTEMPTS = 50  # scenes drawn, until enough matches are found
 
 
-class KindOfScene(NamedTuple):
-    """How a kind of scene is drawn.
-
-    density: feature points of a scene for each point of a problem; a photo sees a part of them. within: the camera is
-    within the scene, so its field of view is in the upper half of the range.
-    """
-
-    draw: Kind
-    weight: float
-    density: int
-    within: bool = False
-
-
-KINDS = {
-    "facades": KindOfScene(facades, 0.5, 16),
-    "street": KindOfScene(street, 0.25, 24, within=True),
-    "statue": KindOfScene(statue, 0.25, 12),
-}
-WEIGHTS = {name: kind.weight for name, kind in KINDS.items()}
+# How each kind is drawn, and feature points of its scene for each point of a problem: a photo sees a part of them.
+KINDS = {"facades": (facades, 16), "street": (street, 24), "statue": (statue, 12)}
+WEIGHTS = {"facades": 0.5, "street": 0.25, "statue": 0.25}
+WITHIN = "street"  # the camera is within the scene, so its field of view is in the upper half of the range
 
 
 @dataclass(frozen=True)
@@ -71,7 +55,7 @@ class MapOptions:
     min_points: int = 16
     outliers: Drawn = (0.25, 1.0)
     views: tuple[int, int] = (1, 3)
-    kinds: Mapping[str, float] = field(default_factory=lambda: dict(WEIGHTS))
+    kinds: Mapping[str, float] = field(default_factory=WEIGHTS.copy)
     frame: Frame = "upright"
     tilt_deg: float = 0.0
     scale_range: tuple[float, float] = (0.1, 10.0)
@@ -103,13 +87,6 @@ class MapOptions:
             raise ValueError(f"expected `kinds` as weights of {', '.join(KINDS)}, got {dict(self.kinds)}")
 
 
-class MapPoints(NamedTuple):
-    """Points (n, 3) of a map, triangulated, and which points of the scene they are, of (n,)."""
-
-    of: NDArray[np.int64]
-    points: Array
-
-
 def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -> Problem:
     """A new scene, a map of it by some photos, and one more photo's keypoints.
 
@@ -118,12 +95,11 @@ def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -
     kinds = list(options.kinds)
     weights = np.array([options.kinds[kind] for kind in kinds])
     for _ in range(ATTEMPTS):
-        kind = KINDS[kinds[rng.choice(len(kinds), p=weights / weights.sum())]]
+        kind = kinds[rng.choice(len(kinds), p=weights / weights.sum())]
         low, high = bounds(options.field_of_view)
-        view = (math.sqrt(low * high), high) if kind.within else (low, high)
+        view = (math.sqrt(low * high), high) if kind == WITHIN else (low, high)
         half = math.tan(math.radians(_log_uniform(view, rng)) / 2)
-        problem = _draw(name, kind, half, options, rng)
-        if problem is not None:
+        if (problem := _draw(name, kind, half, options, rng)) is not None:
             return problem
     raise ValueError(
         f"expected a photo that shares {options.min_points} points with its map in {ATTEMPTS} scenes, got none in "
@@ -131,9 +107,10 @@ def draw_map_problem(name: str, options: MapOptions, rng: np.random.Generator) -
     )
 
 
-def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: np.random.Generator) -> Problem | None:
+def _draw(name: str, kind: str, half: float, options: MapOptions, rng: np.random.Generator) -> Problem | None:
     """A problem of a scene of this kind; None if photo and map share too few points."""
-    scene, view = kind.draw(max(LEAST_POINTS, kind.density * options.num_points), half, rng)
+    draw_scene, density = KINDS[kind]
+    scene, view = draw_scene(max(LEAST_POINTS, density * options.num_points), half, rng)
     reach = details(scene, view, half, rng)
     shape = image_shape(half, rng)
     photo = camera_at(view.centre, view.target, shape, rng)
@@ -143,17 +120,17 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     sight = look(scene, photo, reach, rng, alone=True)
     keypoints = sight.image + noise_px / focal * rng.standard_normal(sight.image.shape)
     cameras = [nearby_camera(view, shape, rng) for _ in range(rng.integers(*options.views, endpoint=True))]
-    mapped = triangulated(scene, view, cameras, reach, noise_px / focal, rng)
+    mapped, map_points = triangulated(scene, view, cameras, reach, noise_px / focal, rng)
 
-    _, place2d, place3d = np.intersect1d(sight.of, mapped.of, assume_unique=True, return_indices=True)
-    matched = _matched(photo, cameras[0], mapped.points[place3d], keypoints[place2d], MOST_ERROR_PX / focal, rng)
+    _, place2d, place3d = np.intersect1d(sight.of, mapped, assume_unique=True, return_indices=True)
+    matched = _matched(photo, cameras[0], map_points[place3d], keypoints[place2d], MOST_ERROR_PX / focal, rng)
     matched2d, matched3d = place2d[matched], place3d[matched]
     if len(matched2d) < options.min_points:
         return None
     # A point that is seen from another side mostly has no keypoint either.
     changed = place2d[~matched & (rng.random(len(matched)) < CHANGED)]
     others2d = np.setdiff1d(np.arange(len(keypoints)), np.concatenate([matched2d, changed]))
-    others3d = np.setdiff1d(np.arange(len(mapped.of)), matched3d)
+    others3d = np.setdiff1d(np.arange(len(mapped)), matched3d)
     matches, extra2d, extra3d = _amounts(len(matched2d), len(others2d), len(others3d), options, rng)
     if matches < options.min_points:
         return None
@@ -166,7 +143,7 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
     pick = rng.permutation(len(matched2d))[:matches]
     chosen2d = np.concatenate([matched2d[pick], rng.permutation(others2d)[:extra2d]])
     chosen3d = np.concatenate([matched3d[pick], rng.permutation(others3d)[:extra3d]])
-    points3d = scale * mapped.points[chosen3d] @ turn.T + origin
+    points3d = scale * map_points[chosen3d] @ turn.T + origin
     rotation = photo.rotation @ turn.T
     translation = scale * photo.translation - rotation @ origin
     points2d = keypoints[chosen2d].astype(np.float32)
@@ -175,8 +152,8 @@ def _draw(name: str, kind: KindOfScene, half: float, options: MapOptions, rng: n
 
 def triangulated(
     scene: Scene, view: Viewpoint, cameras: list[Camera], reach: Array, noise: float, rng: np.random.Generator
-) -> MapPoints:
-    """The points of which one of the cameras and enough other photos have a keypoint.
+) -> tuple[NDArray[np.int64], Array]:
+    """Which points of the scene one of the cameras and enough other photos have a keypoint of, and where in the map.
 
     noise: of a keypoint, radians. A point is off along the ray of the camera by a normal error of its inverse depth,
     noise / (baseline sqrt(photos)): with few photos from almost one place far points are anywhere along the ray.
@@ -199,7 +176,7 @@ def triangulated(
         index.append(seen)
         points.append(camera.centre + along[:, None] * (scene.points[seen] - camera.centre))
     order = np.argsort(np.concatenate(index))
-    return MapPoints(np.concatenate(index)[order], np.concatenate(points)[order])
+    return np.concatenate(index)[order], np.concatenate(points)[order]
 
 
 def _matched(

@@ -1,7 +1,7 @@
 """Scenes and photos of them: feature points, the walls and blobs that hide them, and where a photo has a keypoint."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +78,6 @@ class Surface(NamedTuple):
     found_again: float
 
 
-Kind = Callable[[int, float, np.random.Generator], tuple[Scene, Viewpoint]]
 NO_BLOBS = Blobs(np.zeros((0, 3)), np.zeros((0, 3, 3)))
 NO_WALLS = Walls(*(np.zeros((0, 2)) for _ in range(3)), *(np.zeros(0) for _ in range(5)))
 
