@@ -2,7 +2,7 @@
 
 import math
 from collections import deque
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -173,6 +173,16 @@ class SceneMap:
         cones = Cones(self.cones.axes[points], self.cones.cosines[points])
         return Region(view, self.points3d[points], self.point_ids[points], cones, distance)
 
+    def _regions(self, views: Sequence[str] | None, camera: Any, keypoints: Array) -> Iterator[Region]:
+        """The surroundings of the given views, or of all views by their rank for keypoints of a known camera; also of
+        views that show the same place."""
+        if views is not None:
+            order = self.named(views)
+        else:
+            scores = scores_of_views(camera_from(camera).normalise(keypoints), self.pictures)
+            order = [self.views[k] for k in np.argsort(-scores, kind="stable")]
+        yield from (self._region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
+
     def localize(
         self,
         keypoints: Any,
@@ -217,10 +227,8 @@ class SceneMap:
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
         """
         start, best = Clock.now(), list[tuple[Place, Solution]]()
-        pixels, lens = (
-            pixels_from(keypoints, image_size or camera),
-            self._lens(camera, image_size, focal_error, distortion),
-        )
+        pixels = pixels_from(keypoints, image_size or camera)
+        lens = self._lens(camera, image_size, focal_error, distortion)
         if image_size is not None:
             check_inside(pixels, image_size)
         views = None if views is None else list(views)
@@ -230,9 +238,7 @@ class SceneMap:
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
         module, places = source_from(solver), self.places(views, used, lens)
         deadline = Deadline(math.inf if time_limit is None else start + time_limit)
-        met = list[Solution]()
-
-        regions, tries = partial(map, lambda place: self._region(place.view, place.points), places), len(places)
+        met, tries = list[Solution](), len(places)
 
         def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
             return counted(near_view(region, used, camera, expected, options), tries)
@@ -251,6 +257,7 @@ class SceneMap:
             if solution.verdict == "confident":
                 if prior is None:  # which would tell twins apart
                     every = self._region(place.view, np.arange(len(self.points3d))) if views is None else region
+                    regions = partial(self._regions, views, solution.camera)
                     photo = Photo(used, solution.camera, every, regions, seed, deadline)
                     search = partial(near, solution.camera, options)
                     solution = without_twins(photo, solution, met, search)

@@ -17,16 +17,16 @@ from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.loops.parallel import Deadline, one_blas_thread
 from bpnp.maps.localize import Region, problem_near
 from bpnp.maps.views import Array
-from bpnp.search.annealing import polished
+from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.kernels.raster import Raster
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
-from bpnp.search.sources.raster import search_near
+from bpnp.search.sources.raster import search_beside, search_near
 from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import with_false_alarms
+from bpnp.search.verdict import weighed
 from bpnp.solving.matches import count_one_to_one
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Candidate, Solution
@@ -37,14 +37,13 @@ class TwinSettings:
     """Constants of the looks at views of other points.
 
     look: a search near each. Of the image points that a pose explains few are outliers beside a twin, so that fewer
-    starts, smoothed more, do: of 11 photos of boxes with two faces alike that were taken for the other face 10 are put
-    right, the last one with four times the starts. looks: views at most, a tenth of the time that a photo takes.
+    starts, smoothed more, do than near a view that is tried. looks: views at most.
     unseen: share of a view's points that the pose does not see. fewest: such points, and image points that a pose
     explains. degrees, share: of the prior of a search about a twin.
     """
 
     look: RasterSearch = RasterSearch(
-        Draws(2**14, least_starts=2**14),
+        Draws(2**16, least_starts=2**16),
         Screens((100, 300), (2**10, 2**8)),
         Narrowing(0.08, 0.02, steps=3, copies=8, points=300),
         annealed=6,
@@ -61,20 +60,21 @@ TWINS = TwinSettings()
 
 @dataclass(frozen=True, eq=False)
 class Photo:
-    """What is localised, among which points, and near which views; `deadline` and `seed` are of the search."""
+    """What is localised, among which points, and near which views of the map, by their rank for image points (k, 2);
+    `deadline` and `seed` are of the search."""
 
-    keypoints: Any
+    keypoints: Array
     camera: Any
     place: Region
-    regions: Callable[[], Iterable[Region]]
+    regions: Callable[[NDArray[np.float64]], Iterable[Region]]
     seed: int = 0
     deadline: Deadline = Deadline()
 
 
 @one_blas_thread
-def rivals_of(photo: Photo, solution: Solution, met: Sequence[Solution]) -> list[tuple[float, Candidate]]:
-    """Different poses that explain the image points of a solution, and by how many decades they explain all of them
-    worse, the best one first. met: solutions with the points of other views."""
+def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tuple[float, Candidate] | None:
+    """The different pose that explains the image points of a solution best, and by how many decades it explains all of
+    them worse; None if there is none. met: solutions with the points of other views."""
     problem, rule = problem_near(photo.place, photo.keypoints, photo.camera, None), DEFAULT.evidence
     sets, scale = problem.sets, max(solution.stats.residual, problem.sets.image.scales[0])
     best = solution.rotation, solution.translation + solution.rotation @ problem.origin
@@ -91,18 +91,18 @@ def rivals_of(photo: Photo, solution: Solution, met: Sequence[Solution]) -> list
         return np.asarray(~same_pose(rotations, middle, 0, rule.other_deg, shift)[1:])
 
     rotations, translations = (np.array([pose[k] for pose in poses]).reshape(-1, *x.shape) for k, x in enumerate(best))
-    others = different(rotations, translations)
-    if not others.any():
-        return []
+    apart = different(rotations, translations)
+    if not apart.any():
+        return None
     scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
-    ends = polished(scene, rotations[others], translations[others], scale)
+    ends = polished(scene, rotations[apart], translations[apart], scale)
     ends = ends[different(ends.rotation, ends.translation)]
     twins = ends.rotation, ends.translation
     behind = decades_behind(sets, best, twins, twins, scale)
-    return [
-        (float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k])))
-        for k in np.argsort(behind).tolist()
-    ]
+    if not len(behind):
+        return None
+    k = int(np.argmin(behind))
+    return float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k]))
 
 
 def _candidate(problem: Problem, solution: Solution, ends: Candidates, k: int, behind: float) -> Candidate:
@@ -114,25 +114,35 @@ def _candidate(problem: Problem, solution: Solution, ends: Candidates, k: int, b
 
 
 def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple[Array, Array]]:
-    """Poses near views, of whose points the solution does not see most, for the image points that it explains."""
-    explained = np.isin(problem.usable, solution.matches[:, 0])
-    seen, looks = _seen(photo, problem, solution), 0
+    """Poses for the image points that the solution explains, near views of whose points it does not see most; in the
+    order of the rank that these image points give to the views."""
+    places = np.flatnonzero(np.isin(problem.usable, solution.matches[:, 0]))
+    explained, looks = photo.keypoints[problem.usable[places]], 0
+    seen = _seen(photo, problem, solution)
     rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
-    for region in photo.regions() if explained.sum() >= TWINS.fewest else ():
+    for region in photo.regions(explained) if len(explained) >= TWINS.fewest else ():
         if looks == TWINS.looks or photo.deadline.passed():
             return
         unseen = ~np.isin(region.point_ids, seen)
         if unseen.sum() < TWINS.fewest or unseen.mean() < TWINS.unseen:
             continue
         looks += 1
-        near = problem_near(region, photo.keypoints, photo.camera, region.prior())
-        sets = replace(near.sets, bearings=near.sets.bearings[explained])
-        scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
-        scene.rasters, known = rasters, scene.enter_prior(sets.prior or region.prior())
+        near = problem_near(region, explained, photo.camera, region.prior())
+        scene = Scene(near.sets, photo.seed, DEFAULT, photo.deadline)
+        scene.rasters = rasters
+        known = scene.enter_prior(near.sets.prior or region.prior())
         assert isinstance(known, PosePrior)
-        found = with_false_alarms(in_user_frame(search_near(scene, known, TWINS.look)[:1], scene), sets)
-        for k in np.flatnonzero(found.log10_false_alarms < 0):
-            yield found.rotation[k], found.translation[k] + found.rotation[k] @ (problem.origin - near.origin)
+        found = _likeliest(finish(scene, search_near(scene, known, TWINS.look)), scene, near)
+        if len(found) and found.log10_false_alarms[0] < 0:
+            start = Candidates.unscored(*scene.enter(found.rotation, found.translation))
+            beside = _likeliest(finish(scene, search_beside(scene, start, DEFAULT.beside)), scene, near)
+            for one in (found, beside):
+                yield one.rotation[0], one.translation[0] + one.rotation[0] @ (problem.origin - near.origin)
+
+
+def _likeliest(poses: Candidates, scene: Scene, problem: Problem) -> Candidates:
+    """(1,) of the poses that with the fewest false alarms, in the user's frame."""
+    return weighed(in_user_frame(poses, scene), problem.sets)[:1]
 
 
 def without_twins(
@@ -145,13 +155,13 @@ def without_twins(
 ) -> Solution:
     """A confident solution, or where another pose explains the image points as well, an ambiguous one with both as its
     first candidates. Where that explains them better, the solution about it that `search` finds is the one."""
-    rivals = rivals_of(photo, solution, met)
-    if not rivals or rivals[0][0] >= DEFAULT.evidence.lead:
+    rival = best_rival(photo, solution, met)
+    if rival is None or rival[0] >= DEFAULT.evidence.lead:
         return solution
-    behind, twin = rivals[0]
+    behind, twin = rival
     if again and behind <= -DEFAULT.evidence.lead:
         seen = _seen(photo, problem_near(photo.place, photo.keypoints, photo.camera, None), twin)
-        region = max(photo.regions(), key=lambda one: int(np.isin(one.point_ids, seen).sum()))
+        region = max(photo.regions(photo.keypoints), key=lambda one: int(np.isin(one.point_ids, seen).sum()))
         distance = float(np.linalg.norm(twin.rotation @ np.median(region.points3d, 0) + twin.translation))
         better = search(region, PosePrior(twin.rotation, twin.translation, TWINS.degrees, TWINS.share * distance))
         if better.verdict == "confident":

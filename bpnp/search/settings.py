@@ -260,20 +260,14 @@ class Repetitions:
 class OtherFocal:
     """Where another focal length is looked for beside a confident pose (`bpnp.search.evidence.rivals`).
 
-    zooms: over the given one, to start from; from a fifth off the steps that follow lead to one a third off. fewest:
-    matches; of fewer a seventh unknown explains too much. search: around the pose; it sees the scene as large, so that
-    a narrow and coarse one meets what there is.
+    zooms: over the given one, at which a pose is annealed. width: of the residuals to anneal from, shares of the
+    bearings' spread and of the logarithm of the zoom: a scene is a few tenths as deep as wide. fewest: matches; of
+    fewer a seventh unknown explains too much.
     """
 
-    zooms: tuple[float, ...] = (0.8, 1.25)
+    zooms: tuple[float, ...] = (0.66, 0.73, 0.81, 0.9, 1.11, 1.23, 1.37, 1.52)
+    width: float = 0.05
     fewest: int = 24
-    search: RasterSearch = RasterSearch(
-        Draws(2**12, 3.0, 0.03, 2**12),
-        Screens((50, 300), (2**9, 2**5)),
-        Narrowing(0.03, 0.015, steps=1, copies=16, points=600),
-        RasterShape(cells=1.0),
-        annealed=2,
-    )
 
 
 @dataclass(frozen=True)

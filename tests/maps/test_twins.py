@@ -112,3 +112,31 @@ def test_a_box_whose_faces_differ_stays_confident(seed: int) -> None:
     solution = map_of(points, normals).localize(photo(rng, points, normals, *pose), CAMERA, seed=seed)
     assert solution.verdict == "confident"
     assert degrees_off(solution.rotation, pose[0]) < 1
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points, normals = box(rng, ())
+    size, turn, shift = 1.4, Rotation.random(rng=rng).as_matrix(), np.array([40.0, -10.0, 25.0])
+    one = map_of(points, normals)
+    again = tuple(
+        View(
+            f"again {view.name}",
+            view.camera,
+            view.rotation @ turn.T,
+            size * view.translation - view.rotation @ turn.T @ shift,
+            view.points + np.int32(len(one.points3d)),
+        )
+        for view in one.views
+    )
+    both = np.concatenate([one.points3d, size * one.points3d @ turn.T + shift])
+    twice = SceneMap(both, np.arange(len(both)), np.zeros(len(both), np.int32), (*one.views, *again)).seen_by(2)
+    rotation, translation = pose_at(14.0, 4.2, -3.0)
+    pixels = photo(rng, points, normals, rotation, translation)
+    solution = twice.localize(pixels, CAMERA, solver="search", seed=seed, time_limit=60)
+    assert solution.verdict == "ambiguous"
+    found = [degrees_off(one.rotation, rotation) for one in solution.candidates[:2]]
+    other = [degrees_off(one.rotation, rotation @ turn.T) for one in solution.candidates[:2]]
+    assert min(found) < 1
+    assert min(other) < 1

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import polished
-from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.alternatives import of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.partners import Zoomed, with_focal_length
@@ -18,7 +18,6 @@ from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.scene import Scene
 from bpnp.search.settings import Evidence
-from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import SearchResult, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]
@@ -57,8 +56,8 @@ def against_rivals(
 def _at_other_focal_lengths(
     result: SearchResult, sets: PointSets, middle: Array, entered: Callable[[], Scene], rule: Evidence
 ) -> Iterator[Zoomed | None]:
-    """Poses with the focal lengths that fit them best: of Gauss-Newton steps from the best pose itself, and from what a
-    raster search finds around it at other focal lengths.
+    """Poses with the focal lengths that fit them best: of Gauss-Newton steps from the best pose itself, and from the
+    likeliest of those that annealing reaches from it at other focal lengths.
 
     The latter only where three matches may be coincidences: else the steps meet what there is. middle: (3,) of the
     scene, seen from the camera.
@@ -67,27 +66,28 @@ def _at_other_focal_lengths(
     yield with_focal_length(sets, rotation, middle, scale)
     decades = -result.log10_false_alarms / match_count(result.candidates, sets)
     if -rule.independent * decades > rule.missed:
-        for zoom in rule.zoomed.zooms:
-            yield near_focal_length(sets, rotation, middle, zoom, entered())
+        scene = entered()
+        poses = [near_focal_length(sets, rotation, middle, zoom, scale, scene) for zoom in rule.zoomed.zooms]
+        zoom, there, pose = min(poses, key=lambda one: float(one[2].log10_false_alarms[0]))
+        seen = pose.rotation[0] @ sets.middle + pose.translation[0]
+        fitted = with_focal_length(there, pose.rotation[0], seen, max(float(pose.scale[0]), there.image.scales[0]))
+        yield None if fitted is None else fitted._replace(zoom=zoom * fitted.zoom)
 
 
-def near_focal_length(sets: PointSets, rotation: Array, middle: Array, zoom: float, scene: Scene) -> Zoomed | None:
-    """The likeliest pose near `zoom` times the focal length, with the focal length that fits it best; None if nothing
-    matches.
+def near_focal_length(
+    sets: PointSets, rotation: Array, middle: Array, zoom: float, scale: float, scene: Scene
+) -> tuple[float, PointSets, Candidates]:
+    """The pose that annealing reaches at `zoom` times the focal length from the one that sees the scene as large, with
+    its false alarms; and the focal length and the points there.
 
-    A raster search around the pose that sees the scene as large as this one, then Gauss-Newton steps. middle: (3,) of
-    the scene, seen from the camera. scene: whose settings and deadline hold.
+    middle: (3,) of the scene, seen from the camera. scale: of the residuals, radians. scene: whose settings and
+    deadline hold.
     """
-    zoomed = at_focal_length(sets, zoom)
+    zoomed, rule = at_focal_length(sets, zoom), scene.settings.evidence.zoomed
     there = Scene(zoomed, 0, scene.settings, scene.deadline)
-    start = there.enter(rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None])
-    rule = scene.settings.evidence.zoomed
-    found = in_user_frame(search_beside(there, Candidates.unscored(*start), rule.search), there)[:1]
-    if not len(found):
-        return None
-    seen = found.rotation[0] @ sets.middle + found.translation[0]
-    fitted = with_focal_length(zoomed, found.rotation[0], seen, max(float(found.scale[0]), zoomed.image.scales[0]))
-    return None if fitted is None else fitted._replace(zoom=zoom * fitted.zoom)
+    wide = max(scale, rule.width * abs(math.log(zoom)) * sets.image.spread)
+    poses = rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None]
+    return zoom, zoomed, with_false_alarms(polished(there, *poses, wide), zoomed)
 
 
 def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:
