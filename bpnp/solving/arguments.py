@@ -1,11 +1,10 @@
-"""The arguments of `solve` and `solve_many`, checked: each function raises ValueError for what is not usable.
-
-`where` names the problem in the errors, where there are several.
-"""
+"""The arguments of `solve`, `solve_many` and `verify`, checked: ValueError for what is not usable."""
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,12 +19,22 @@ Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
 Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
-UNIT_NORM = 1e-3  # largest error of a length
-UNIT_SUM = 1e-3  # largest error of a sum of probabilities
+UNIT = 1e-3  # largest error of a length, of a rotation, and of a sum of probabilities
 SURE = 0.8  # probability of a class from which a search matches a point to none of another one
 WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
 WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
+
+
+@contextmanager
+def about(problem: str | None) -> Iterator[None]:
+    """Errors within begin with what they are about, where there are several problems."""
+    try:
+        yield
+    except ValueError as error:
+        if problem is None:
+            raise
+        raise ValueError(f"{problem}: {error}") from error
 
 
 def source_from(solver: str | Path | nn.Module) -> nn.Module | None:
@@ -66,10 +75,9 @@ def each_set(name: str, values: Any, count: int | None, axes: int = 2) -> list[A
         got = f"{values!r:.60}" if dims == axes + 1 else f"shape {tuple(values.shape)}"
         raise ValueError(f"expected `{name}` as a sequence of arrays, one a problem, got {got}")
     arrays = list(values)
-    if not arrays or len(arrays) != (count or len(arrays)):
-        wanted = "one array a problem" if count is None else f"{count} arrays as in `points2d`"
-        raise ValueError(f"expected {wanted} in `{name}`, got {len(arrays)}")
-    return arrays
+    if not arrays:
+        raise ValueError(f"expected one array a problem in `{name}`, got 0")
+    return each_of(name, arrays, count or len(arrays))
 
 
 def each_of(name: str, value: Any, count: int) -> list[Any]:
@@ -108,7 +116,7 @@ def checked_prior(prior: Any) -> Prior | None:
             positive(f"prior.{name}", getattr(prior, name))
         return prior._replace(rotation=rotation, translation=shift)
     if isinstance(prior, GravityPrior):
-        camera, scene = (_vector(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
+        camera, scene = (_finite(f"prior.{name}", getattr(prior, name), (3,)) for name in ("up_camera", "up_scene"))
         if not (camera.any() and scene.any() and prior.sigma_deg > 0):
             raise ValueError(f"expected directions and a positive sigma_deg in `prior`, got {prior}")
         return GravityPrior(camera, scene, prior.sigma_deg)
@@ -124,26 +132,16 @@ def checked_prior(prior: Any) -> Prior | None:
 
 
 def checked_pose(prefix: str, rotation: Any, translation: Any) -> tuple[Array, Any]:
-    """A rotation (3, 3), orthonormal, and a translation (3,), None if that is None; `prefix` goes before their names.
-
-    Raises ValueError for a matrix that is no rotation.
-    """
-    matrix = _vector(f"{prefix}rotation", rotation, (3, 3))
+    """A rotation (3, 3), orthonormal, and a translation (3,) or None; `prefix` goes before their names."""
+    matrix = _finite(f"{prefix}rotation", rotation, (3, 3))
     off = float(np.abs(matrix @ matrix.T - np.eye(3)).max())
-    if off > 1e-3 or np.linalg.det(matrix) < 0:
+    if off > UNIT or np.linalg.det(matrix) < 0:
         raise ValueError(f"expected a rotation in `{prefix}rotation`, R R^T = I and det R = 1, got {matrix.tolist()}")
-    shift = None if translation is None else _vector(f"{prefix}translation", translation, (3,))
+    shift = None if translation is None else _finite(f"{prefix}translation", translation, (3,))
     return Rotation.from_matrix(matrix).as_matrix() if off > ROUNDING else matrix, shift
 
 
-def _vector(name: str, values: Any, shape: tuple[int, ...]) -> Array:
-    array = numbers(name, values, "")
-    if array.shape != shape or not np.isfinite(array).all():
-        raise ValueError(f"expected finite `{name}` of shape {shape}, got {array.tolist()}")
-    return array
-
-
-def numbers(name: str, values: Any, where: str) -> Array:
+def numbers(name: str, values: Any) -> Array:
     """The values in float64."""
     if isinstance(values, torch.Tensor):
         values = values.detach().cpu().double().numpy() if not values.is_complex() else values.numpy()
@@ -153,7 +151,14 @@ def numbers(name: str, values: Any, where: str) -> Array:
             raise TypeError(f"{array.dtype}")
         return array.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"expected `{name}` as an array of numbers{where}, got {values!r:.80}") from error
+        raise ValueError(f"expected `{name}` as an array of numbers, got {values!r:.80}") from error
+
+
+def _finite(name: str, values: Any, shape: tuple[int, ...]) -> Array:
+    array = numbers(name, values)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"expected finite `{name}` of shape {shape}, got {array.tolist()}")
+    return array
 
 
 def pixels_from(values: Any, camera: Any) -> Any:
@@ -165,7 +170,7 @@ def pixels_from(values: Any, camera: Any) -> Any:
 
 
 def checked_size(image_size: Any) -> tuple[int, int]:
-    """Width and height of images in pixels. Raises ValueError for anything else."""
+    """Width and height of images in pixels."""
     try:
         width, height = (int(side) for side in image_size)
         whole = (width, height) == tuple(image_size)
@@ -178,7 +183,7 @@ def checked_size(image_size: Any) -> tuple[int, int]:
 
 def check_inside(points2d: Any, size: Any) -> None:
     """Pixels (m, 2) within an image of this width and height, to a pixel."""
-    pixels, sides = keypoints(points2d, ""), np.array(checked_size(size))
+    pixels, sides = image_points(points2d), np.array(checked_size(size))
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise ValueError(f"expected pixels `points2d` of shape (m, 2) with an `image_size`, got {pixels.shape}")
     outside = ~((pixels >= -1) & (pixels <= sides + 1) | ~np.isfinite(pixels)).all(-1)
@@ -191,152 +196,142 @@ def check_inside(points2d: Any, size: Any) -> None:
         )
 
 
-def keypoints(values: Any, where: str) -> Array:
+def image_points(values: Any) -> Array:
     """Image points (m, 2) or (m, 3) from what detectors return: OpenCV's (m, 1, 2) arrays, and rows of four or more
     numbers that begin with x and y (scale, orientation, strength)."""
-    points = one_row_each(numbers("points2d", values, where))
+    points = scene_points(values, "points2d")
     return points[:, :2] if points.ndim == 2 and 3 < points.shape[1] <= WIDEST_ROW else points
 
 
-def one_row_each(points: Array) -> Array:
-    """(k, 1, d) as OpenCV has them, as (k, d)."""
+def scene_points(values: Any, name: str = "points3d") -> Array:
+    """Points (k, d), also from OpenCV's (k, 1, d)."""
+    points = numbers(name, values)
     return points[:, 0] if points.ndim == 3 and points.shape[1] == 1 else points
 
 
-def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int, where: str) -> None:
+def check_points(name: str, points: Array, widths: tuple[int, ...], fewest: int) -> None:
     """Points (k, width), k `fewest` or more, all finite."""
     if points.ndim != 2 or points.shape[1] not in widths:
         shapes = " or ".join(f"(k, {width})" for width in widths)
         swapped = points.ndim == 2 and points.shape[1] in (2, 3)
         hint = " (are points2d and points3d swapped?)" if swapped else "; try one row a point"
-        raise ValueError(f"expected `{name}` of shape {shapes}{where}, got {points.shape}{hint}")
+        raise ValueError(f"expected `{name}` of shape {shapes}, got {points.shape}{hint}")
     if len(points) < fewest:
-        raise ValueError(f"expected {fewest} or more points in `{name}`{where}, got {len(points)}: fewer fix no pose")
-    bad = np.flatnonzero(~np.isfinite(points).all(-1))
-    if len(bad):
-        raise ValueError(f"expected finite `{name}`{where}, got {points[bad[0]].tolist()} at point {bad[0]}")
+        raise ValueError(f"expected {fewest} or more points in `{name}`, got {len(points)}: fewer fix no pose")
+    _check_rows(f"finite `{name}`", points, np.isfinite(points).all(-1))
 
 
-def unit_bearings(rays: Array, where: str) -> Array:
+def _check_rows(expected: str, rows: Array, good: Any, hint: str = "") -> None:
+    """Raise ValueError that names the first row that is not good."""
+    if not good.all():
+        bad = int(good.argmin())
+        raise ValueError(f"expected {expected}, got {rows[bad].tolist()} at point {bad}{hint}")
+
+
+def unit_bearings(rays: Array) -> Array:
     """Bearings (m, 3) of length one, to rounding."""
     length = np.linalg.norm(rays, axis=-1, keepdims=True)
-    if np.abs(length - 1).max() > UNIT_NORM:
+    if np.abs(length - 1).max() > UNIT:
         worst = float(length[np.abs(length - 1).argmax(), 0])
         raise ValueError(
-            f"expected unit bearings in `points2d` of shape (m, 3){where}, got one of length {worst:g} (are points2d "
+            f"expected unit bearings in `points2d` of shape (m, 3), got one of length {worst:g} (are points2d "
             "and points3d swapped?); try points2d of shape (m, 2), or to divide by the lengths"
         )
     return rays / length
 
 
-def normalised(points2d: Array, camera: Camera | None, where: str) -> Array:
+def normalised(points2d: Array, camera: Camera | None) -> Array:
     """Points (m, 2) on the normalised image plane, undistorted."""
+    largest = np.abs(points2d).max()
     if camera is None:
         if np.median(np.linalg.norm(points2d, axis=-1)) > WIDEST:
             raise ValueError(
-                f"expected normalised image coordinates without a `camera`{where}, got values up to "
-                f"{np.abs(points2d).max():g}, which look like pixels; try camera=K"
+                f"expected normalised image coordinates without a `camera`, got values up to {largest:g}, which look "
+                "like pixels; try camera=K"
             )
         return points2d
-    if np.abs(points2d).max() < INSIDE_ONE_PIXEL and camera.focal > 100:
+    if largest < INSIDE_ONE_PIXEL and camera.focal > 100:
         raise ValueError(
-            f"expected pixels with a `camera`{where}, got values up to {np.abs(points2d).max():g}, which look "
-            "normalised; try without the camera"
+            f"expected pixels with a `camera`, got values up to {largest:g}, which look normalised; try without the "
+            "camera"
         )
     return camera.normalise(points2d)
 
 
-def checked_normals(values: Any, count: int, where: str) -> Array | None:
+def unit_vectors(name: str, vectors: Array, hint: str = "try to divide by the lengths") -> Array:
+    """Vectors (n, 3) of length one, to rounding."""
+    length = np.linalg.norm(vectors, axis=-1)
+    _check_rows(f"unit vectors in `{name}`", vectors, np.abs(length - 1) <= UNIT, f"; {hint}")
+    return np.asarray(vectors / length[:, None])
+
+
+def checked_normals(values: Any, count: int) -> Array | None:
     """Unit normals (n, 3) of `count` 3D points."""
     if values is None:
         return None
-    normals = _one_each("normals3d", numbers("normals3d", values, where), (count, 3), where)
-    length = np.linalg.norm(normals, axis=-1)
-    bad = np.flatnonzero(~(np.abs(length - 1) <= UNIT_NORM))
-    if len(bad):
-        raise ValueError(
-            f"expected unit vectors in `normals3d`{where}, got {normals[bad[0]].tolist()} at point {bad[0]}; "
-            "try to divide by the lengths"
-        )
-    return np.asarray(normals / length[:, None])
+    return unit_vectors("normals3d", _one_each("normals3d", numbers("normals3d", values), (count, 3)))
 
 
-class KnownLabels(NamedTuple):
-    """Labels as `PointSets` has them."""
-
-    labels2d: Labels
-    labels3d: Labels
-    odds2d: Array | None = None
-    classes3d: Array | None = None
-
-
-def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int], where: str) -> KnownLabels | None:
-    """Integer labels of the 2D and the 3D points, -1 for any, or probabilities (m, c), (n, c); both or neither.
+def checked_labels(labels2d: Any, labels3d: Any, counts: tuple[int, int]) -> dict[str, Any]:
+    """The labels in `PointSets`, of integers for the 2D and the 3D points, -1 for any, or of probabilities (m, c),
+    (n, c); both or neither.
 
     Of image point i with the probabilities p_i and scene point j with q_j, the appearance of i is likelier if they
     belong together than if not by sum_c p_ic q_jc / b_c, b the mean of the p_i, over its mean over j.
     """
-    if labels2d is None and labels3d is None:
-        return None
-    for name, values in (("labels2d", labels2d), ("labels3d", labels3d)):
-        if values is None:
-            raise ValueError(f"expected both `labels2d` and `labels3d`, or neither{where}, got no `{name}`")
-    if max(getattr(values, "ndim", 1) for values in (labels2d, labels3d)) < 2:
-        known2d = _labels("labels2d", labels2d, counts[0], where)
-        return KnownLabels(known2d, _labels("labels3d", labels3d, counts[1], where))
-    image, scene = _classes("labels2d", labels2d, counts[0], where), _classes("labels3d", labels3d, counts[1], where)
+    labels = {"labels2d": labels2d, "labels3d": labels3d}
+    missing = [name for name, values in labels.items() if values is None]
+    if len(missing) == 2:
+        return {}
+    if missing:
+        raise ValueError(f"expected both `labels2d` and `labels3d`, or neither, got no `{missing[0]}`")
+    if all(getattr(values, "ndim", 1) < 2 for values in labels.values()):
+        return {name: _integers(name, labels[name], count) for name, count in zip(labels, counts, strict=True)}
+    image, scene = (_classes(name, labels[name], count) for name, count in zip(labels, counts, strict=True))
     if image.shape[1] != scene.shape[1]:
         raise ValueError(
-            f"expected as many classes in `labels2d` as in `labels3d`{where}, got {image.shape[1]} and {scene.shape[1]}"
+            f"expected as many classes in `labels2d` as in `labels3d`, got {image.shape[1]} and {scene.shape[1]}"
         )
     odds = image / np.maximum(image.mean(0), 1e-12)
     odds /= np.maximum(odds @ scene.mean(0), 1e-12)[:, None]
-    sure2d, sure3d = (np.where(each.max(1) >= SURE, each.argmax(1), -1) for each in (image, scene))
-    return KnownLabels(sure2d, sure3d, odds, scene)
+    sure = [np.where(shares.max(1) >= SURE, shares.argmax(1), -1) for shares in (image, scene)]
+    return {"labels2d": sure[0], "labels3d": sure[1], "odds2d": odds, "classes3d": scene}
 
 
-def _classes(name: str, values: Any, count: int, where: str) -> Array:
+def _classes(name: str, values: Any, count: int) -> Array:
     """Probabilities (count, c) of classes."""
-    shares = numbers(name, values, where)
+    shares = numbers(name, values)
     if shares.ndim != 2 or len(shares) != count:
         raise ValueError(
-            f"expected probabilities in `{name}` of shape ({count}, c), as in the other one{where}, got {shares.shape}"
+            f"expected probabilities in `{name}` of shape ({count}, c), as in the other one, got {shares.shape}"
         )
-    off = np.abs(shares.sum(1) - 1)
-    bad = np.flatnonzero(~((shares >= 0).all(1) & (off <= UNIT_SUM)))
-    if len(bad):
-        raise ValueError(
-            f"expected probabilities from 0 that add up to 1 in `{name}`{where}, got {shares[bad[0]].tolist()} at "
-            f"point {bad[0]}; try softmax, or to divide by the sums"
-        )
+    good = (shares >= 0).all(1) & (np.abs(shares.sum(1) - 1) <= UNIT)
+    expected = f"probabilities from 0 that add up to 1 in `{name}`"
+    _check_rows(expected, shares, good, "; try softmax, or to divide by the sums")
     return np.asarray(shares / shares.sum(1, keepdims=True))
 
 
-def _labels(name: str, values: Any, count: int, where: str) -> Labels:
+def _integers(name: str, values: Any, count: int) -> Labels:
     values = values.detach().cpu() if isinstance(values, torch.Tensor) else values
-    labels = _one_each(name, np.asarray(values), (count,), where)
+    labels = _one_each(name, np.asarray(values), (count,))
     if labels.dtype.kind not in "iu":
-        raise ValueError(f"expected integers in `{name}`{where}, got {labels.dtype}; try .astype(int)")
+        raise ValueError(f"expected integers in `{name}`, got {labels.dtype}; try .astype(int)")
     if labels.min(initial=0) < -1:
-        raise ValueError(f"expected labels of 0 or more, or -1 for any, in `{name}`{where}, got {labels.min()}")
+        raise ValueError(f"expected labels of 0 or more, or -1 for any, in `{name}`, got {labels.min()}")
     return labels.astype(np.int64)
 
 
-def checked_scores(name: str, values: Any, count: int, where: str) -> Array | None:
+def checked_scores(name: str, values: Any, count: int) -> Array | None:
     """Probabilities (count,) that a point has a partner, in (0, 1]."""
     if values is None:
         return None
-    scores = _one_each(name, numbers(name, values, where), (count,), where)
-    bad = np.flatnonzero(~((scores > 0) & (scores <= 1)))
-    if len(bad):
-        raise ValueError(
-            f"expected probabilities above 0 and up to 1 in `{name}`{where}, got {scores[bad[0]]} at point {bad[0]}; "
-            "try to divide by the largest"
-        )
+    scores = _one_each(name, numbers(name, values), (count,))
+    good = (scores > 0) & (scores <= 1)
+    _check_rows(f"probabilities above 0 and up to 1 in `{name}`", scores, good, "; try to divide by the largest")
     return scores
 
 
-def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...], where: str) -> npt.NDArray[Any]:
+def _one_each(name: str, values: npt.NDArray[Any], shape: tuple[int, ...]) -> npt.NDArray[Any]:
     if values.shape != shape:
-        raise ValueError(f"expected `{name}` of shape {shape} as `points{name[-2:]}`{where}, got {values.shape}")
+        raise ValueError(f"expected `{name}` of shape {shape} as `points{name[-2:]}`, got {values.shape}")
     return values

@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,7 +18,7 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.problem import Problem
-from bpnp.solving.solution import Candidate, Solution, SolutionStats
+from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 
 Array = npt.NDArray[np.float64]
 Labels = npt.NDArray[np.int64]
@@ -40,45 +41,40 @@ def finished(problem: Problem, result: SearchResult, seconds: float, inlier_thre
         poses[0] = _fitted(problem, *poses[0], threshold)
     projected, *others = (problem.view(*pose) for pose in poses)
     matches = one_to_one(problem.image, projected, threshold, problem.allowed)
-    counts = [count_one_to_one(problem.image, seen, threshold, problem.allowed) for seen in others]
-    candidates = tuple(
+    counts = [len(matches), *(count_one_to_one(problem.image, seen, threshold, problem.allowed) for seen in others)]
+    candidates = [
         Candidate(rotation, translation - rotation @ problem.origin, score, count, alarms)
         for (rotation, translation), score, count, alarms in zip(
-            poses, found.score.tolist(), [len(matches), *counts], found.log10_false_alarms.tolist(), strict=True
+            poses, found.score.tolist(), counts, found.log10_false_alarms.tolist(), strict=True
         )
-    )
+    ]
     i, j = matches.T
     camera = problem.sets.points3d[j] @ poses[0][0].T + poses[0][1]
-    sine = np.linalg.norm(np.cross(problem.sets.bearings[i], camera), axis=-1)
-    angles = np.degrees(np.arctan2(sine, (problem.sets.bearings[i] * camera).sum(-1)))
-    errors = np.linalg.norm(problem.image[i] - projected[j], axis=-1)
-    count = float(found.matched[0]) * min(len(problem.image), len(problem.points3d))
+    matched = float(found.matched[0]) * min(len(problem.image), len(problem.points3d))
     linear = None if result.verdict == "failed" else linearised(problem.sets, *poses[0], result.residual)
-    covariance = pose_covariance(problem.sets, linear, count, problem.origin)
-    return Solution(
-        rotation=candidates[0].rotation,
-        translation=candidates[0].translation,
-        matches=np.stack([problem.usable[i], j], -1),
-        inlier_count=len(matches),
-        inlier_ratio=len(matches) / min(len(problem.points2d), len(problem.points3d)),
-        inlier_threshold=threshold,
-        reprojection_error=float(errors.mean()) if len(matches) else math.nan,
-        reprojection_error_deg=float(angles.mean()) if len(matches) else math.nan,
-        unit=problem.unit,
-        covariance=_of_pixels(problem, covariance),
-        candidates=candidates,
-        verdict=result.verdict,
-        reason=result.reason,
-        log10_false_alarms=result.log10_false_alarms,
-        stats=SolutionStats(result.batches, result.residual, result.verdict == "confident", *problem.left_out),
-        seconds=seconds + time.perf_counter() - start,
-        points2d=problem.points2d,
-        points3d=problem.points3d,
-        camera=problem.camera,
+    solution = with_pose(
+        replace(without_pose(problem, result.reason, None), verdict=result.verdict),
+        candidates,
+        np.stack([problem.usable[i], j], -1),
+        np.linalg.norm(problem.image[i] - projected[j], axis=-1),
+        angles_between(problem.sets.bearings[i], camera),
+        most=min(len(problem.points2d), len(problem.points3d)),
+        threshold=threshold,
+        residual=result.residual,
+        covariance=_of_pixels(problem, pose_covariance(problem.sets, linear, matched, problem.origin)),
     )
+    stats = replace(solution.stats, iterations=result.batches)
+    return replace(solution, stats=stats, seconds=seconds + time.perf_counter() - start)
+
+
+def angles_between(bearings: Array, directions: Array) -> Array:
+    """Angles (k,) between vectors (k, 3), radians, also small ones to the last digits."""
+    sine = np.linalg.norm(np.cross(bearings, directions), axis=-1)
+    return np.arctan2(sine, (bearings * directions).sum(-1))
 
 
 def without_pose(problem: Problem, reason: str, inlier_threshold: float | None, seconds: float = 0.0) -> Solution:
+    """The failed solution of a problem."""
     dropped, taken = problem.left_out
     return Solution(
         inlier_threshold=math.nan if inlier_threshold is None else inlier_threshold,

@@ -19,10 +19,9 @@ from bpnp.solving.arguments import (
     checked_labels,
     checked_normals,
     checked_scores,
-    keypoints,
+    image_points,
     normalised,
-    numbers,
-    one_row_each,
+    scene_points,
     unit_bearings,
 )
 
@@ -31,6 +30,8 @@ FAR = 100.0  # median distances of the points from their median; further off flo
 FLAT = 1e-6  # of the points' longest extent; what float32 leaves of the other extents of a line
 LIKELY = 0.1  # by their classes, over a mean match, at least, of two points that are matched
 FLOOR_PIXELS = 0.1  # no detector of points is better
+OF_IMAGE = "bearings", "labels2d", "scores2d", "odds2d"  # fields of PointSets with a row a point
+OF_SCENE = "points3d", "normals3d", "labels3d", "cosines3d", "scores3d", "classes3d"
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,20 +79,16 @@ class Problem:
 
     def without(self, taken: Labels) -> "Problem":
         """The same without some of the m 2D points."""
-        sets, stay = self.sets, ~np.isin(self.usable, taken)
-        reason = degenerate_points(sets.bearings[stay], self.points3d)
-        known = {
-            name: getattr(sets, name)[stay]
-            for name in ("bearings", "labels2d", "scores2d", "odds2d")
-            if getattr(sets, name) is not None
-        }
+        stay = np.flatnonzero(~np.isin(self.usable, taken))
+        sets = chosen(self.sets, stay)
+        reason = degenerate_points(sets.bearings, self.points3d)
         return replace(
             self,
-            sets=replace(sets, **known),
+            sets=sets,
             usable=self.usable[stay],
             image=self.image[stay],
             degenerate=None if reason is None else f"of the lights that no other problem has, {reason}",
-            taken2d=int((~stay).sum()),
+            taken2d=len(self.usable) - len(stay),
         )
 
     def allowed(self, i: Labels, j: Labels) -> npt.NDArray[np.bool_]:
@@ -127,58 +124,69 @@ def problem_from(
     cosines3d: Array | None = None,
     prior: Prior | None = None,
     focal: UnknownFocal | None = None,
-    where: str = "",
 ) -> Problem:
     """Check the arrays of one problem; they are as for `bpnp.solve`, camera and prior are checked.
 
-    cosines3d, focal: as in `PointSets`, not checked. where: added to the errors, to name the problem. Pixels that
-    cannot be undistorted are left out of `usable`. Raises ValueError that names the argument: wrong shape, swapped,
-    fewer points than fix a pose (3 where gravity is known, else 4), NaN, pixels without a camera or the reverse,
-    normals, labels or scores that do not go with the points.
+    cosines3d, focal: as in `PointSets`, not checked. Pixels that cannot be undistorted are left out of `usable`. Raises
+    ValueError that names the argument: wrong shape, swapped, fewer points than fix a pose (3 where gravity is known,
+    else 4), NaN, pixels without a camera or the reverse, normals, labels or scores that do not go with the points.
     """
     fewest = MIN_POINTS - isinstance(prior, GravityPrior)
-    image, scene = keypoints(points2d, where), one_row_each(numbers("points3d", points3d, where))
+    image, scene = image_points(points2d), scene_points(points3d)
     if image.ndim == 2 and image.shape[1] == 3 and (camera is not None or scene.shape[-1:] == (2,)):
         wrong = image if camera is not None else scene
         what = "`points3d` of shape (n, 3)" if camera is None else "pixels `points2d` of shape (m, 2) with a `camera`"
-        raise ValueError(f"expected {what}{where}, got {wrong.shape} (are points2d and points3d swapped?)")
-    check_points("points2d", image, (2, 3) if camera is None else (2,), fewest, where)
-    check_points("points3d", scene, (3,), fewest, where)
-    unit: Unit = "rad" if image.shape[1] == 3 else "normalised" if camera is None else "px"
+        raise ValueError(f"expected {what}, got {wrong.shape} (are points2d and points3d swapped?)")
+    check_points("points2d", image, (2, 3) if camera is None else (2,), fewest)
+    check_points("points3d", scene, (3,), fewest)
+    unit = unit_of(image, camera)
     if unit == "rad":
-        image = bearings = unit_bearings(image, where)
+        image = bearings = unit_bearings(image)
         plane = in_front(bearings)[:, :2]
     else:
-        plane = normalised(image, camera, where)
+        plane = normalised(image, camera)
         rays = np.column_stack([plane, np.ones(len(plane))])
         bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
-    if len(usable) < fewest:
-        raise ValueError(
-            f"expected {fewest} or more 2D points that the camera can see{where}, got {len(usable)} of {len(image)}"
-        )
-    scores = checked_scores("scores2d", scores2d, len(image), where)
-    labels = checked_labels(labels2d, labels3d, (len(image), len(scene)), where)
+    check_seen(usable, image, fewest)
     origin, known = _origin(scene), prior if isinstance(prior, (PosePrior, GravityPrior)) else None
     if isinstance(known, PosePrior) and known.translation is not None:
         known = known._replace(translation=np.asarray(known.translation) + np.asarray(known.rotation) @ origin)
     sets = PointSets(
-        bearings[usable],
+        bearings,
         scene - origin,
-        checked_normals(normals3d, len(scene), where),
-        None if labels is None else labels.labels2d[usable],
-        None if labels is None else labels.labels3d,
-        cosines3d,
-        None if scores is None else scores[usable],
-        checked_scores("scores3d", scores3d, len(scene), where),
+        normals3d=checked_normals(normals3d, len(scene)),
+        cosines3d=cosines3d,
+        scores2d=checked_scores("scores2d", scores2d, len(image)),
+        scores3d=checked_scores("scores3d", scores3d, len(scene)),
         floor=None if camera is None else FLOOR_PIXELS / _per_radian(plane[usable], unit, camera),
         prior=known,
-        odds2d=None if labels is None or labels.odds2d is None else labels.odds2d[usable],
-        classes3d=None if labels is None else labels.classes3d,
         focal=focal,
+        **checked_labels(labels2d, labels3d, (len(image), len(scene))),
     )
+    sets = chosen(sets, usable)
     degenerate = degenerate_points(sets.bearings, scene, fewest)
     return Problem(sets, usable, image[usable], unit, plane, scene, origin, camera, degenerate, prior)
+
+
+def unit_of(image: Array, camera: Camera | None) -> Unit:
+    """In which residuals of such image points are measured."""
+    return "rad" if image.shape[1] == 3 else "normalised" if camera is None else "px"
+
+
+def check_seen(usable: Labels, image: Array, fewest: int) -> None:
+    """Raise ValueError where too few of the 2D points are usable."""
+    if len(usable) < fewest:
+        raise ValueError(
+            f"expected {fewest} or more 2D points that the camera can see, got {len(usable)} of {len(image)}"
+        )
+
+
+def chosen(sets: PointSets, image: Labels, scene: Labels | slice = slice(None)) -> PointSets:
+    """These image points and scene points alone, with what is known of them."""
+    rows = dict.fromkeys(OF_IMAGE, image) | dict.fromkeys(OF_SCENE, scene)
+    known = {name: values[rows[name]] for name in rows if (values := getattr(sets, name)) is not None}
+    return replace(sets, **known)
 
 
 def _per_radian(points2d: Array, unit: Unit, camera: Camera | None) -> float:

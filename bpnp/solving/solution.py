@@ -4,7 +4,7 @@ import base64
 import io
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from html import escape
@@ -221,6 +221,37 @@ class Solution:
             return _read(cls, content)
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise ValueError(f"expected the JSON of a solution{name}, got {error}") from error
+
+
+def with_pose(
+    solution: Solution,
+    candidates: Sequence[Candidate],
+    matches: npt.NDArray[np.int64],
+    errors: Array,
+    angles: Array,
+    *,
+    most: int,
+    threshold: float,
+    residual: float,
+    covariance: Array | None,
+) -> Solution:
+    """A solution without a pose with the first of the candidates, of whose matches `errors` are in the unit of the
+    solution and `angles` in radians; at `most` so many matches there could be."""
+    return replace(
+        solution,
+        rotation=candidates[0].rotation,
+        translation=candidates[0].translation,
+        matches=matches,
+        inlier_count=len(matches),
+        inlier_ratio=len(matches) / most,
+        inlier_threshold=threshold,
+        reprojection_error=float(errors.mean()) if len(matches) else math.nan,
+        reprojection_error_deg=float(np.degrees(angles).mean()) if len(matches) else math.nan,
+        covariance=solution.covariance if covariance is None else covariance,
+        candidates=tuple(candidates),
+        log10_false_alarms=candidates[0].log10_false_alarms,
+        stats=replace(solution.stats, residual=residual, converged=solution.verdict == "confident"),
+    )
 
 
 def _largest(covariance: Array) -> float:

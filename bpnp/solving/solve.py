@@ -1,6 +1,6 @@
 """Pose from two point sets in one call: `solve`, and `solve_many` for many problems."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.solving.arguments import (
     Prior,
+    about,
     check_inside,
     checked_prior,
     device_from,
@@ -26,9 +27,9 @@ from bpnp.solving.arguments import (
     source_from,
 )
 from bpnp.solving.focal_length import solved_with_focal_length, unknown_camera
-from bpnp.solving.infinity import refuse_at_infinity, solve_directions
+from bpnp.solving.infinity import solve_directions
 from bpnp.solving.problem import Problem, problem_from
-from bpnp.solving.rigs.rig_solution import solve_rig
+from bpnp.solving.rig import solve_rig
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, Progress, solutions_of
 
@@ -115,49 +116,29 @@ def solve(
     >>> bool(np.allclose(solution.translation, [0, 0, 6], atol=1e-6))
     True
     """
+    normals_and_labels: dict[str, Any] = {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
+    scores: dict[str, Any] = {"scores2d": scores2d, "scores3d": scores3d}
+    rules: dict[str, Any] = {
+        "inlier_threshold": positive("inlier_threshold", inlier_threshold, finite=True),
+        "seed": seed,
+        "time_limit": positive("time_limit", SECONDS if time_limit is None else time_limit),
+    }
+    beside: dict[str, Any] = {
+        "solver": None if solver in ("auto", "search") else solver,
+        "prior": prior,
+        "device": device,
+    }
     if at_infinity:
-        module = None if solver in ("auto", "search") else solver
-        refuse_at_infinity(
-            distortion=distortion or None,
-            normals3d=normals3d,
-            labels2d=labels2d,
-            labels3d=labels3d,
-            scores3d=scores3d,
-            solver=module,
-            prior=prior,
-            clutter=clutter,
-            device=device,
-        )
-        return solve_directions(
-            pixels_from(points2d, camera),
-            points3d,
-            camera,
-            unknown=None
-            if image_size is None and focal_error is None
-            else unknown_camera(camera, image_size, focal_error),
-            scores2d=scores2d,
-            inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
-            seed=seed,
-            time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
-        )
+        beside |= {"distortion": distortion or None, "scores3d": scores3d, "clutter": clutter, "rig": rig}
+        _refuse(normals_and_labels | beside, "at_infinity")
+        rough = image_size is not None or focal_error is not None
+        unknown = unknown_camera(camera, image_size, focal_error) if rough else None
+        return solve_directions(pixels_from(points2d, camera), points3d, camera, unknown, scores2d, **rules)
     if rig is not None:
-        known = {"prior": prior, "scores2d": scores2d, "scores3d": scores3d, "device": device}
-        refused = [name for name, value in known.items() if value is not None]
-        if refused or solver not in ("auto", "search"):
-            raise ValueError(f"expected no `{(refused or ['solver'])[0]}` with a `rig`; try without")
-        return solve_rig(
-            points2d,
-            points3d,
-            camera,
-            rig,
-            normals3d=normals3d,
-            labels2d=labels2d,
-            labels3d=labels3d,
-            inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
-            clutter=clutter,
-            seed=seed,
-            time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
-        )
+        lens = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion or None}
+        _refuse(scores | beside | lens, "rig")
+        return solve_rig(points2d, points3d, camera, rig, clutter=clutter, **normals_and_labels, **rules)
+    arrays: dict[str, Any] = {name: [values] for name, values in (normals_and_labels | scores).items()}
     return solve_many(
         [points2d],
         [points3d],
@@ -165,20 +146,21 @@ def solve(
         image_size=image_size,
         focal_error=focal_error,
         distortion=distortion,
-        normals3d=[normals3d],
-        labels2d=[labels2d],
-        labels3d=[labels3d],
-        scores2d=[scores2d],
-        scores3d=[scores3d],
         solver=solver,
         prior=prior,
-        inlier_threshold=inlier_threshold,
         clutter=clutter,
-        seed=seed,
-        time_limit=SECONDS if time_limit is None else time_limit,
         device=device,
         progress=progress,
+        **arrays,
+        **rules,
     )[0]
+
+
+def _refuse(options: Mapping[str, Any], kind: str) -> None:
+    """Raise ValueError for what such a problem says nothing of, or cannot have."""
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(f"expected no `{name}` with `{kind}`, got {value!r:.60}; try without one of them")
 
 
 def solve_many(
@@ -219,8 +201,8 @@ def solve_many(
     [0.0, 1.0]
     """
     begun = Clock.now()
-    sets2d = each_set("points2d", points2d, None)
-    count = len(sets2d)
+    images = each_set("points2d", points2d, None)
+    count = len(images)
     seconds = positive("time_limit", SECONDS_OF_MANY if time_limit is None else time_limit)
     options = Options(
         source_from(solver),
@@ -234,30 +216,21 @@ def solve_many(
         until=Deadline(begun + seconds) if count == 1 and seconds is not None else Deadline(),
     )
     known = {
-        name: each_set(name, values, count, 2 if name == "normals3d" or _is_table(name, values) else 1)
-        for name, values in (
-            ("normals3d", normals3d),
-            ("labels2d", labels2d),
-            ("labels3d", labels3d),
-            ("scores2d", scores2d),
-            ("scores3d", scores3d),
-        )
+        "normals3d": each_set("normals3d", normals3d, count),
+        "labels2d": each_set("labels2d", labels2d, count, _axes_of_labels(labels2d)),
+        "labels3d": each_set("labels3d", labels3d, count, _axes_of_labels(labels3d)),
+        "scores2d": each_set("scores2d", scores2d, count, 1),
+        "scores3d": each_set("scores3d", scores3d, count, 1),
     }
-    sets3d, cameras = each_set("points3d", points3d, count), each_camera(camera, count)
+    scenes, cameras = each_set("points3d", points3d, count), each_camera(camera, count)
     priors = [checked_prior(each) for each in each_of("prior", prior, count)]
+    pixels = [pixels_from(points, image_size or one) for points, one in zip(images, cameras, strict=True)]
 
     def problem(i: int, lens: Camera | None, focal: UnknownFocal | None = None) -> Problem:
-        return problem_from(
-            pixels[i],
-            sets3d[i],
-            lens,
-            **{name: values[i] for name, values in known.items()},
-            prior=priors[i],
-            focal=focal,
-            where=f" in problem {i}" if count > 1 else "",
-        )
+        arrays = {name: values[i] for name, values in known.items()}
+        with about(f"problem {i}" if count > 1 else None):
+            return problem_from(pixels[i], scenes[i], lens, prior=priors[i], focal=focal, **arrays)
 
-    pixels = [pixels_from(points, image_size or one) for points, one in zip(sets2d, cameras, strict=True)]
     if distortion or (image_size or focal_error) is not None:
         unknown = [unknown_camera(one, image_size, focal_error, distortion) for one in cameras]
         for points in pixels if image_size is not None else ():
@@ -265,22 +238,20 @@ def solve_many(
         return [solved_with_focal_length(partial(problem, i), one, options) for i, one in enumerate(unknown)]
     problems = {i: problem(i, None if one is None else camera_from(one)) for i, one in enumerate(cameras)}
     solutions = solutions_of(problems, options)
-    shared_lights(problems, solutions, lambda i, problem: solutions_of({i: problem}, options)[i])
+    share_points(problems, solutions, options)
     return [solutions[i] for i in range(count)]
 
 
-def _is_table(name: str, values: Any) -> bool:
-    """Whether labels are one array of class probabilities, for all problems."""
-    return name.startswith("labels") and getattr(values, "ndim", 1) == 2 and "float" in str(values.dtype)
+def _axes_of_labels(labels: Any) -> int:
+    """Of the labels of one problem: two if they are one array of class probabilities, for all problems."""
+    return 2 if getattr(labels, "ndim", 1) == 2 and "float" in str(labels.dtype) else 1
 
 
-def shared_lights(
-    problems: Mapping[int, Problem], solutions: dict[int, Solution], solve_again: Callable[[int, Problem], Solution]
-) -> None:
+def share_points(problems: Mapping[int, Problem], solutions: dict[int, Solution], options: Options) -> None:
     """Where few-point problems have the same image points, leave each point to one of them; `solutions` is changed.
 
     The problem with the fewest false alarms keeps its matches. A later one that claimed one of their points is solved
-    again, by `solve_again`, without these; its `stats.taken2d` says how many points that are. A failed pose keeps none.
+    again without these; its `stats.taken2d` says how many points that are. A failed pose keeps none.
     """
     groups: dict[bytes, list[int]] = {}
     for i, problem in problems.items():
@@ -289,9 +260,7 @@ def shared_lights(
     for members in groups.values():
         taken: set[int] = set()
         for i in sorted(members, key=lambda i: (solutions[i].log10_false_alarms, i)):
-            claimed = set(solutions[i].matches[:, 0].tolist())
-            if claimed & taken:
-                solutions[i] = solve_again(i, problems[i].without(np.array(sorted(taken))))
-                claimed = set(solutions[i].matches[:, 0].tolist())
+            if taken.intersection(solutions[i].matches[:, 0].tolist()):
+                solutions |= solutions_of({i: problems[i].without(np.array(sorted(taken)))}, options)
             if solutions[i].verdict != "failed":
-                taken |= claimed
+                taken.update(solutions[i].matches[:, 0].tolist())

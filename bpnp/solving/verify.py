@@ -16,7 +16,7 @@ from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.verdict import match_count
 from bpnp.solving.arguments import Array, Labels, checked_pose, numbers, positive
 from bpnp.solving.matches import finished, without_pose
-from bpnp.solving.problem import Problem, degenerate_points, problem_from
+from bpnp.solving.problem import Problem, chosen, degenerate_points, problem_from
 from bpnp.solving.solution import Solution
 
 SECONDS = 10.0
@@ -79,64 +79,65 @@ def verify(
     deadline = Deadline.after(positive("time_limit", SECONDS if time_limit is None else time_limit))
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     rotation, translation = checked_pose("", rotation, translation)
-    known = {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
-    known |= {"scores2d": scores2d, "scores3d": scores3d}
-    problem = problem_from(points2d, points3d, None if camera is None else camera_from(camera), **known)
-    judged, pairs = problem, None
-    if matches is not None:
-        pairs = _checked_matches(matches, problem)
-        judged = _of_matches(problem, pairs)
+    problem = problem_from(
+        points2d,
+        points3d,
+        None if camera is None else camera_from(camera),
+        normals3d=normals3d,
+        labels2d=labels2d,
+        labels3d=labels3d,
+        scores2d=scores2d,
+        scores3d=scores3d,
+    )
+    given = None if matches is None else _checked_matches(matches, problem)
+    judged = problem if given is None else _of_matches(problem, given)
     if judged.degenerate is not None:
-        return without_pose(problem, judged.degenerate, threshold)
+        return without_pose(judged, judged.degenerate, threshold)
     moved = translation + rotation @ judged.origin
     claimed = judge_claim(judged.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
     solution = finished(judged, claimed.result, time.perf_counter() - begun, threshold)
     if not refine and solution.verdict != "failed" and len(claimed.optimum):
         solution = replace(solution, covariance=_of_unrefined(judged, claimed.optimum, rotation, moved))
-    if pairs is None:
+    if given is None:
         return solution
     return replace(
         solution,
-        matches=pairs[solution.matches[:, 0]],
-        inlier_ratio=solution.inlier_count / len(pairs),
+        matches=given[solution.matches[:, 0]],
+        inlier_ratio=solution.inlier_count / len(given),
         points2d=problem.points2d,
         points3d=problem.points3d,
     )
 
 
 def _checked_matches(values: Any, problem: Problem) -> Labels:
-    """Places (k, 2) of a 2D and a 3D point, each in one match."""
-    matches, counts = numbers("matches", values, ""), (len(problem.points2d), len(problem.points3d))
+    """Places (k, 2) of a 2D and a 3D point, each in one match; of those that the camera can see."""
+    matches, counts = numbers("matches", values), (len(problem.points2d), len(problem.points3d))
     if matches.ndim != 2 or matches.shape[1] != 2 or (matches != np.round(matches)).any():
         raise ValueError(f"expected `matches` as integers of shape (k, 2), got shape {matches.shape}")
     if (matches < 0).any() or (matches >= counts).any():
         raise ValueError(f"expected `matches` below {counts}, the numbers of points, got {matches.max(0).tolist()}")
-    for name, side in zip(("2D", "3D"), matches.T, strict=True):
-        points, count = np.unique(side, return_counts=True)
-        if len(points) < len(side):
-            twice = int(points[count.argmax()])
-            raise ValueError(f"expected each point in one of the `matches`, got {name} point {twice} in {count.max()}")
+    for name, side in zip(("2D", "3D"), matches.T.astype(np.int64), strict=True):
+        times = np.bincount(side)
+        if times.max(initial=0) > 1:
+            twice = f"{name} point {times.argmax()} in {times.max()}"
+            raise ValueError(f"expected each point in one of the `matches`, got {twice}")
     places = matches.astype(np.int64)
     return np.asarray(places[np.isin(places[:, 0], problem.usable)])
 
 
-def _of_matches(problem: Problem, pairs: Labels) -> Problem:
+def _of_matches(problem: Problem, matches: Labels) -> Problem:
     """The matched points alone, each with a label that its partner alone has."""
-    i, j = pairs.T
-    sets, usable = problem.sets, np.searchsorted(problem.usable, i)
-    known: dict[str, Any] = {"labels2d": np.arange(len(pairs)), "labels3d": np.arange(len(pairs))}
-    known |= {"odds2d": None, "classes3d": None}
-    for names, chosen in ((("bearings", "scores2d"), usable), (("points3d", "normals3d", "scores3d"), j)):
-        known |= {name: None if getattr(sets, name) is None else getattr(sets, name)[chosen] for name in names}
-    restricted = replace(sets, **known)
+    (i, j), own = matches.T, np.arange(len(matches))
+    usable = np.searchsorted(problem.usable, i)
+    sets = replace(chosen(problem.sets, usable, j), labels2d=own, labels3d=own, odds2d=None, classes3d=None)
     return replace(
         problem,
-        sets=restricted,
-        usable=np.arange(len(pairs)),
+        sets=sets,
+        usable=own,
         image=problem.image[usable],
         points2d=problem.points2d[i],
         points3d=problem.points3d[j],
-        degenerate=problem.degenerate or degenerate_points(restricted.bearings, problem.points3d[j]),
+        degenerate=problem.degenerate or degenerate_points(sets.bearings, problem.points3d[j]),
     )
 
 

@@ -201,7 +201,7 @@ def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
     [
         (
             {"points3d": np.full((9, 3), 2.0)},
-            r"expected unit vectors in `points3d` with `at_infinity`, got one",
+            "expected unit vectors in `points3d`, got .* or points of a scene without",
         ),
         ({"points3d": np.ones((9, 2))}, r"expected `points3d` of shape \(k, 3\)"),
         ({"points2d": np.ones((2, 2))}, "expected 3 or more points in `points2d`"),

@@ -158,7 +158,7 @@ def test_annotations_of_many_pairs() -> None:
         assert degrees_between(solution.rotation, rotation) < 3
         alone = solve(image, points, CAMERA, normals3d=normals)
         np.testing.assert_array_equal(alone.rotation, solution.rotation)
-    with pytest.raises(ValueError, match="expected 2 arrays as in `points2d` in `labels2d`, got 1"):
+    with pytest.raises(ValueError, match="expected 2 of `labels2d`, one a problem, got 1"):
         solve_many(images, points, CAMERA, labels2d=[np.zeros(3, int)], labels3d=np.zeros(20, int))
 
 

@@ -211,8 +211,8 @@ def test_a_missing_checkpoint_is_named() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (([X, X[:3]], [P, P]), "4 or more points in `points2d` in problem 1, got 3"),
-        (([X], [P, P]), "1 arrays as in `points2d` in `points3d`, got 2"),
+        (([X, X[:3]], [P, P]), "problem 1: .* points in `points2d`, got 3"),
+        (([X], [P, P]), "1 of `points3d`, one a problem, got 2"),
         ((X, P), r"`points2d` as a sequence of arrays, one a problem, got shape \(20, 2\)"),
         (([], []), "one array a problem in `points2d`, got 0"),
         ((5, P), "`points2d` as a sequence"),

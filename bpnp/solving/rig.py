@@ -8,37 +8,87 @@ cameras together, for each of them proposes poses from its own triples.
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.special import stdtrit
 
-from bpnp.loops.parallel import Deadline
+from bpnp.cameras import camera_from
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.poses import enumerate_poses
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
 from bpnp.search.evidence.repetitions import repeated_poses
-from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
-from bpnp.search.point_sets import PointSets
+from bpnp.search.evidence.uncertainty import ONE_SIGMA, Linearised, linearised, local_covariance
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged, no_pose
+from bpnp.solving.arguments import Array, Labels, about, checked_pose, each_camera, each_set, numbers
+from bpnp.solving.matches import SCALES, one_to_one, without_pose
+from bpnp.solving.problem import Problem, problem_from
+from bpnp.solving.solution import Candidate, Solution, with_pose
 
-Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all cameras that are refined
 WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
 STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the last of them that are weighed
 
 
-class Rig:
-    """Cameras with their points: `sets` of each, all with the same scene; `mounts`, camera_k = C_k rig + c_k."""
+def solve_rig(
+    points2d: Any,
+    points3d: Any,
+    camera: Any,
+    rig: Sequence[Any],
+    *,
+    normals3d: Any,
+    labels2d: Any,
+    labels3d: Any,
+    inlier_threshold: float | None,
+    clutter: float | None,
+    seed: int,
+    time_limit: float | None,
+) -> Solution:
+    """`bpnp.solve` with a `rig`: the pose rig_from_world."""
+    begun, deadline = Clock.now(), Deadline.after(time_limit)
+    mounts = [_mount(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
+    images = each_set("points2d", points2d, None)
+    for name, values in (("points2d", images), ("camera", camera), ("labels2d", labels2d)):
+        if isinstance(values, list) and len(values) != len(mounts):
+            raise ValueError(f"expected {len(mounts)} of `{name}`, one a camera of the `rig`, got {len(values)}")
+    labels, problems = each_set("labels2d", labels2d, len(mounts), 1), []
+    for k, one in enumerate(each_camera(camera, len(mounts))):
+        lens = None if one is None else camera_from(one)
+        with about(f"camera {k}"):
+            problems.append(
+                problem_from(images[k], points3d, lens, normals3d=normals3d, labels2d=labels[k], labels3d=labels3d)
+            )
+    for problem in problems:
+        if problem.degenerate is not None:
+            return without_pose(problems[0], problem.degenerate, inlier_threshold)
+    cameras = Rig(problems, mounts)
+    solution = _finished(cameras, search_rig(cameras, clutter, seed, deadline), inlier_threshold)
+    return replace(solution, seconds=Clock.now() - begun)
 
-    def __init__(self, sets: Sequence[PointSets], mounts: Sequence[Pose]) -> None:
-        self.sets, self.mounts = sets, mounts
-        self.floor = max(each.floor or float(each.image.scales[0]) for each in sets)
+
+def _mount(name: str, value: Any) -> Pose:
+    """cam_from_rig as (3, 4), (4, 4) or (R, t)."""
+    if isinstance(value, tuple) and len(value) == 2:
+        return checked_pose(f"{name}.", *value)
+    matrix = numbers(name, value)
+    if matrix.shape not in ((3, 4), (4, 4)):
+        raise ValueError(f"expected `{name}` as cam_from_rig, (3, 4), (4, 4) or (R, t), got shape {matrix.shape}")
+    return checked_pose(f"{name}.", matrix[:3, :3], matrix[:3, 3])
+
+
+class Rig:
+    """Cameras with their points, all of the same scene; `mounts`, camera_k = C_k rig + c_k."""
+
+    def __init__(self, problems: Sequence[Problem], mounts: Sequence[Pose]) -> None:
+        self.problems, self.mounts, self.sets = problems, mounts, [problem.sets for problem in problems]
+        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.sets)
 
     def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
         """Of camera k, for poses (..., 3, 3), (..., 3) of the rig."""
@@ -105,9 +155,7 @@ class Rig:
         return np.asarray(np.linalg.inv(information), np.float64) if np.linalg.matrix_rank(information) == 6 else None
 
 
-def search_rig(
-    rig: Rig, *, clutter: float | None, seed: int, deadline: Deadline, settings: SearchSettings = DEFAULT
-) -> SearchResult:
+def search_rig(rig: Rig, clutter: float | None, seed: int, deadline: Deadline) -> SearchResult:
     """Distinct poses of the rig, best first, and the verdict on the first one."""
     rotations, translations, hits, sure, exhaustive = [], [], [], [], True
     for k, sets in enumerate(rig.sets):
@@ -119,7 +167,7 @@ def search_rig(
             exhaustive &= poses.ended == "exhausted"
             proposed, starts = (poses.rotation, poses.translation), np.zeros(len(poses.rotation), np.int64)
         else:
-            result = search_poses(sets, clutter=clutter, seed=seed, deadline=until, settings=settings)
+            result = search_poses(sets, clutter=clutter, seed=seed, deadline=until)
             found, exhaustive = result.candidates, False
             proposed, starts = (found.rotation, found.translation), found.hits
             sure += [rig.rig_of(k, found.rotation[:1], found.translation[:1])] * (result.verdict == "confident")
@@ -132,14 +180,13 @@ def search_rig(
     found = _candidates(rig, rotation[order], translation[order], np.concatenate(hits)[order])
     if not len(found):
         return no_pose("no pose was found")
-    found = found[np.argsort(found.log10_false_alarms, kind="stable")]
+    found, rule = found[np.argsort(found.log10_false_alarms, kind="stable")], DEFAULT.evidence
     strongest = max(range(len(rig.sets)), key=lambda k: len(rig.sets[k].bearings))
     best = rig.pose_of(strongest, found.rotation[0], found.translation[0])
-    (turns, shifts), _ = repeated_poses(rig.sets[strongest], *best, float(found.scale[0]), settings.evidence)
+    (turns, shifts), _ = repeated_poses(rig.sets[strongest], *best, float(found.scale[0]), rule)
     repeated = _candidates(rig, *rig.rig_of(strongest, turns, shifts), np.zeros(len(turns), np.int64))
     found = Candidates.concatenated([found, repeated])
     found = found[np.argsort(found.log10_false_alarms, kind="stable")]
-    rule = settings.evidence
     same = rig.sets[0].same_pose(*rig.pose_of(0, found.rotation, found.translation), rule.other_deg, rule.other_shift)
     found.hits[0] = found.hits[same].sum()  # of the cameras, which search for themselves
     for turn, shift in sure:  # nothing better than this pose was missed
@@ -171,7 +218,7 @@ def _screened(rig: Rig, rotations: Array, translations: Array) -> Array:
     return total
 
 
-def _candidates(rig: Rig, rotations: Array, translations: Array, hits: NDArray[np.int64]) -> Candidates:
+def _candidates(rig: Rig, rotations: Array, translations: Array, hits: Labels) -> Candidates:
     """Poses refined on all cameras to the scale at which their false alarms are fewest, those that end together as one;
     `matched` is their expected number of matches."""
     ends = []
@@ -186,3 +233,52 @@ def _candidates(rig: Rig, rotations: Array, translations: Array, hits: NDArray[n
         Candidates.unscored(turns, shifts),
         matched=counts, scale=scales, hits=known, score=-own, log10_false_alarms=own, log10_rough=rough,
     )  # fmt: skip
+
+
+def _finished(rig: Rig, result: SearchResult, inlier_threshold: float | None) -> Solution:
+    """The matches of all cameras; their 2D points count on from one camera to the next."""
+    found, problems, first = result.candidates, rig.problems, rig.problems[0]
+    solution = without_pose(first, result.reason, inlier_threshold)
+    if not len(found):
+        return solution
+    rotation, translation = found.rotation[0], found.translation[0]
+    matches, errors, angles, count = [], [], [], 0
+    for k, problem in enumerate(problems):
+        threshold = inlier_threshold or SCALES * result.residual * problem.per_radian
+        seen = problem.view(*rig.pose_of(k, rotation, translation))
+        i, j = one_to_one(problem.image, seen, threshold, problem.allowed).T
+        errors.append(np.linalg.norm(problem.image[i] - seen[j], axis=-1))
+        angles.append(errors[-1] / problem.per_radian)
+        matches.append(np.stack([problem.usable[i] + count, j], -1))
+        count += len(problem.points2d)
+    matched = sum(map(len, matches))
+    covariance = None if result.verdict == "failed" else rig.covariance(rotation, translation, result.residual)
+    if covariance is not None:
+        middle = rotation @ (first.sets.middle + first.origin)
+        covariance = _about_origin(covariance, middle, max(2 * matched - 6, 1))
+    alarms = found.log10_false_alarms.tolist()
+    points2d = np.concatenate([problem.points2d for problem in problems])
+    dropped = sum(problem.left_out[0] for problem in problems)
+    stats = replace(solution.stats, iterations=result.batches, dropped2d=dropped)
+    return with_pose(
+        replace(solution, verdict=result.verdict, points2d=points2d, camera=None, stats=stats),
+        [
+            Candidate(r, t - r @ first.origin, -alarms[k], matched if k == 0 else 0, alarms[k])
+            for k, (r, t) in enumerate(zip(found.rotation, found.translation, strict=True))
+        ],
+        np.concatenate(matches),
+        np.concatenate(errors),
+        np.concatenate(angles),
+        most=sum(min(len(problem.points2d), len(problem.points3d)) for problem in problems),
+        threshold=inlier_threshold or SCALES * result.residual * first.per_radian,
+        residual=result.residual,
+        covariance=covariance,
+    )
+
+
+def _about_origin(covariance: Array, middle: Array, free: int) -> Array:
+    """That of a turn and the shift of the scene's origin, from that of the shift of its middle; with Student's t."""
+    x, y, z = middle
+    moved = np.eye(6)
+    moved[3:, :3] = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
+    return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)

@@ -1,1 +1,0 @@
-"""Several cameras that are fixed to each other: their joint evidence, and the solution made of it."""
