@@ -78,6 +78,12 @@ BAD = {
 }
 
 
+def test_bad_samples_are_left_out_and_listed(tmp_path: Path) -> None:
+    samples = [sample(i) for i in range(8)] + [sample(i) | bad for i, bad in enumerate(BAD.values())]
+    store = prepare_authors(write(tmp_path, samples), tmp_path / "store")
+    assert (len(store), len(store.skipped)) == (16, 2 * len(BAD))
+
+
 def test_a_2d_point_is_matched_once(tmp_path: Path) -> None:
     """Of two 3D points that share a 2D point the first is its partner."""
     samples = [sample(i) for i in range(8)]
