@@ -53,6 +53,22 @@ def check_positive(**options: int | float) -> None:
             raise ValueError(f"expected `{name}` > 0, got {value}")
 
 
+def check_within(least: float | int, most: float | int, **options: Any) -> None:
+    """Raise ValueError that names the first option that is not a finite number from `least` to `most`, or two of them.
+
+    >>> check_within(0, 1, share=(0.2, 0.5))
+    >>> check_within(0, 1, share=(0.5, 0.2))
+    Traceback (most recent call last):
+    ValueError: expected `share` from 0 to 1 as (low, high), got (0.5, 0.2)
+    """
+    for name, value in options.items():
+        several = isinstance(value, (tuple, list))
+        low, high = value if several else (value, value)
+        if not (least <= low <= high <= most and abs(low) < np.inf and high < np.inf):
+            limits = f"of {least} or more" if most == np.inf else f"from {least} to {most}"
+            raise ValueError(f"expected `{name}` {limits}{' as (low, high)' * several}, got {value}")
+
+
 def _tensor_type(hint: Any) -> Any:
     """The jaxtyping annotation in `hint` or in `hint | None`; None if there is none of a fixed number of axes."""
     for part in (hint, *typing.get_args(hint)):

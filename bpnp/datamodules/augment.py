@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import pad
 
+from bpnp.checks import check_within
 from bpnp.datamodules.keyed_random import Purpose, permutations, rotations, stream, uniform
 from bpnp.datamodules.problem import Counts
 from bpnp.geometry import MIN_POINTS
@@ -42,16 +43,10 @@ class Outliers:
     occluded_side: DrawnSide = "2d"
 
     def __post_init__(self) -> None:
-        low, high = bounds(self.ratio)
-        if not 0 <= low <= high < np.inf:
-            raise ValueError(
-                f"expected an outlier `ratio` of 0 or more, or (low, high), got {self.ratio}; 1 doubles the points"
-            )
-        low, high = bounds(self.occlusion)
-        if not 0 <= low <= high < 1:
-            raise ValueError(
-                f"expected `occlusion` in [0, 1), or (low, high), got {self.occlusion}; 0.1 hides one point in ten"
-            )
+        check_within(0, math.inf, ratio=self.ratio)
+        check_within(0, 1, occlusion=self.occlusion)
+        if bounds(self.occlusion)[1] == 1:
+            raise ValueError(f"expected `occlusion` below 1, got {self.occlusion}; 0.1 hides one point in ten")
         for name in ("side", "occluded_side"):
             if getattr(self, name) not in (*SIDES, "random"):
                 raise ValueError(f'expected `{name}` "both", "2d", "3d" or "random", got {getattr(self, name)!r}')

@@ -1,6 +1,7 @@
 """From a source of problems to batches: which are in a batch, in any number of processes, exact resuming, and the data
 module of all sources."""
 
+import math
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from torch import distributed
 from torch.utils.data import DataLoader, Dataset, DistributedSampler, Subset
 
+from bpnp.checks import check_within
 from bpnp.datamodules.augment import Augmentation, Outliers, augment
 from bpnp.datamodules.keyed_random import row_keys
 from bpnp.datamodules.problem import ProblemSource
@@ -246,11 +248,8 @@ class ProblemDataModule(LightningDataModule):
     ) -> None:
         super().__init__()
         sizes = {"batch_size": batch_size, "eval_batch_size": eval_batch_size, "max_cells": max_cells}
-        for name, value in sizes.items():
-            if value is not None and value < 1:
-                raise ValueError(f"expected `{name}` of 1 or more, got {value}")
-        if num_workers < 0:
-            raise ValueError(f"expected `num_workers` of 0 or more, got {num_workers}")
+        check_within(1, math.inf, **{name: size for name, size in sizes.items() if size is not None})
+        check_within(0, math.inf, num_workers=num_workers)
         train, test = train_outliers or Outliers(), test_outliers or Outliers()
         self.outliers = {"train": train, "val": train, "test": test, "predict": test}
         self.batch_size = batch_size

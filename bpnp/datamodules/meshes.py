@@ -14,6 +14,7 @@ from jaxtyping import Float, Int
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import picked
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
@@ -48,14 +49,10 @@ class RandomCameras:
     def __post_init__(self) -> None:
         if self.rotation not in ("euler", "so3"):
             raise ValueError(f"expected `rotation` euler or so3, got {self.rotation!r}")
-        low, high = self.euler_range
-        if not -math.inf < low <= high < math.inf:
-            raise ValueError(f"expected `euler_range` as (low, high) in degrees, got {self.euler_range}")
-        for name in ("translation_range", "distance", "noise_px"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"expected a finite, non-negative `{name}`, got {getattr(self, name)}")
-        if not 0 < self.focal < math.inf:
-            raise ValueError(f"expected a positive `focal` in pixels, got {self.focal}")
+        check_within(-math.inf, math.inf, euler_range=self.euler_range)
+        lengths = {name: getattr(self, name) for name in ("translation_range", "distance", "noise_px", "focal")}
+        check_within(0, math.inf, **lengths)
+        check_positive(focal=self.focal)
 
     def poses(self, keys: Int[Tensor, " b"]) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
         """A random camera = R p + t for each key; float64."""

@@ -125,6 +125,20 @@ def test_wrong_options_are_named(kind: type, bad: dict[str, Any]) -> None:
         kind(**bad)
 
 
+def test_a_problem_depends_on_its_key_alone_whatever_batch_it_is_in() -> None:
+    problems = [planted(20 + 30 * i, free2d=7 * i, free3d=40 - 9 * i, seed=i) for i in range(4)]
+    together = augmented(raw(*problems), 5, **HARD)
+    for i, problem in enumerate(problems):
+        batch = raw(problem)
+        alone = augmented(Batch(**(vars(batch) | {"index": torch.tensor([i])})), 5, **HARD)
+        m, n = int(alone.count2d), int(alone.count3d)
+        assert (int(together.count2d[i]), int(together.count3d[i])) == (m, n)
+        assert torch.equal(together.points2d[i, :m], alone.points2d[0])
+        assert torch.equal(together.points3d[i, :n], alone.points3d[0])
+        assert torch.equal(together.match3d[i, :n], alone.match3d[0])
+        assert torch.equal(together.rotation[i], alone.rotation[0])
+
+
 @pytest.mark.parametrize(("valid", "name"), [(Outliers(), "side"), (Augmentation(), "clutter_side")])
 def test_a_side_that_there_is_not_is_named(valid: Any, name: str) -> None:
     object.__setattr__(valid, name, "2D")  # past the type checks of the tests, which users do not have

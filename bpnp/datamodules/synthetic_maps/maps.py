@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import Augmentation, Drawn, bounds
 from bpnp.datamodules.loader import PARTS, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, stacked
@@ -26,6 +27,7 @@ from bpnp.datamodules.synthetic_maps.scene import (
     look,
     nearby_camera,
 )
+from bpnp.geometry import MIN_POINTS
 from bpnp.types import Batch
 
 Frame = Literal["upright", "view"]
@@ -63,25 +65,15 @@ class MapOptions:
     noise_px: Drawn = (0.1, 1.5)
 
     def __post_init__(self) -> None:
-        if not 4 <= self.min_points <= self.num_points:
-            raise ValueError(
-                f"expected `min_points` from 4 to `num_points`, got {self.min_points} and {self.num_points}"
-            )
-        ranges = {"outliers": (0, 1), "noise_px": (0, np.inf), "field_of_view": (5, 150)}
-        for name, (least, most) in ranges.items():
-            low, high = bounds(getattr(self, name))
-            if not (least <= low <= high <= most and high < np.inf):
-                raise ValueError(
-                    f"expected `{name}` from {least} to {most}, a number or (low, high), got {getattr(self, name)}"
-                )
-        if not 0 < self.scale_range[0] <= self.scale_range[1] < np.inf:
-            raise ValueError(f"expected a positive `scale_range` (low, high), got {self.scale_range}")
-        if not 0 <= self.tilt_deg <= 180:
-            raise ValueError(f"expected `tilt_deg` from 0 to 180, got {self.tilt_deg}")
+        check_within(MIN_POINTS, self.num_points, min_points=self.min_points)
+        check_within(0, 1, outliers=self.outliers)
+        check_within(0, math.inf, noise_px=self.noise_px, scale_range=self.scale_range)
+        check_within(5, 150, field_of_view=self.field_of_view)
+        check_within(0, 180, tilt_deg=self.tilt_deg)
+        check_within(1, math.inf, views=self.views)
+        check_positive(scale_range=self.scale_range[0])
         if self.frame not in get_args(Frame):
             raise ValueError(f"expected `frame` among {', '.join(get_args(Frame))}, got {self.frame!r}")
-        if not 1 <= self.views[0] <= self.views[1]:
-            raise ValueError(f"expected `views` (low, high) of 1 or more, got {self.views}")
         weights = list(self.kinds.values())
         if not set(self.kinds) <= set(KINDS) or not all(weight >= 0 for weight in weights) or not any(weights):
             raise ValueError(f"expected `kinds` as weights of {', '.join(KINDS)}, got {dict(self.kinds)}")
