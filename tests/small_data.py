@@ -35,7 +35,6 @@ def small_net(
     channels: int = 16,
     depth: int = 2,
     *,
-    batch_norm: bool = False,
     centre: bool = False,
     scale: float = 1.0,
     normalise: bool = False,
@@ -45,7 +44,7 @@ def small_net(
     rounds: int = 0,
 ) -> BPnPNet:
     """BPnPNet with features of few channels."""
-    size = {"channels": channels, "depth": depth, "batch_norm": batch_norm, "centre": centre}
+    size = {"channels": channels, "depth": depth, "centre": centre}
     return BPnPNet(
         ImageFeatures(**size, scale=scale),  # type: ignore[arg-type]
         SceneFeatures(**size, normalise=normalise),  # type: ignore[arg-type]

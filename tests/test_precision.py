@@ -131,7 +131,7 @@ def test_mixed_precision_from_the_command_line_is_that_of_the_nets_alone(net: st
         main(["fit", *data, *options, "--model.pose_weight=1", *run, "--trainer.limit_train_batches=2"])
     # Operations of a backward pass that are not ours are met below the command itself.
     others = {file for file in halves.files if not file.startswith("/models/nets/")}
-    assert "/models/nets/pointwise.py" in halves.files
+    assert "/models/nets/normalisation.py" in halves.files
     assert others <= {"/commands/training.py", "/models/matcher.py"}
 
 

@@ -8,12 +8,10 @@ from torch import Tensor, nn
 
 from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
-from bpnp.layers.plan import cached_parts
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets.features import ImageFeatures, SceneFeatures
-from bpnp.models.nets.pointwise import products
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction
@@ -103,10 +101,8 @@ class _PairwiseDistance(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, a: Tensor, b: Tensor) -> Tensor:
-        distance = a.new_empty(*a.shape[:2], b.shape[1])
-        for part, x, y in cached_parts(distance, a, b, cache=0):
-            squared = nn.functional.threshold(products(x, -2 * y, 2.0), SQUARED_FLOOR, 0.0, inplace=True)
-            torch.sqrt(squared, out=part)
+        squared = torch.baddbmm(a.new_full((1, 1, 1), 2.0), a, b.mT, alpha=-2)
+        distance = nn.functional.threshold(squared, SQUARED_FLOOR, 0.0, inplace=True).sqrt_()
         ctx.save_for_backward(a, b, distance)
         return distance
 
@@ -114,9 +110,5 @@ class _PairwiseDistance(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, distance = ctx.saved_tensors
-        parts = []
-        for d, g, x, y in cached_parts(distance, gradient, a, b, cache=0):
-            weight = torch.ops.aten.threshold_backward(g / d, d, 0)  # zero where the distance is
-            parts.append((products(weight, -y.mT), products(weight.mT, -x.mT)))
-        to_a, to_b = map(torch.cat, zip(*parts, strict=True))
-        return to_a, to_b
+        weight = torch.where(distance > 0, -gradient / distance, 0)
+        return weight @ b, weight.mT @ a

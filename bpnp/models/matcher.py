@@ -15,10 +15,8 @@ from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.evaluation import Refinement, pnp_pose, ransac_pose
 from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
-from bpnp.models.nets.normalisation import centred, principal_axes, robust_frame
-from bpnp.models.nets.pointwise import Pointwise
+from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
-from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction, SolveStats
 
 WIDEST = 4.0  # distance from the middle of a view's image over the focal length, 76 degrees
@@ -38,8 +36,6 @@ class Matcher(TrainedNet):
         depth: attention blocks.
         heads: of each attention.
         neighbours: nearest neighbours that a point is described by; 0 for none.
-        principal: describe 3D points along the principal axes of their set, so that the scene's rotation does not
-            matter; false for the axes that they are given in.
         frame: coordinates in which the 3D points are expected: "any", or "view", those of a camera nearby, such as that
             of a map's view of the same place, which looks along the third axis. There a 3D point is also described by
             its place in that camera's image, as a 2D point is. `bpnp.solve` and `SceneMap.localize` move the points
@@ -62,7 +58,6 @@ class Matcher(TrainedNet):
         depth: int = 6,
         heads: int = 4,
         neighbours: int = 8,
-        principal: bool = False,
         frame: Literal["any", "view"] = "any",
         mu: float = 0.1,
         tolerance: float = 1e-6,
@@ -76,19 +71,19 @@ class Matcher(TrainedNet):
             raise ValueError(f"expected `frame` any or view, got {frame!r}")
         self.frame = frame
         self.channels, self.depth, self.heads, self.neighbours = channels, depth, heads, neighbours
-        self.principal, self.mu, self.tolerance = principal, mu, tolerance
+        self.mu, self.tolerance = mu, tolerance
         self.backward_stats = BackwardStats()
-        self.enter2d = Pointwise(2 * (1 + 2 * FREQUENCIES) + 3, channels)
-        self.enter3d = Pointwise(3 * (1 + 2 * FREQUENCIES), channels)
+        self.enter2d = nn.Linear(2 * (1 + 2 * FREQUENCIES) + 3, channels)
+        self.enter3d = nn.Linear(3 * (1 + 2 * FREQUENCIES), channels)
         self.around2d = Neighbourhood(2, channels, neighbours=neighbours) if neighbours else None
         self.around3d = Neighbourhood(3, channels, neighbours=neighbours) if neighbours else None
         self.seen = None
         if frame == "view":  # nothing of it at first, so that weights for any axes can go on so
-            self.seen = Pointwise(channels, channels, bias=False)
+            self.seen = nn.Linear(channels, channels, bias=False)
             nn.init.zeros_(self.seen.weight)
         self.blocks = nn.ModuleList(ExchangeBlock(channels, heads) for _ in range(depth))
         self.norm = nn.LayerNorm(channels)
-        self.project = Pointwise(channels, channels)
+        self.project = nn.Linear(channels, channels)
         self.leave = nn.Linear(channels, 1)
         self.bin_cost = nn.Parameter(torch.ones(()))
         self.log_mu = nn.Parameter(torch.tensor(math.log(mu)))
@@ -135,11 +130,8 @@ class Matcher(TrainedNet):
 
     def features(self, batch: Batch) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
         """Features of both sides after the last block, normalised by layer, not to unit length."""
-        points3d = batch.points3d
-        if self.principal:
-            points3d = full_precision(torch.matmul)(points3d, principal_axes(points3d, batch.mask3d))
-        centre3d, radius3d = robust_frame(points3d, batch.mask3d)
-        local3d = (points3d - centre3d) / radius3d
+        centre3d, radius3d = robust_frame(batch.points3d, batch.mask3d)
+        local3d = (batch.points3d - centre3d) / radius3d
         x2d, x3d = self._image_features(batch.points2d, batch.mask2d), self.enter3d(encode(local3d))
         if self.around3d is not None:
             x3d = x3d + self.around3d(local3d, batch.mask3d)
@@ -160,6 +152,19 @@ class Matcher(TrainedNet):
     def _unit(self, z: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         """Projected, centred over the set, of unit length: a set's features cannot all be the same."""
         return nn.functional.normalize(centred(self.project(z), mask), dim=-1)
+
+
+def robust_frame(
+    points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]
+) -> tuple[Float[Tensor, "b 1 d"], Float[Tensor, "b 1 1"]]:
+    """Median of each coordinate and median distance from it: half of the points may be clutter. Padding is not seen.
+
+    A set whose points coincide has radius one.
+    """
+    hidden = points.masked_fill(~mask.unsqueeze(-1), torch.nan)
+    centre = hidden.nanmedian(1, keepdim=True).values
+    radius = torch.linalg.vector_norm(hidden - centre, dim=-1).nanmedian(1).values[:, None, None]
+    return centre, torch.where(radius > 0, radius, 1)
 
 
 def image_of(points3d: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 2"]:

@@ -27,6 +27,7 @@ LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 PLAIN = (bool, int, float, str, type(None))
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
 RENAMED = {"pairs_factor": "matches_factor"}  # settings in older checkpoints
+REMOVED = {"batch_norm": False, "principal": False}  # settings of older checkpoints that had no other value in use
 
 Net = TypeVar("Net", bound="TrainedNet")
 
@@ -202,7 +203,9 @@ def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
             f"expected the settings of {name}, got none; try a class that keeps each constructor argument as an "
             "attribute of its name"
         )
-    settings = {RENAMED.get(key, key): value for key, value in settings.items()}
+    settings = {
+        RENAMED.get(key, key): value for key, value in settings.items() if key not in REMOVED or value != REMOVED[key]
+    }
     arguments = {key: built(value, classes) if is_description(value) else value for key, value in settings.items()}
     try:
         return known[name](**arguments)

@@ -77,7 +77,7 @@ def test_the_cost_is_the_distance_between_unit_features() -> None:
     torch.testing.assert_close(net.cost(batch), torch.cdist(z2d, z3d), atol=1e-7, rtol=0)
 
 
-@pytest.mark.parametrize("options", [{}, {"batch_norm": True}, {"centre": True, "normalise": True}])
+@pytest.mark.parametrize("options", [{}, {"centre": True, "normalise": True}])
 def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any]) -> None:
     net = small_net(**options).double().eval()
     sizes = (8, 30, 3, 17)

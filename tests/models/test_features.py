@@ -1,25 +1,22 @@
-"""Nets of padded point sets against plain ones in torch, and frames of sets against planted axes."""
+"""Nets of padded point sets against plain ones in torch, in double precision but where rounding is the subject."""
 
 from copy import deepcopy
 
-import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
-from bpnp.models.nets.normalisation import MaskedBatchNorm, principal_axes
-from bpnp.models.nets.pointwise import pointwise_norm
+from bpnp.models.nets.normalisation import MaskedBatchNorm, linear_context_norm
 
 SIZES = (9, 1, 14)
 
 
 def sets(channels: int, *, garbage: float = 50.0) -> tuple[list[Tensor], Tensor, Tensor]:
     """Sets of different sizes, the same padded with garbage, and the mask."""
-    single = [torch.randn(size, channels) for size in SIZES]
-    padded = garbage * torch.randn(len(SIZES), max(SIZES), channels)
+    single = [torch.randn(size, channels, dtype=torch.float64) for size in SIZES]
+    padded = garbage * torch.randn(len(SIZES), max(SIZES), channels, dtype=torch.float64)
     mask = torch.arange(max(SIZES)) < torch.tensor(SIZES).unsqueeze(-1)
     for i, points in enumerate(single):
         padded[i, : len(points)] = points
@@ -44,7 +41,7 @@ def randomise(module: nn.Module) -> nn.Module:
 
 
 def test_a_block_is_the_released_block() -> None:
-    block = ResidualBlock(6, batch_norm=False)
+    block = ResidualBlock(6).double()
     single, padded, mask = sets(6)
     out = block(padded, mask)
     for i, x in enumerate(single):
@@ -56,7 +53,7 @@ def test_a_block_is_the_released_block() -> None:
 
 @pytest.mark.parametrize("centre", [True, False])
 def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
-    net = PointFeatures(2, channels=8, depth=3, centre=centre)
+    net = PointFeatures(2, channels=8, depth=3, centre=centre).double()
     single, padded, mask = sets(2)
     features = net(padded, mask)
     for i, x in enumerate(single):
@@ -67,19 +64,11 @@ def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
         torch.testing.assert_close(features[i, : len(x)], z / z.norm(dim=-1, keepdim=True).clamp_min(1e-12))
 
 
-def build(kind: str) -> tuple[nn.Module, int]:
-    if kind == "transform":
-        return InputTransform(), 3
-    return PointFeatures(3, channels=16, depth=4, batch_norm=kind == "batch norm", centre=kind == "centre"), 3
-
-
-@pytest.mark.parametrize("kind", ["plain", "batch norm", "transform"])
-def test_padding_changes_no_gradient_in_training(kind: str) -> None:
-    net, channels = build(kind)
+@pytest.mark.parametrize("net", [PointFeatures(3, channels=16, depth=4), InputTransform()], ids=["plain", "transform"])
+def test_padding_changes_no_gradient_in_training(net: nn.Module) -> None:
     net.double()
-    _, padded, mask = sets(channels)
-    padded = padded.double()
-    weights = torch.randn(*mask.shape, 16 if kind != "transform" else 3, dtype=torch.float64)
+    _, padded, mask = sets(3)
+    weights = torch.randn(net(padded, mask).shape, dtype=torch.float64)
 
     def gradients(points: Tensor) -> list[Tensor]:
         net.zero_grad()
@@ -92,7 +81,7 @@ def test_padding_changes_no_gradient_in_training(kind: str) -> None:
 
 
 def test_batch_norm_is_torchs_on_the_real_points() -> None:
-    ours, theirs = MaskedBatchNorm(5), nn.BatchNorm1d(5)
+    ours, theirs = MaskedBatchNorm(5).double(), nn.BatchNorm1d(5).double()
     theirs.load_state_dict(ours.state_dict())
     for _ in range(4):
         single, padded, mask = sets(5)
@@ -106,11 +95,11 @@ def test_batch_norm_is_torchs_on_the_real_points() -> None:
 
 
 def test_batch_norm_of_vectors_is_torchs_and_one_sample_uses_the_running_statistics() -> None:
-    ours, theirs = MaskedBatchNorm(5), nn.BatchNorm1d(5)
-    x = torch.randn(6, 5)
+    ours, theirs = MaskedBatchNorm(5).double(), nn.BatchNorm1d(5).double()
+    x = torch.randn(6, 5, dtype=torch.float64)
     torch.testing.assert_close(ours(x), theirs(x))
     state = {k: v.clone() for k, v in ours.state_dict().items()}
-    one = torch.randn(1, 5, requires_grad=True)
+    one = torch.randn(1, 5, dtype=torch.float64, requires_grad=True)
     out = ours(one)
     torch.testing.assert_close(out, theirs.eval()(one))
     assert torch.equal(ours.running_mean, state["running_mean"])
@@ -130,15 +119,15 @@ def test_the_input_transform_is_pointnets(training: bool) -> None:
     def norm(k: int, z: Tensor) -> Tensor:
         return F.relu(nn.BatchNorm1d.forward(plain.norms[k], z))
 
-    z = torch.cat(single).double()
+    z = torch.cat(single)
     for k in range(3):
         z = norm(k, F.linear(z, plain.linears[k].weight, plain.linears[k].bias))
     z = torch.stack([part.max(0).values for part in z.split(SIZES)])
     for k in (3, 4):
         z = norm(k, plain.linears[k](z))
     transforms = torch.eye(3) + plain.out(z).view(-1, 3, 3)
-    expected = torch.cat([x.double() @ transform for x, transform in zip(single, transforms, strict=True)])
-    moved = net(padded.double(), mask)[mask]
+    expected = torch.cat([x @ transform for x, transform in zip(single, transforms, strict=True)])
+    moved = net(padded, mask)[mask]
     torch.testing.assert_close(moved, expected)
     for result in (moved, expected):
         (result * weights[mask]).sum().backward()
@@ -153,21 +142,21 @@ def test_normalised_scenes_forget_their_unit_and_origin() -> None:
     normalised = normalise_points3d(padded, mask)
     for i, x in enumerate(single):
         y = normalised[i, : len(x)]
-        assert y.mean(0).abs().max() < 1e-6
-        assert abs(float((y**2).sum(-1).mean().sqrt()) - (len(x) > 1)) < 1e-6
+        assert y.mean(0).abs().max() < 1e-12
+        assert abs(float((y**2).sum(-1).mean().sqrt()) - (len(x) > 1)) < 1e-12
     assert not normalised[~mask].any()
     moved = normalise_points3d(250 * padded + torch.tensor([30.0, -20, 10]), mask)
-    torch.testing.assert_close(moved, normalised, atol=2e-5, rtol=0)
+    torch.testing.assert_close(moved, normalised, atol=1e-10, rtol=0)
 
 
 @pytest.mark.parametrize("padded", [True, False])
 @pytest.mark.parametrize("residual", [True, False])
 def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: bool) -> None:
     x, mask = sets(5, garbage=3.0)[1:]
-    weight, bias, skip = torch.randn(6, 5), torch.randn(6), torch.randn(*x.shape[:2], 6)
+    weight, bias, skip = (torch.randn(*shape) for shape in ((6, 5), (6,), (*x.shape[:2], 6)))
     inputs = [value.double().requires_grad_() for value in (x, weight, bias, skip)]
     assert torch.autograd.gradcheck(
-        lambda x, w, b, s: pointwise_norm(x, w, b, mask if padded else None, s if residual else None), inputs
+        lambda x, w, b, s: linear_context_norm(x, w, b, mask if padded else None, s if residual else None), inputs
     )
 
 
@@ -188,40 +177,8 @@ def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype, 
         return out[mask].double(), [p.grad.double() for n, p in net.named_parameters() if "bias" not in n]
 
     (out, grads), (exact, exact_grads) = gradients(dtype), gradients(torch.float64)
-    rounding = 1e-5 if dtype == torch.float32 else 0.05
+    differences = [got - expected for got, expected in zip(grads, exact_grads, strict=True)]
+    rounding = 1e-5 if dtype == torch.float32 else 0.1
     assert (out - exact).abs().max() < rounding
-    for got, expected in zip(grads, exact_grads, strict=True):
-        assert (got - expected).norm() < 10 * rounding * expected.norm()
-
-
-DEVIATIONS = torch.tensor([0.3, 1.0, 3.0], dtype=torch.float64)
-
-
-def skewed(count: int, seed: int) -> Tensor:
-    """(1, count, 3) with a longer tail towards positive values on each axis, of standard deviations `DEVIATIONS`."""
-    rng = np.random.default_rng(seed)
-    return torch.from_numpy(rng.gamma(2.0, 1.0, (1, count, 3)) - 2) / 2**0.5 * DEVIATIONS
-
-
-def everywhere(points: Tensor) -> Tensor:
-    return torch.ones(points.shape[:2], dtype=torch.bool)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_the_axes_are_those_that_were_planted_and_turn_with_the_points(seed: int) -> None:
-    points = skewed(3000, seed)
-    turn = torch.from_numpy(Rotation.random(random_state=seed).as_matrix())
-    axes = principal_axes(points @ turn.T + torch.tensor([5.0, -70.0, 9.0]), everywhere(points))[0]
-    torch.testing.assert_close(axes.mT @ axes, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-12)
-    assert float(torch.linalg.det(axes)) == pytest.approx(1)
-    assert ((axes * turn).sum(0) > 0.99).all()  # along the planted ones, towards their longer tails
-    own = principal_axes(points, everywhere(points))[0]
-    torch.testing.assert_close(axes, turn @ own, rtol=0, atol=1e-6)
-
-
-@pytest.mark.parametrize("points", [torch.zeros(1, 5, 3), torch.ones(1, 1, 3), torch.rand(1, 20, 1) * torch.ones(3)])
-def test_degenerate_sets_have_a_frame(points: Tensor) -> None:
-    """One place, one point, a line."""
-    axes = principal_axes(points, everywhere(points))[0].double()
-    torch.testing.assert_close(axes.mT @ axes, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-5)
-    assert float(torch.linalg.det(axes)) == pytest.approx(1, abs=1e-5)
+    error, size = (float(torch.cat([g.flatten() for g in parts]).norm()) for parts in (differences, exact_grads))
+    assert error < 7 * rounding * size  # of the whole gradient, as the digits of 30 other draws; a wrong one has 1

@@ -43,7 +43,7 @@ def save(net: nn.Module, path: Path, **more: Any) -> Path:
 
 
 def test_a_checkpoint_brings_the_network_back(tmp_path: Path) -> None:
-    net = small_net(transport=Sinkhorn(learn_mu=True), batch_norm=True, normalise=True, rounds=2)
+    net = small_net(transport=Sinkhorn(learn_mu=True), centre=True, normalise=True, rounds=2)
     again = BPnPNet.from_checkpoint(save(net, tmp_path / "net.ckpt", **{"other.weight": torch.ones(1)}))
     assert described(again) == described(net)
     assert not again.training
@@ -83,7 +83,7 @@ def test_a_checkpoint_names_no_class_that_is_not_known(name: str, tmp_path: Path
 
 def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
     given = [
-        ImageFeatures(channels=8, depth=1, batch_norm=True, centre=True, scale=2.0),
+        ImageFeatures(channels=8, depth=1, centre=True, scale=2.0),
         SceneFeatures(channels=8, depth=1, normalise=True),
         Sinkhorn(mu=0.3, learn_mu=True, tolerance=1e-5, max_iterations=7),
         RansacPnP(backend="opencv", matches_factor=2.0, threshold=0.1, max_iterations=9, seed=4),

@@ -5,12 +5,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn.functional import scaled_dot_product_attention
 
-from bpnp.models.nets.pointwise import Pointwise
-from bpnp.precision import HALF
-from bpnp.types import unpadded
-
-MOST_PRODUCTS = 1 << 22  # of a head, 2048 points a side: beyond, memory for the gradient matters more than time
-
 
 class Attention(nn.Module):
     """x + out(softmax(q k^T / sqrt(d)) v), with q of the points x and k, v of the points it looks at, both normalised.
@@ -24,9 +18,9 @@ class Attention(nn.Module):
             raise ValueError(f"expected `channels` a multiple of `heads`, got {channels} and {heads}")
         self.heads = heads
         self.norm = nn.LayerNorm(channels)
-        self.query = Pointwise(channels, channels)
-        self.key_value = Pointwise(channels, 2 * channels)
-        self.out = Pointwise(channels, channels)
+        self.query = nn.Linear(channels, channels)
+        self.key_value = nn.Linear(channels, 2 * channels)
+        self.out = nn.Linear(channels, channels)
 
     def forward(
         self, x: Float[Tensor, "b k c"], seen: Float[Tensor, "b l c"], mask: Bool[Tensor, "b l"]
@@ -34,25 +28,11 @@ class Attention(nn.Module):
         """mask: True at the real points of `seen`."""
         q = self._split(self.query(self.norm(x)))
         k, v = (self._split(part) for part in self.key_value(self.norm(seen)).chunk(2, -1))
-        z = attended(q, k, v, mask)
+        z = scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None, :])
         return x + self.out(z.transpose(1, 2).flatten(2))
 
     def _split(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b h k d"]:
         return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
-
-
-def attended(
-    q: Float[Tensor, "b h k d"], k: Float[Tensor, "b h l d"], v: Float[Tensor, "b h l d"], mask: Bool[Tensor, "b l"]
-) -> Float[Tensor, "b h k d"]:
-    """softmax(q k^T / sqrt(d)) v over the real points of k and v.
-
-    In half precision on the CPU by two products: torch's fused kernel takes twice as long there.
-    """
-    seen = mask[:, None, None, :]
-    if not (q.is_cpu and q.dtype in HALF and q.shape[2] * k.shape[2] <= MOST_PRODUCTS):
-        return scaled_dot_product_attention(q, k, v, attn_mask=seen)
-    near = (q * q.shape[-1] ** -0.5) @ k.mT
-    return (near if unpadded(mask) else near.masked_fill(~seen, -torch.inf)).softmax(-1).to(v.dtype) @ v
 
 
 class FeedForward(nn.Module):
@@ -61,8 +41,8 @@ class FeedForward(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.norm = nn.LayerNorm(channels)
-        self.enter = Pointwise(channels, 2 * channels)
-        self.out = Pointwise(2 * channels, channels)
+        self.enter = nn.Linear(channels, 2 * channels)
+        self.out = nn.Linear(2 * channels, channels)
 
     def forward(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b k c"]:
         return x + self.out(nn.functional.gelu(self.enter(self.norm(x))))
@@ -100,7 +80,7 @@ class Neighbourhood(nn.Module):
         super().__init__()
         self.neighbours = neighbours
         self.enter = nn.Linear(coordinates + 1, channels)
-        self.out = Pointwise(channels, channels)
+        self.out = nn.Linear(channels, channels)
 
     def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
         k = min(self.neighbours, points.shape[1] - 1)
