@@ -1,8 +1,7 @@
-"""Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU: `bpnp.layers.laplacian` in one pass.
+"""Conjugate gradients on the Laplacian of a transport plan, compiled for the CPU.
 
-One pass over the plan and the gradient gives all sums that the system is made of. In a step of the iteration four rows
-of the plan at a time are used for both products while they are in the cache, so that a step reads the plan once where
-torch reads it twice. Samples are divided among torch's threads; each stops by itself.
+Four rows of the plan at a time are used for both products of an iteration while they are in the cache, so that it reads
+the plan once where torch reads it twice. Samples are divided among torch's threads; each stops by itself.
 """
 
 from typing import Any
@@ -19,7 +18,6 @@ from bpnp.loops.parallel import in_threads
 compiled = compiler(fastmath=FAST, _nrt=False)
 part = compiler(fastmath=FAST, _nrt=False, no_cpython_wrapper=True)  # called by compiled functions alone
 SHORT_COLUMN = 256  # rows that are added up in the precision of the data
-LINE = 16  # numbers of a cache line: sums whose memory begins with one are added to in two thirds of the time
 
 
 def applies_to(tensor: Tensor) -> bool:
@@ -49,70 +47,6 @@ def conjugate_gradients(
 
     in_threads(work, len(rhs))
     return x, mean, solved
-
-
-def first_sums(plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]) -> tuple[Tensor, ...]:
-    """`bpnp.layers.laplacian.first_sums`, same arguments and results; both matrices are read once."""
-    b, m, n = plan.shape
-    of_rows, of_cols = plan.new_empty(2, b, m), plan.new_empty(3, b, n)
-    arrays = [value.contiguous().numpy() for value in (plan, gradient, of_rows, of_cols)]
-    width = n + -n % LINE
-
-    def work(first: int, last: int) -> None:
-        _sum(first, last, *arrays, plan.new_empty(3, width).numpy(), np.empty((3, width)))
-
-    in_threads(work, b)
-    (rows, mean), (cols, rhs, degree) = of_rows, of_cols
-    return rows, cols, mean, rhs, torch.maximum(degree, torch.finfo(cols.dtype).eps * cols)
-
-
-@compiled
-def _sum(start: int, stop: int, plan: Any, gradient: Any, of_rows: Any, of_cols: Any, short: Any, total: Any) -> None:
-    """Samples start to stop: plan, gradient (b, m, n) -> sums of rows (2, b, m) and columns (3, b, n) as `first_sums`.
-
-    short and, in float64, total, both (3, at least n): scratch memory.
-    """
-    _, m, n = plan.shape
-    rows, mean = of_rows
-    short[:] = 0
-    for s in range(start, stop):
-        total[:] = 0
-        for i in range(m):
-            p, v = plan[s, i], gradient[s, i]
-            mass = weighted = 0.0
-            for first in range(0, n, SHORT_SUM):
-                some, more = _row_sums(p[first : first + SHORT_SUM], v[first : first + SHORT_SUM])
-                mass += some
-                weighted += more
-            rows[s, i] = mass
-            mean[s, i] = weighted / mass if mass > 0 else 0
-            _add_row(p, v, mean[s, i], p.dtype.type(1 / mass if mass > 0 else 0), short[0], short[1], short[2])
-            if i % SHORT_COLUMN == SHORT_COLUMN - 1 or i == m - 1:
-                for k in range(3):
-                    _flush(short[k], total[k])
-        for k in range(3):
-            for j in range(n):
-                of_cols[k, s, j] = total[k, j]
-
-
-@part
-def _row_sums(p: Any, v: Any) -> tuple[float, float]:
-    """Sums of p and of p . v, both (n,)."""
-    mass = weighted = p.dtype.type(0)
-    for j in range(len(p)):
-        mass += p[j]
-        weighted += p[j] * v[j]
-    return mass, weighted
-
-
-@part
-def _add_row(p: Any, v: Any, mean: float, unit: float, cols: Any, rhs: Any, degree: Any) -> None:
-    """Add a row p with gradient v, both (n,), to the sums over rows; unit: 1 / its sum."""
-    one = p.dtype.type(1)
-    for j in range(len(p)):
-        cols[j] += p[j]
-        rhs[j] += p[j] * (v[j] - mean)
-        degree[j] += p[j] * (one - p[j] * unit)
 
 
 @part

@@ -1,9 +1,9 @@
 """The derivative of an optimum with respect to its problem (paper Lemmas 1 and 2), whatever solver found it.
 
 If F(y, x) = 0 defines y(x), then dL/dx = -(dF/dx)^T w with (dF/dy)^T w = dL/dy: one linear solve and one
-vector-Jacobian product; the iterations need not be kept. `at_optimum` is this for a small y. `entropic_plan` is the
-closed form for the transport plan. The caller passes the solver of the linear system; `BackwardStats` count how often
-it did not converge.
+vector-Jacobian product; the iterations need not be kept. For a pose that is the derivative of one more Newton step
+(`bpnp.layers.pnp`). `entropic_plan` is the closed form for the transport plan. The caller passes the solver of the
+linear system; `BackwardStats` count how often it did not converge.
 """
 
 import functools
@@ -57,55 +57,24 @@ def record(stats: BackwardStats | None, layer: str, converged: Bool[Tensor, " b"
 
 
 def first_derivative(backward: Callable[..., Any]) -> Callable[..., Any]:
-    """Decorator of the `backward` of a Function that has no second derivative; products are exact in it.
-
-    Raises ValueError under `create_graph=True`, whose gradient would lack the graph that was asked for.
-    """
+    """Decorator of the `backward` of a Function that has no second derivative; products are exact in it."""
 
     @functools.wraps(backward)
     def run(ctx: Any, gradient: Tensor) -> Any:
-        if torch.is_grad_enabled():
-            raise ValueError(
-                "expected a first derivative, got create_graph=True: the layers have no second derivative; "
-                "try create_graph=False"
-            )
+        refuse_second_derivative(gradient)
         with exact_products(gradient.device):
             return backward(ctx, gradient)
 
     return run
 
 
-def at_optimum(
-    solution: Tensor, optimality: Callable[..., Tensor], solve_adjoint: Callable[[Tensor], Tensor], *parameters: Tensor
-) -> Tensor:
-    """Return `solution` unchanged, with the gradient dL/dx = -(dF/dx)^T w, (dF/dy)^T w = dL/dy.
-
-    solution: y with optimality(y, *parameters) = 0.
-    optimality: F, differentiable in the parameters.
-    solve_adjoint: maps dL/dy to w; a sample that has no derivative must map to zero and be flagged by the caller.
-    parameters: the x that receive gradients.
-    """
-    return _AtOptimum.apply(solution, optimality, solve_adjoint, *parameters)
-
-
-class _AtOptimum(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, solution: Tensor, optimality: Any, solve_adjoint: Any, *parameters: Tensor) -> Tensor:
-        ctx.save_for_backward(solution, *parameters)
-        ctx.optimality, ctx.solve_adjoint = optimality, solve_adjoint
-        return solution.clone()
-
-    @staticmethod
-    @first_derivative
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
-        solution, *parameters = ctx.saved_tensors
-        adjoint = ctx.solve_adjoint(gradient)
-        wanted = ctx.needs_input_grad[3:]
-        with torch.enable_grad():
-            variables = [p.detach().requires_grad_(w) for p, w in zip(parameters, wanted, strict=True)]
-            residual = ctx.optimality(solution, *variables)
-            pulled = iter(torch.autograd.grad(residual, [v for v in variables if v.requires_grad], -adjoint))
-        return None, None, None, *(next(pulled) if w else None for w in wanted)
+def refuse_second_derivative(gradient: Tensor) -> None:
+    """In a backward pass: raise ValueError under `create_graph=True`, whose gradient would lack the graph asked for."""
+    if torch.is_grad_enabled():
+        raise ValueError(
+            "expected a first derivative, got create_graph=True: the layers have no second derivative; "
+            "try create_graph=False"
+        )
 
 
 PlanAdjoint = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]

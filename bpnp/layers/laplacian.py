@@ -134,18 +134,12 @@ def _solve_parts(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tens
     return tuple(map(torch.cat, zip(*parts, strict=True)))
 
 
-def first_sums(plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]) -> tuple[Tensor, ...]:
-    """Sums of P (b, m), (b, n), means of V in its rows (b, m), and the system's right-hand side and degree (b, n)."""
-    weighted, rows, cols = plan * gradient, plan.sum(-1), plan.sum(-2)
-    mean = divide(weighted.sum(-1), rows)
-    return rows, cols, mean, weighted.sum(-2) - transpose_times(plan, mean), Plan.of(plan).degree(rows, cols)
-
-
 def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """(a, b) in the precision of the plan, which samples are solved, and for which of these the precision is enough."""
-    start = compiled.first_sums if compiled.applies_to(plan) else first_sums
-    rows, cols, row_mean, rhs, degree = start(plan, gradient)
-    b, mean, solved = solve_laplacian(Plan.of(plan), rows, cols, degree, rhs, torch.full_like(rhs[:, 0], tolerance))
+    weighted, rows, cols, kernel = plan * gradient, plan.sum(-1), plan.sum(-2), Plan.of(plan)
+    row_mean, degree = divide(weighted.sum(-1), rows), kernel.degree(rows, cols)
+    rhs = weighted.sum(-2) - transpose_times(plan, row_mean)
+    b, mean, solved = solve_laplacian(kernel, rows, cols, degree, rhs, torch.full_like(rhs[:, 0], tolerance))
     a = row_mean - mean
     if plan.dtype == torch.float64 and not bool(solved.all()):
         # Links between groups of columns may be so weak that the whole right-hand side is rounding, which nothing

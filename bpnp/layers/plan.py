@@ -67,13 +67,10 @@ class Plan:
         return torch.maximum(degree, torch.finfo(cols.dtype).eps * cols)
 
 
-def cached_parts(*values: Tensor, cache: int = CACHE) -> Iterator[tuple[Tensor, ...]]:
-    """The values, matrices (b, m, n) first, in groups of samples that fit in a CPU's cache; on a GPU in one group.
-
-    cache: bytes of the matrices of a group; zero for one sample at a time.
-    """
+def cached_parts(*values: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    """The values, matrices (b, m, n) first, in groups of samples that fit in a CPU's cache; on a GPU in one group."""
     matrices = values[0]
-    size = max(1, cache // matrices[0].nbytes) if matrices.is_cpu else len(matrices)
+    size = max(1, CACHE // matrices[0].nbytes) if matrices.is_cpu else len(matrices)
     return zip(*(value.split(size) for value in values), strict=True)
 
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from bpnp.checks import checked_shapes
 from bpnp.geometry import hat, is_finite
-from bpnp.layers.implicit import at_optimum
+from bpnp.layers.implicit import refuse_second_derivative
 from bpnp.layers.objective import (
     Columns,
     Derivatives,
@@ -91,12 +91,12 @@ def weighted_pnp(
         residual, well_posed, factor = _judge(derivatives(q, points, r, t))
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
 
-    def solve_adjoint(gradient: Tensor) -> Tensor:
-        adjoint = torch.cholesky_solve(gradient.unsqueeze(-1), factor).squeeze(-1)
-        return torch.where(converged[:, None], adjoint, 0)
-
-    zero = torch.zeros_like(factor[:, 0])
-    step = at_optimum(zero, lambda _, q, p: pose_gradient(q, p, r, t), solve_adjoint, q, points)
+    # One more Newton step y - H^-1 F(y, x), H held fixed, has the derivative -H^-1 dF/dx of the optimum y(x).
+    optimality = pose_gradient(q, points, r, t)
+    step = -torch.cholesky_solve(optimality.unsqueeze(-1), factor).squeeze(-1)
+    step = torch.where(converged[:, None], step - step.detach(), 0)
+    if step.requires_grad:
+        step.register_hook(refuse_second_derivative)
     # The step is zero: exp([w]x) R = R + [w]x R is exact, in the derivative too.
     moved_r = r + hat(step[:, :3]) @ r
     moved_t = (t + step[:, 3:]) * scale - _turned(moved_r, centre)

@@ -57,13 +57,14 @@ def test_a_gradient_that_is_not_a_number_is_counted() -> None:
     assert stats == BackwardStats(samples=3, unconverged=1)
 
 
-@pytest.mark.parametrize("layer", ["sinkhorn", "weighted_pnp"])
+@pytest.mark.parametrize("layer", ["sinkhorn", "weighted_pnp", "weighted_pnp in the points"])
 def test_a_second_derivative_is_refused(layer: str) -> None:
     planted = plant(1, 6)
-    variable = planted.diffuse(0.2).requires_grad_()
+    assignment, points3d = planted.diffuse(0.2).requires_grad_(), planted.points3d.requires_grad_()
     if layer == "sinkhorn":
-        loss = sinkhorn(variable)[0][0, 0, 0]
+        loss = sinkhorn(assignment)[0][0, 0, 0]
     else:
-        loss = weighted_pnp(variable, planted.bearings, planted.points3d, *planted.near(0.1))[1].sum()
+        loss = weighted_pnp(assignment, planted.bearings, points3d, *planted.near(0.1))[1].sum()
+    variable = points3d if "points" in layer else assignment
     with pytest.raises(ValueError, match="expected a first derivative, got create_graph=True"):
         torch.autograd.grad(loss, variable, create_graph=True)

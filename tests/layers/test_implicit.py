@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from bpnp.layers import sinkhorn
-from bpnp.layers.implicit import at_optimum
 
 EXACT = {"tolerance": 1e-14, "max_iterations": 5000}
 
@@ -138,24 +137,3 @@ def test_from_equal_costs_to_an_exact_permutation(dtype: torch.dtype, gap: float
     scale = float((plan * weights).abs().max()) / mu
     assert found.isfinite().all()
     assert (found - projected(plan[0], weights[0], mu)).abs().max() < 32 * torch.finfo(dtype).eps * scale
-
-
-def test_at_optimum_differentiates_any_root() -> None:
-    """Ridge regression: y = (A^T A + s I)^-1 A^T x, from its optimality condition alone."""
-    design, target = uniform(1, 5, 3), uniform(1, 5, seed=1)
-
-    def solve(target: Tensor, strength: Tensor) -> Tensor:
-        def hessian(strength: Tensor) -> Tensor:
-            return design.mT @ design + strength * torch.eye(3).double()
-
-        def optimality(y: Tensor, x: Tensor, s: Tensor) -> Tensor:
-            return (hessian(s) @ y.unsqueeze(-1) - design.mT @ x.unsqueeze(-1)).squeeze(-1)
-
-        with torch.no_grad():
-            normal = hessian(strength)
-            y = torch.linalg.solve(normal, (design.mT @ target.unsqueeze(-1)).squeeze(-1))
-        return at_optimum(y, optimality, lambda v: torch.linalg.solve(normal, v), target, strength)
-
-    inputs = (target.requires_grad_(), torch.tensor(0.3, dtype=torch.float64, requires_grad=True))
-    assert gradcheck(solve, inputs)
-    assert gradcheck(lambda t: solve(t, inputs[1].detach()), inputs[:1])
