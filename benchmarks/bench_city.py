@@ -1,6 +1,6 @@
 """Photos without descriptors or a view in maps merged to one city: recall, CPU seconds and memory against its views.
 
-    python -m benchmarks city --views 477 1000 3000 10000 --limit 12 --draw city.png
+    python -m benchmarks city --views 477 1000 3000 10000 --limit 12
     python -m benchmarks city --twice 0.1
 
 The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views
@@ -14,16 +14,16 @@ degrees and lies within half the distance.
 import argparse
 import resource
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from bench_views import REPORTED
 from cities import CityPhoto, city
-from record import TIME_LIMIT, Outcome, degrees, measured, parser, solved
+from record import TIME_LIMIT, Outcome, Rows, degrees, measured, parser, solved
 
-from bpnp import SceneMap, Solution, warm_up
+from bpnp import SceneMap, warm_up
 from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.maps.views import View
@@ -32,19 +32,6 @@ RIGHT_DEG, RIGHT_SHIFT = 5.0, 0.1
 NEAR_DEG, NEAR_SHIFT = 30.0, 0.5  # of a view that shows about what a photo shows
 FIRST = (1, 10, 50)
 VIEWS = (477, 1000, 3000, 10_000)
-
-
-def localized(scene: SceneMap, photo: CityPhoto, seed: int, limit: float) -> Solution:
-    camera = np.diag([photo.focal, photo.focal, 1.0])
-    return scene.localize(photo.focal * photo.points2d, camera, seed=seed, time_limit=limit)
-
-
-def outcome(scene: SceneMap, photo: CityPhoto, seed: int, limit: float) -> Outcome:
-    search = partial(localized, scene, photo, seed, limit)
-    found = solved(photo.name, *photo.poses[0], search, distance=photo.distance)
-    print(f"  {photo.name}: {found.rotation_deg:.3g} deg, {found.shift:.3g}, {found.verdict}, "
-          f"{found.cpu_seconds:.3g} CPU s", flush=True)  # fmt: skip
-    return found
 
 
 def opened(scene: SceneMap) -> float:
@@ -76,26 +63,30 @@ def is_near(view: View, photo: CityPhoto) -> bool:
     )
 
 
-def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
+def outcomes(scene: SceneMap, photos: Sequence[CityPhoto], seed: int, limit: float) -> list[Outcome]:
+    seconds, rank, found = opened(scene), ranked(scene, photos), []
+    for photo in photos:
+        camera = np.diag([photo.focal, photo.focal, 1.0])
+        search = partial(scene.localize, photo.focal * photo.points2d, camera, seed=seed, time_limit=limit)
+        found.append(solved(photo.name, *photo.poses[0], search, distance=photo.distance))
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
+    print(f"opened in {seconds:.2g} CPU s, {memory:.2g} GB, {rank}", end="; ")
+    return found
+
+
+def rows(options: argparse.Namespace) -> Rows:
     scenes = [read_reconstruction(folder, name=folder.parents[1].name) for folder in folders(options)]
-    each = -(-options.limit // len(options.photos))
+    wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
     for views in options.views if options.twice is None else [0]:
-        wanted = dict.fromkeys(options.photos, each)
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
-        seconds, rank = opened(scene), ranked(scene, photos[: options.limit])
-        outcomes = [outcome(scene, photo, options.seed, options.time_limit) for photo in photos[: options.limit]]
-        memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-        median = np.median([one.cpu_seconds for one in outcomes])
-        yield (
-            f"{rank}, {len(scene.views):,} views, {len(scene.points3d):,} points, opened in {seconds:.2g} CPU s, "
-            f"{memory:.2g} GB, median {median:.3g} CPU s", outcomes,
-        )  # fmt: skip
+        name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
+        yield name, partial(outcomes, scene, photos[: options.limit], options.seed, options.time_limit)
 
 
 def folders(options: argparse.Namespace) -> list[Path]:
     """Those of the models: given ones, or all in the folder of the data."""
-    given = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
-    return [options.data / "colmap" / name / "sparse/0" for name in given]
+    models = options.data / "colmap"
+    return [models / name / "sparse/0" for name in options.scenes or sorted(path.name for path in models.iterdir())]
 
 
 def main() -> None:

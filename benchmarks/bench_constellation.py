@@ -1,25 +1,20 @@
-"""Few points: LEDs of rings, headsets, drones and markers among other lights; success, verdicts and milliseconds.
+"""Few points: LEDs of rings, headsets, drones and markers among other lights; success, verdicts and CPU seconds.
 
-    python -m benchmarks constellation --limit 200 --only "ring, 3 lights" noise
+    python -m benchmarks constellation --limit 200 --only "ring, 3 lights" drone
 
-Every frame has a new pose, every fifth a new device. Right is a rotation within 3 degrees. --peers: the
-baselines too, on --limit frames of some rows. noise: points without a pose, where every confident answer is wrong.
+Every frame has a new pose, every fifth a new device. Right is a rotation within 3 degrees.
 """
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from constellations import Camera, Frame, Kind, device, frame, noise_frame
-from record import Outcome, degrees, measured, parser, solved
+from constellations import Camera, Frame, Kind, device, frame
+from record import Outcome, measured, parser, solved
 from scipy.spatial.transform import Rotation
 
 import bpnp
-from bpnp.models.baselines import Constellation, RandomRansac, SoftPOSIT
-from bpnp.types import Batch
 
 RIGHT_DEG = 3.0
 FISHEYE = Camera(focal=330.0, size=900, fisheye=True)
@@ -58,17 +53,13 @@ SETTINGS = {
     "drone, 3 lights": Setting("drone, 3 lights", "drone", background=3, least=5, normals=False),
     "marker, all seen": Setting("marker, all seen", "marker", least=5, normals=False),
 }
-COMPARED = ("ring, all seen", "ring, 3 lights", "marker, all seen")
-NOISE = [(6, 6), (8, 8), (10, 17), (20, 20), (30, 30), (50, 50), (10, 50), (20, 100), (100, 20)]
 
 
-def outcomes(name: str, limit: int, seed: int, solver: Any = None) -> list[Outcome]:
+def outcomes(name: str, limit: int, seed: int) -> list[Outcome]:
     """Frames of a setting; every fifth has a new device."""
     setting = SETTINGS[name]
     rng = np.random.default_rng([seed, list(SETTINGS).index(name)])
     frames = [picture(setting, 1000 * seed + i // 5, rng) for i in range(limit)]
-    if solver is not None:
-        return [by_baseline(shown, solver) for shown in frames]
     return [
         solved(f"{name} {i}", shown.rotation, shown.translation, partial(search, shown, setting, rng))
         for i, shown in enumerate(frames)
@@ -95,49 +86,11 @@ def search(shown: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Sol
     return bpnp.solve(shown.pixels, shown.device.points3d, shown.camera.model, normals3d=normals, prior=prior)
 
 
-def by_baseline(shown: Frame, solver: Any) -> Outcome:
-    """A baseline on the normalised image and a device of unit size; confident where it says that it has converged."""
-    rays, size = shown.bearings, float(np.abs(shown.device.points3d).max())
-    batch = Batch.from_arrays(
-        [(rays[:, :2] / rays[:, 2:]).astype(np.float32)], [(shown.device.points3d / size).astype(np.float32)]
-    )
-    start = time.process_time()
-    (pose,) = solver(batch).poses.values()
-    seconds = time.process_time() - start
-    error = degrees(pose.rotation[0].double().numpy(), shown.rotation)
-    return Outcome("", error, 0.0, "confident" if bool(pose.stats.converged[0]) else "failed", seconds)
-
-
-def noise(m: int, n: int, limit: int, seed: int) -> list[Outcome]:
-    """Points that have no pose in common: every confident answer is wrong."""
-    rng, nowhere = np.random.default_rng([seed, m, n]), np.full((3, 3), np.nan)
-    frames = [noise_frame(m, n, rng) for _ in range(limit)]
-    return [
-        solved(f"noise {i}", nowhere, np.zeros(3), partial(bpnp.solve, *points, Camera().model))
-        for i, points in enumerate(frames)
-    ]
-
-
-def rows(limit: int, seed: int, *, peers: bool) -> Iterator[tuple[str, Callable[[], list[Outcome]]]]:
-    """The name of every row and what measures it."""
-    for name in SETTINGS:
-        yield name, partial(outcomes, name, limit, seed)
-    for m, n in NOISE:
-        yield f"noise {m} x {n}", partial(noise, m, n, limit, seed)
-    for name in COMPARED if peers else ():
-        for solver in (Constellation(), SoftPOSIT(start="random"), RandomRansac(threshold=0.003, time_limit=5.0)):
-            yield f"{type(solver).__name__}: {name}", partial(outcomes, name, limit, seed, solver)
-
-
 def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
-    options.add_argument("--peers", action="store_true", help="the baselines too")
-    chosen = options.parse_args()
+    chosen = parser(__doc__).parse_args()
     bpnp.warm_up()
-    every = rows(chosen.limit, chosen.seed, peers=chosen.peers)
-    picked = ((name, run()) for name, run in every if any(part in name for part in chosen.only))
-    measured(picked, chosen, RIGHT_DEG)
+    rows = ((name, partial(outcomes, name, chosen.limit, chosen.seed)) for name in SETTINGS)
+    measured(rows, chosen, RIGHT_DEG)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@
 What: maps (photos left out of their map, which view is not told; beside it with the focal length known), views (photos
 against the points of one view), leds (10 or more of them seen), wrong (as maps, told a camera whose focal length is
 wrong by each factor). Right is within 1.5 degrees, of LEDs within 3, and of wrong cameras with the centre within a
-twentieth of the distance too. A line says for how many the focal length is within 3 %, and how many confident poses
-are more than 3 degrees off. --limit: problems a scene or setting.
+twentieth of the distance too. A line says for how many the focal length is within 3 %. --limit: problems a scene or
+setting.
 """
 
 import argparse
@@ -19,55 +19,31 @@ from typing import Any
 import numpy as np
 from bench_constellation import Setting, picture
 from bench_views import REPORTED
-from record import TIME_LIMIT, Array, Outcome, measured, parser, solved
-from view_problems import ViewProblem, scene_problems
+from record import TIME_LIMIT, Array, Outcome, Rows, measured, parser, solved
+from view_problems import MOST_POINTS, ViewProblem, scene_problems
 
 from bpnp import Solution, solve, warm_up
 from bpnp.cameras import image_size
 
 RIGHT = {"maps": (1.5, np.inf), "views": (1.5, np.inf), "leds": (3.0, np.inf), "wrong": (1.5, 0.05)}  # degrees, share
-FAR_DEG, NEAR_FOCAL = 3.0, 0.03
 SCENES = (*REPORTED, "statue_of_liberty")
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in ("ring", "headset") for n in (0, 3)]
-Row = tuple[str, list[Outcome]]
 
 
-def named(name: str, focals: Sequence[float], found: Sequence[tuple[Outcome, Solution]]) -> Row:
-    """A row with the shares of its focal lengths, pixels."""
-    near = [
-        abs(solution.focal_length / focal - 1) < NEAR_FOCAL for (_, solution), focal in zip(found, focals, strict=True)
-    ]
-    far = sum(one.verdict == "confident" and one.rotation_deg > FAR_DEG for one, _ in found)
-    median = np.median([one.cpu_seconds for one, _ in found])
-    title = f"{name}, focal length within 3 % of {np.mean(near):.0%}, confident beyond 3 deg {far}"
-    return f"{title}, median {median:.3g} CPU s", [one for one, _ in found]
-
-
-def outcome(
-    name: str, rotation: Array, translation: Array, search: Callable[[], Solution], distance: float
-) -> tuple[Outcome, Solution]:  # fmt: skip
-    solutions: list[Solution] = []
-
-    def run() -> Solution:
-        solutions.append(search())
-        return solutions[0]
-
-    one = solved(name, rotation, translation, run, distance=distance)
-    print(
-        f"  {name}: {one.rotation_deg:.3g} deg, {one.shift:.3g}, {one.verdict}, {one.cpu_seconds:.3g} CPU s", flush=True
-    )
-    return one, solutions[0]
-
-
-def of_photo(problem: ViewProblem, search: Callable[..., Solution], what: str) -> tuple[Outcome, Solution]:
+def of_photo(problem: ViewProblem, search: Callable[..., Solution], factor: float | None) -> Outcome:
+    """A photo with a camera of `factor` times its focal length, or with the image's size alone."""
     pixels, size = image_of(problem)
-    known = np.array([[problem.focal, 0, size[0] / 2], [0, problem.focal, size[1] / 2], [0, 0, 1]])
-    camera: dict[str, Any] = {"camera": known} if what == "known" else {"image_size": size}
-    run = partial(search, pixels, **camera, time_limit=TIME_LIMIT)
+    camera: dict[str, Any] = {"image_size": size}
+    if factor is not None:
+        focal = factor * problem.focal
+        camera = {"camera": np.array([[focal, 0, size[0] / 2], [0, focal, size[1] / 2], [0, 0, 1]])}
     seen = problem.points3d[problem.match3d >= 0] @ problem.rotation.T + problem.translation
-    distance = float(np.median(np.linalg.norm(seen, axis=-1)))
-    return outcome(f"{problem.name} {what}", problem.rotation, problem.translation, run, distance)
+    one = solved(
+        problem.name, problem.rotation, problem.translation, partial(search, pixels, **camera, time_limit=TIME_LIMIT),
+        distance=float(np.median(np.linalg.norm(seen, axis=-1))), focal=np.nan if factor else problem.focal,
+    )  # fmt: skip
+    return one if factor in (None, 1.0) else replace(one, outside=True)  # a wrong camera's bound is none
 
 
 def image_of(problem: ViewProblem) -> tuple[Array, tuple[int, int]]:
@@ -79,68 +55,52 @@ def image_of(problem: ViewProblem) -> tuple[Array, tuple[int, int]]:
     return pixels + np.array([width / 2, height / 2]), (width, height)
 
 
-def problems_of(options: argparse.Namespace, views: int, outliers: float) -> list[ViewProblem]:
-    known = {"limit": options.limit, "views": views, "outliers": outliers, "seed": options.seed}
-    most = 1024 if views else None
-    return [problem for name in options.scenes for problem in scene_problems(options.data, name, most=most, **known)]
+def photos(options: argparse.Namespace, views: int, factors: Sequence[float | None]) -> Iterator[tuple[str, Any]]:
+    """Photos against one view or, for 0, in the whole map."""
+    known = {"limit": options.limit, "views": views, "outliers": 0.5 if views else 1.0, "seed": options.seed}
+    most = MOST_POINTS if views else None
+    problems = [one for name in options.scenes for one in scene_problems(options.data, name, most=most, **known)]
 
-
-def maps(options: argparse.Namespace) -> Iterator[Row]:
-    problems = problems_of(options, 0, 1.0)
-    for what in ("known", "unknown"):
-        found = [of_photo(one, partial(one.scene.localize, seed=options.seed), what) for one in problems]
-        yield named(f"whole map, {what}", [one.focal for one in problems], found)
-
-
-def views(options: argparse.Namespace) -> Iterator[Row]:
-    problems = problems_of(options, 1, 0.5)
-    for what in ("known", "unknown"):
-        found = [
-            of_photo(
-                one, lambda pixels, one=one, **known: solve(pixels, one.points3d, seed=options.seed, **known), what
-            )
-            for one in problems
-        ]
-        yield named(f"one view, {what}", [one.focal for one in problems], found)
-
-
-def leds(options: argparse.Namespace) -> Iterator[Row]:
-    for k, setting in enumerate(LEDS):
-        rng, found, focals = np.random.default_rng([options.seed, k]), [], []
-        for i in range(options.limit):
-            shown = picture(setting, 1000 * options.seed + i // 5, rng)
-            size = (shown.camera.size, shown.camera.size)
-            search = partial(
-                solve, shown.pixels, shown.device.points3d, image_size=size, normals3d=shown.device.normals3d
-            )  # fmt: skip
-            distance = float(np.linalg.norm(shown.translation))
-            found.append(outcome(f"{setting.name} {i}", shown.rotation, shown.translation, search, distance))
-            focals.append(shown.camera.focal)
-        yield named(setting.name, focals, found)
-
-
-def wrong(options: argparse.Namespace) -> Iterator[Row]:
-    problems = problems_of(options, 0, 1.0)
-    for factor in options.factors:
+    def outcomes(factor: float | None) -> list[Outcome]:
         found = []
         for one in problems:
-            told = replace(one, focal=factor * one.focal, points2d=one.points2d / factor)
-            found.append(of_photo(told, partial(one.scene.localize, seed=options.seed), "known"))
-        row, outcomes = named(f"focal length x {factor}", [one.focal for one in problems], found)
-        yield row, [replace(one, outside=True) for one in outcomes]  # a wrong camera's bound is none
+            search = partial(solve, points3d=one.points3d) if views else one.scene.localize
+            found.append(of_photo(one, partial(search, seed=options.seed), factor))
+        return found
+
+    for factor in factors:
+        name = "unknown" if factor is None else "known" if factor == 1 else f"x {factor}"
+        yield f"{'one view' if views else 'whole map'}, {name}", partial(outcomes, factor)
 
 
-WHAT = {"maps": maps, "views": views, "leds": leds, "wrong": wrong}
+def leds(setting: Setting, k: int, limit: int, seed: int) -> list[Outcome]:
+    rng, found = np.random.default_rng([seed, k]), []
+    for i in range(limit):
+        shown = picture(setting, 1000 * seed + i // 5, rng)
+        size, known = (shown.camera.size, shown.camera.size), shown.device
+        search = partial(solve, shown.pixels, known.points3d, image_size=size, normals3d=known.normals3d)
+        distance = float(np.linalg.norm(shown.translation))
+        found.append(
+            solved(f"{i}", shown.rotation, shown.translation, search, distance=distance, focal=shown.camera.focal)
+        )
+    return found
+
+
+def rows(options: argparse.Namespace) -> Rows:
+    if options.what == "leds":
+        return [(one.name, partial(leds, one, k, options.limit, options.seed)) for k, one in enumerate(LEDS)]
+    factors = options.factors if options.what == "wrong" else (1.0, None)
+    return photos(options, int(options.what == "views"), factors)
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("what", choices=WHAT)
+    options.add_argument("what", choices=RIGHT)
     options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
     options.add_argument("--factors", type=float, nargs="+", default=FACTORS, help="of wrong focal lengths")
     chosen = options.parse_args()
     warm_up()
-    measured(WHAT[chosen.what](chosen), chosen, *RIGHT[chosen.what])
+    measured(rows(chosen), chosen, *RIGHT[chosen.what])
 
 
 if __name__ == "__main__":

@@ -7,13 +7,14 @@ with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each 
 --maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+import argparse
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from descriptor_poses import DescribedMap
 from rebuilt_maps import PhotoScene, aligned
-from record import TIME_LIMIT, Array, Outcome, measured, parser, solved
+from record import TIME_LIMIT, Outcome, Rows, measured, parser, solved
 
 from bpnp import SceneMap, Solution
 from bpnp.maps.photos import detected_keypoints
@@ -61,17 +62,16 @@ def photo_outcomes(
     }
 
 
-def rows(
-    names: Sequence[str], data: Path, maps: Path, camera: Array, methods: Sequence[str], limit: int, seed: int
-) -> Iterator[tuple[str, list[Outcome]]]:
-    for name in names:
-        scene = PhotoScene(data / "photos" / name, maps / f"{name}-{FEATURES}", tuple(camera), FEATURES)
+def rows(options: argparse.Namespace) -> Rows:
+    for name in options.scenes:
+        kept = options.maps / f"{name}-{FEATURES}"
+        scene = PhotoScene(options.data / "photos" / name, kept, tuple(options.camera), FEATURES)
         full = SceneMap.from_colmap(scene.full())
         photos = [photo for photo in scene.names() if photo in full.view_numbers]
-        chosen = [photos[i] for i in sorted({int(k * len(photos) / limit) for k in range(limit)})]
-        found = [photo_outcomes(scene, photo, full, methods, seed) for photo in chosen]
-        for method in methods:
-            yield f"{name}, {method}", [outcome[method] for outcome in found]
+        chosen = [photos[i] for i in sorted({int(k * len(photos) / options.limit) for k in range(options.limit)})]
+        found = [photo_outcomes(scene, photo, full, options.methods, options.seed) for photo in chosen]
+        for method in options.methods:
+            yield f"{name}, {method}", lambda method=method: [one[method] for one in found]  # type: ignore[misc] # noqa: B023
 
 
 def main() -> None:
@@ -81,8 +81,7 @@ def main() -> None:
     options.add_argument("--camera", type=float, nargs=4, default=CAMERA, metavar=("FX", "FY", "CX", "CY"))
     options.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     chosen = options.parse_args()
-    found = rows(chosen.scenes, chosen.data, chosen.maps, chosen.camera, chosen.methods, chosen.limit, chosen.seed)
-    measured(found, chosen, RIGHT_DEG)
+    measured(rows(chosen), chosen, RIGHT_DEG)
 
 
 if __name__ == "__main__":

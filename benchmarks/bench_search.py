@@ -9,7 +9,9 @@ keypoints without a point and points that the photo does not see.
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from record import TIME_LIMIT, Array, Outcome, measured, parser, solved
@@ -44,17 +46,13 @@ def shapes(ratio: float, limit: int, seed: int) -> Iterator[Problem]:
 def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Iterator[Problem]:
     """Meshes or photos, spread evenly over those that there are."""
     if name.startswith("psb"):
+        rotation: Literal["so3", "euler"] = "so3" if name == "psb-so3" else "euler"
         module: MeshDataModule | ColmapDataModule = MeshDataModule(
-            str(data / "psb"),
-            test_problems=limit,
-            seed=seed,
-            rotation="so3" if name == "psb-so3" else "euler",
-            test_outliers=Outliers(ratio=ratio),
+            str(data / "psb"), test_problems=limit, seed=seed, rotation=rotation, test_outliers=Outliers(ratio=ratio)
         )
     else:
-        module = ColmapDataModule(
-            str(data / "colmap" / name), test_fraction=1.0, rotate=True, clutter=ratio, seed=seed
-        )  # fmt: skip
+        folder = str(data / "colmap" / name)
+        module = ColmapDataModule(folder, test_fraction=1.0, rotate=True, clutter=ratio, seed=seed)
     module.setup("test")
     problems = module.datasets["test"]
     for i in sorted({int(k * len(problems) / limit) for k in range(limit)}):
@@ -63,26 +61,23 @@ def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Itera
         yield f"{name}/{batch.ids[0]}", *(x[0].double().numpy() for x in values if x is not None)  # type: ignore[misc]
 
 
-def outcomes(name: str, data: Path, limit: int, seed: int) -> list[Outcome]:
+def outcomes(chosen: str, data: Path, limit: int, seed: int) -> list[Outcome]:
     """What `solve` finds of a set."""
-    match = re.fullmatch(r"(.+?)(?:-(\d+\.\d+))?", name)
+    match = re.fullmatch(r"(.+?)(?:-(\d+\.\d+))?", chosen)
     assert match is not None
     kind, ratio = match[1], float(match[2] or 0)
     problems = shapes(ratio, limit, seed) if kind == "shapes" else of_data(kind, ratio, data, limit, seed)
     return [
-        solved(
-            problem, rotation, translation,
-            lambda p=points2d, q=points3d: solve(p, q, seed=seed, time_limit=TIME_LIMIT),  # type: ignore[misc]
-        )
-        for problem, points2d, points3d, rotation, translation in problems
-    ]  # fmt: skip
+        solved(name, rotation, translation, partial(solve, points2d, points3d, seed=seed, time_limit=TIME_LIMIT))
+        for name, points2d, points3d, rotation, translation in problems
+    ]
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("sets", nargs="*", default=SETS, metavar="SET")
     chosen = options.parse_args()
-    rows = ((name, outcomes(name, chosen.data, chosen.limit, chosen.seed)) for name in chosen.sets)
+    rows = ((name, partial(outcomes, name, chosen.data, chosen.limit, chosen.seed)) for name in chosen.sets)
     measured(rows, chosen, RIGHT_DEG)
 
 

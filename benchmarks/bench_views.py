@@ -9,14 +9,14 @@ weights. --elsewhere: each photo against the views of another place, where none 
 """
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from record import DATA, TIME_LIMIT, Outcome, measured, parser, solved
+from record import DATA, TIME_LIMIT, Outcome, Rows, measured, parser, solved
 from view_problems import MOST_POINTS, ViewProblem, scene_problems
 
 from bpnp import PosePrior, Solution, solve
@@ -29,10 +29,8 @@ RIGHT_DEG = 1.0
 
 
 def by_search(problem: ViewProblem, seed: int, **options: Any) -> Solution:
-    camera = np.diag([problem.focal, problem.focal, 1.0])
-    return solve(
-        problem.focal * problem.points2d, problem.points3d, camera, seed=seed, time_limit=TIME_LIMIT, **options
-    )  # fmt: skip
+    pixels, camera = problem.pixels
+    return solve(pixels, problem.points3d, camera, seed=seed, time_limit=TIME_LIMIT, **options)
 
 
 def by_view(problem: ViewProblem, seed: int, **options: Any) -> Solution:
@@ -40,10 +38,8 @@ def by_view(problem: ViewProblem, seed: int, **options: Any) -> Solution:
 
 
 def in_map(problem: ViewProblem, seed: int) -> Solution:
-    camera = np.diag([problem.focal, problem.focal, 1.0])
-    return problem.scene.localize(
-        problem.focal * problem.points2d, camera, views=problem.views or None, seed=seed, time_limit=TIME_LIMIT
-    )  # fmt: skip
+    views = problem.views or None
+    return problem.scene.localize(*problem.pixels, views=views, seed=seed, time_limit=TIME_LIMIT)
 
 
 def prior_of_view(problem: ViewProblem) -> PosePrior:
@@ -75,11 +71,9 @@ def outcomes(problems: Sequence[ViewProblem], method: str, seed: int) -> list[Ou
     """What a method finds of the photos; the error of a centre in distances of the median point."""
     return [
         solved(
-            problem.name, problem.rotation, problem.translation,
-            lambda problem=problem: METHODS[method](problem, seed),  # type: ignore[misc]
-            distance=problem.distance,
+            one.name, one.rotation, one.translation, partial(METHODS[method], one, seed), distance=one.distance
         )
-        for problem in problems
+        for one in problems
     ]  # fmt: skip
 
 
@@ -101,7 +95,7 @@ def photos(
     return (elsewhere(problems) if apart else problems)[:limit]
 
 
-def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
+def rows(options: argparse.Namespace) -> Rows:
     for outliers in options.outliers:
         problems = photos(
             options.limit * len(options.scenes), options.seed, scenes=options.scenes, data=options.data,
@@ -109,7 +103,8 @@ def rows(options: argparse.Namespace) -> Iterator[tuple[str, list[Outcome]]]:
             most=None if options.all_points else MOST_POINTS,
         )  # fmt: skip
         for method in options.methods:
-            yield f"{method}, {options.views} views, outliers {outliers:.0%}", outcomes(problems, method, options.seed)
+            name = f"{method}, {options.views} views, outliers {outliers:.0%}"
+            yield name, partial(outcomes, problems, method, options.seed)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Simulated devices with LEDs, frames of them, and fields of craters: what the few-point search is measured on.
+"""Simulated devices with LEDs, and frames of them: what the few-point search is measured on.
 
 Every device is made from a shape and a seed: LEDs with outward normals at random places on a ring, a headset's shell, a
 drone's frame, or a marker's arms. Units are metres and pixels.
@@ -74,10 +74,6 @@ class Frame:
     rotation: Array
     translation: Array
     led: NDArray[np.int64]
-
-    @property
-    def bearings(self) -> Array:
-        return self.camera.bearings(self.pixels)
 
     @property
     def gravity(self) -> tuple[Array, Array]:
@@ -167,11 +163,6 @@ def seen(
     detected = facing & np.isfinite(pixels).all(-1) & (rng.random(len(points)) >= missing)
     led = np.flatnonzero(detected)
     return led, pixels[led] + noise * rng.standard_normal((len(led), 2))
-
-
-def noise_frame(m: int, n: int, rng: np.random.Generator, camera: Camera = Camera()) -> tuple[Array, Array]:
-    """m random pixels and n random scene points that have no pose in common."""
-    return camera.size * rng.random((m, 2)), rng.standard_normal((n, 3))
 
 
 def _spread_directions(count: int, rng: np.random.Generator) -> Array:

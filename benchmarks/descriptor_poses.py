@@ -43,7 +43,10 @@ class DescribedMap:
             {"max_reproj_error": THRESHOLD_PX, "seed": 0}, {},
         )  # fmt: skip
         verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
-        return SimpleNamespace(rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict)
+        return SimpleNamespace(
+            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict,
+            covariance=np.full((6, 6), np.nan), focal_length=np.nan,
+        )  # fmt: skip
 
     def _features(self, photo: str) -> tuple[Array, NDArray[np.float32]]:
         """Keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""

@@ -9,44 +9,29 @@ where there is no GPU.
 
 import sys
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from functools import partial
+from typing import Any
 
+import numpy as np
 import torch
-from problems import planted, planted_network
+from problems import planted, planted_network, training_losses, training_step
 from record import parser, write
 from rich.console import Console
 from rich.table import Table
-from steps import training_step
-from timing import Spread
 
 MODES = ("float32", "bf16", "compile", "bf16+compile")
 BATCHES = (16, 32, 64, 128, 256)
 LEVEL = 10.0
 WARM_UP, STEPS, ROUNDS = 5, 5, 7
-Step = Callable[[], None]
 
 
-@dataclass(frozen=True)
-class Row:
-    mode: str
-    poses: bool
-    batch: int
-    problems_per_second: Spread
-    peak_gb: float
-
-
-def make_step(mode: str, batch: int, points: int, *, poses: bool, device: torch.device) -> Step:
-    problem = planted(batch, points, kind="smooth", level=LEVEL)
+def throughput(mode: str, batch: int, points: int, *, poses: bool) -> dict[str, Any]:
+    device, problem = torch.device("cuda"), planted(batch, points, kind="smooth", level=LEVEL)
     net = planted_network(problem, autocast=torch.bfloat16 if "bf16" in mode else None).to(device)
     if "compile" in mode:
         for part in (net.features2d, net.features3d):
             part.compile()
-    return training_step(net, problem.batch.to(device), poses=poses)
-
-
-def throughput(mode: str, batch: int, points: int, *, poses: bool, device: torch.device) -> Row:
-    step = make_step(mode, batch, points, poses=poses, device=device)
+    step = training_step(net, partial(training_losses, batch=problem.batch.to(device), poses=poses))
     torch.cuda.reset_peak_memory_stats()
     for _ in range(WARM_UP):
         step()
@@ -58,7 +43,9 @@ def throughput(mode: str, batch: int, points: int, *, poses: bool, device: torch
             step()
         torch.cuda.synchronize()
         rates.append(STEPS * batch / (time.perf_counter() - start))
-    return Row(mode, poses, batch, Spread.of(rates), torch.cuda.max_memory_allocated() / 1e9)
+    low, median, high = np.percentile(rates, (25, 50, 75)).tolist()
+    known = {"mode": mode, "loss": "with pose" if poses else "correspondence", "batch": batch}
+    return known | {"problems/s": median, "low": low, "high": high, "GB": torch.cuda.max_memory_allocated() / 1e9}
 
 
 def main() -> None:
@@ -70,21 +57,18 @@ def main() -> None:
     if not torch.cuda.is_available():
         print("expected a GPU that torch.cuda can use, got none; try a machine with CUDA", file=sys.stderr)
         raise SystemExit(2)
-    device, name = torch.device("cuda"), torch.cuda.get_device_name()
     rows = [
-        throughput(mode, batch, chosen.points, poses=poses, device=device)
+        throughput(mode, batch, chosen.points, poses=poses)
         for poses in (False, True)
         for mode in chosen.modes
         for batch in chosen.batches
     ]
-    table = Table("mode", "loss", "batch", "problems/s", "quartiles", "GB", title=f"{name}, {chosen.points} points")
+    table = Table(*rows[0], title=f"{torch.cuda.get_device_name()}, {chosen.points} points")
     for row in rows:
-        rate, loss = row.problems_per_second, "with pose" if row.poses else "correspondence"
-        quartiles = f"{rate.low:.0f}-{rate.high:.0f}"
-        table.add_row(row.mode, loss, str(row.batch), f"{rate.median:.0f}", quartiles, f"{row.peak_gb:.1f}")
+        table.add_row(*(f"{value:.4g}" if isinstance(value, float) else str(value) for value in row.values()))
     Console().print(table)
     if chosen.output:
-        write(chosen.output, {"gpu": name, "rows": [asdict(row) for row in rows]})
+        write(chosen.output, {"gpu": torch.cuda.get_device_name(), "rows": rows})
 
 
 if __name__ == "__main__":

@@ -9,18 +9,19 @@ The inverse is by Cholesky: the block that is left of the symmetric system is po
 the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail inside oneMKL.
 """
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import roma
 import torch
+from problems import losses_of
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from bpnp.geometry import bearings, transform
 from bpnp.models.bpnpnet import BPnPNet
-from bpnp.types import Batch
+from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 MU, SINKHORN_ITERATIONS, SINKHORN_TOLERANCE = 0.1, 100, 1e-9
 PNP_ITERATIONS = 75
@@ -152,18 +153,14 @@ class PaperPnP(torch.autograd.Function):
         return pnp_backward(pose, assignment, rays, points3d, gradient), None, None, None
 
 
-class PaperPrediction(NamedTuple):
-    assignment: Tensor
-    rotation: Tensor | None = None
-    translation: Tensor | None = None
-
-
-def paper_network(net: BPnPNet, batch: Batch, *, poses: bool) -> PaperPrediction:
-    """The paper's layers around the feature nets of `net`."""
+def paper_losses(net: BPnPNet, batch: Batch, poses: bool) -> Tensor:
+    """Of each sample (b,), with the paper's layers around the feature nets of `net`."""
     assignment = PaperSinkhorn.apply(net.cost(batch))
     if not poses:
-        return PaperPrediction(assignment)
+        return losses_of(Prediction(assignment), batch)
     rotation, translation = ransac(assignment.detach(), batch.points2d, batch.points3d)
     start = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1)
     pose = PaperPnP.apply(assignment, bearings(batch.points2d), batch.points3d, start)
-    return PaperPrediction(assignment, roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:])
+    stats = SolveStats.of(torch.ones(len(pose), dtype=torch.bool))
+    found = Pose(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], stats)
+    return losses_of(Prediction(assignment, poses={"pnp": found}), batch)

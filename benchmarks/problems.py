@@ -9,6 +9,7 @@ points in the unit ball. Two kinds of features lead to two kinds of assignments:
   A wrong match is as unlikely as any other; the easy case for every iterative solver.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,11 +18,13 @@ from torch import Tensor, nn
 
 from bpnp.models.bpnpnet import BPnPNet, pairwise_distance
 from bpnp.models.nets.features import ImageFeatures, SceneFeatures
-from bpnp.types import Batch
+from bpnp.training.losses import correspondence_losses, pose_losses
+from bpnp.types import Batch, Prediction
 
 Kind = Literal["smooth", "independent"]
 
 FOCAL, NOISE_PX, DISTANCE, CHANNELS = 800.0, 2.0, 4.5, 128
+LEARNING_RATE = 1e-5
 NET_SHARE = 0.02  # of the real network's features beside the planted ones
 
 
@@ -38,8 +41,8 @@ class Problem:
         return pairwise_distance(self.features2d, self.features3d)
 
 
-def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float = 0.0, seed: int = 0) -> Problem:
-    """Scenes of `points` points on each side. The features of a share `clutter` of them have no counterpart."""
+def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0) -> Problem:
+    """Scenes of `points` points on each side, all of them matches."""
     generator = torch.Generator().manual_seed(seed)
     scene = nn.functional.normalize(torch.randn(batch, points, 3, generator=generator), dim=-1)
     scene = scene * torch.rand(batch, points, 1, generator=generator) ** (1 / 3)
@@ -59,8 +62,6 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, clutter: float
     else:
         features3d = torch.randn(batch, points, CHANNELS, generator=generator)
         features2d = features3d + level * torch.randn(batch, points, CHANNELS, generator=generator)
-    lost = round(clutter * points)
-    features2d[:, :lost] = torch.randn(batch, lost, CHANNELS, generator=generator)
     return Problem(problems, nn.functional.normalize(features2d, dim=-1), nn.functional.normalize(features3d, dim=-1))
 
 
@@ -93,6 +94,29 @@ class _PlantedFeatures(nn.Module):
             z = self.inner(points, mask)
         planted = self.get_buffer("planted")
         return nn.functional.normalize(planted + NET_SHARE * z.to(planted.dtype), dim=-1)
+
+
+def training_step(net: BPnPNet, losses: Callable[[BPnPNet], Tensor]) -> Callable[[], None]:
+    """Forward, loss, backward and Adam. losses: of each sample."""
+    optimiser = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
+
+    def step() -> None:
+        optimiser.zero_grad()
+        losses(net).mean().backward()
+        optimiser.step()
+
+    return step
+
+
+def training_losses(net: BPnPNet, batch: Batch, poses: bool) -> Tensor:
+    """L_c, or L_c + L_p, of each sample (b,)."""
+    return losses_of(net(batch) if poses else net.match(batch), batch)
+
+
+def losses_of(prediction: Prediction, batch: Batch) -> Tensor:
+    losses = correspondence_losses(prediction, batch, angle=None)
+    assert losses is not None
+    return losses + pose_losses(prediction.poses["pnp"], batch) if "pnp" in prediction.poses else losses
 
 
 def _axis_rotation(angle: Tensor, i: int, j: int) -> Tensor:

@@ -25,17 +25,19 @@ ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
 TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also on a busy machine
 NO_POSE_DEG = 180.0
+NEAR_FOCAL = 0.03  # of a focal length that counts as right
 BOUND = 0.999  # share of the confident poses that are within their bound
 
 Array = NDArray[np.float64]
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
-    """The options that every benchmark has: data, seed, number of problems, and a file for the record."""
+    """The options that every benchmark has: data, seed, number of problems, rows, and a file for the record."""
     result = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     result.add_argument("--data", type=Path, default=DATA, help="folder with colmap, photos and psb")
     result.add_argument("--seed", type=int, default=9, help="of the problems and of the search (default: %(default)s)")
     result.add_argument("--limit", type=int, default=12, help="problems a row (default: %(default)s)")
+    result.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
     result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
     return result
 
@@ -45,7 +47,7 @@ class Outcome:
     """Of one problem: error of the rotation, and of the translation in units of the distance or of the scene.
 
     verdict: "" of a method that has none. outside: whether the true pose lies beyond the bound that the solution claims
-    (`beyond_bound`).
+    (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where it was known.
     """
 
     problem: str
@@ -54,18 +56,25 @@ class Outcome:
     verdict: str
     cpu_seconds: float
     outside: bool = True
+    focal: float = np.nan
+
+
+Rows = Iterable[tuple[str, Callable[[], Sequence[Outcome]]]]  # the name of each, and what measures it
 
 
 def solved(
-    problem: str, rotation: Any, translation: Any, solve: Callable[[], Solution], *, distance: float = 1.0
-) -> Outcome:
-    """Solve, and compare with the true pose. distance: unit of the error of the camera's centre."""
+    problem: str, rotation: Any, translation: Any, solve: Callable[[], Solution], *, distance: float = 1.0,
+    focal: float = np.nan,
+) -> Outcome:  # fmt: skip
+    """Solve, and compare with the true pose. distance: unit of the error of the camera's centre. focal: the true focal
+    length in pixels, where it is to be found too."""
     start = time.process_time()
     found = solve()
     seconds = time.process_time() - start
     shift = np.linalg.norm(found.rotation.T @ found.translation - rotation.T @ translation) / distance
     outside = beyond_bound(found, rotation, translation)
-    return Outcome(problem, degrees(found.rotation, rotation), float(shift), found.verdict, seconds, outside)
+    turn, ratio = degrees(found.rotation, rotation), float(found.focal_length / focal)
+    return Outcome(problem, turn, float(shift), found.verdict, seconds, outside, ratio)
 
 
 def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
@@ -106,6 +115,7 @@ def summary(outcomes: Sequence[Outcome], right_deg: float, right_shift: float = 
         "confident": round(float(sure.mean()), 4) if any(o.verdict for o in outcomes) else None,
         "confident_and_wrong": int((sure & ~right & np.array([o.outside for o in outcomes])).sum()),
         "cpu_seconds": round(float(np.mean([o.cpu_seconds for o in outcomes])), 4),
+        "median_cpu_seconds": round(float(np.median([o.cpu_seconds for o in outcomes])), 4),
     }
 
 
@@ -115,28 +125,28 @@ def line(row: dict[str, Any]) -> str:
     confident = "-" if row["confident"] is None else f"{row['confident']:.0%}"
     return (
         f"{row['problems']} problems, rotation {quartiles} deg, right {row['right']:.0%}, confident {confident}, "
-        f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s"
+        f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s, "
+        f"median {row['median_cpu_seconds']:.3g}"
     )
 
 
-def measured(
-    rows: Iterable[tuple[str, Sequence[Outcome]]],
-    options: argparse.Namespace,
-    right_deg: float,
-    right_shift: float = np.inf,
-) -> dict[str, dict[str, Any]]:
+def measured(rows: Rows, options: argparse.Namespace, right_deg: float, right_shift: float = np.inf) -> None:
     """Print a line for each row as it comes, and write all with their outcomes to `--output`."""
     found: dict[str, dict[str, Any]] = {}
-    for name, outcomes in rows:
+    for name, measure in rows:
+        if not any(part in name for part in options.only):
+            continue
+        outcomes = measure()
         if not outcomes:
             print(f"{name}: no problems", flush=True)
             continue
         found[name] = summary(outcomes, right_deg, right_shift)
-        print(f"{name}: {line(found[name])}", flush=True)
+        focal = np.array([outcome.focal for outcome in outcomes])
+        near = f", focal length {np.mean(np.abs(focal - 1) < NEAR_FOCAL):.0%}" if np.isfinite(focal).any() else ""
+        print(f"{name}: {line(found[name])}{near}", flush=True)
         if options.output:
             found[name]["outcomes"] = [asdict(outcome) for outcome in outcomes]
             write(options.output, {"rows": found})
-    return found
 
 
 def write(path: Path, record: dict[str, Any]) -> None:

@@ -5,8 +5,9 @@
 
 Families: leds (the settings of `bench_constellation.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
 the points of one view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard
-(`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong). --limit: problems
-of each setting. Photos are of scenes on which no constant was chosen (`--scenes`).
+(`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong), noise (image and
+scene points drawn independently), shuffled (keypoints of one photo, points that another one sees). --limit: problems of
+each setting. Photos are of scenes on which no constant was chosen (`--scenes`).
 
 Wrong: more than 3 degrees off, or the middle of the scene moved by more than a tenth of its distance, and beyond the
 bound that the solution claims (`record.beyond_bound`); with a wrong focal length: the camera's centre more than a
@@ -24,12 +25,13 @@ from unittest.mock import patch
 import numpy as np
 import pandas as pd
 from bench_constellation import SETTINGS, picture, search
-from bench_search import shapes
-from hard_scenes import CAMERA, SCENES, wrong_focal_plane
+from bench_search import of_data, shapes
+from bench_views import REPORTED
+from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, wrong_focal_plane
 from matplotlib.figure import Figure
 from record import TIME_LIMIT, Array, beyond_bound, degrees, parser
 from scipy.stats import binomtest
-from view_problems import LEAST_MATCHES, scene_problems
+from view_problems import LEAST_MATCHES, MOST_POINTS, scene_problems
 
 from bpnp import Solution, solve, warm_up
 from bpnp.cameras import camera_from
@@ -39,9 +41,10 @@ from bpnp.search.verdict import missed
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
 
-REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")  # no constant was chosen on them
 OUTLIERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 RATIOS = (0.0, 0.25, 0.5)
+NOISE = ((6, 6), (8, 8), (10, 17), (30, 30), (20, 100), (100, 100), (400, 400))
+SHUFFLED = (15, 40, 120, 400)
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 WRONG_DEG, WRONG_SHIFT, WRONG_CENTRE = 3.0, 0.1, 0.05
 GROUPS = {"right, confident": "tab:green", "right": "tab:olive", "wrong": "0.8", "wrong, confident": "tab:red"}
@@ -94,12 +97,9 @@ def focal(options: Any) -> Iterator[Problem]:
 
 def maps(options: Any) -> Iterator[Problem]:
     for photo in _photos(options, 1.0, 0):
-        camera = np.diag([photo.focal, photo.focal, 1.0])
-        known = {"seed": options.seed, "time_limit": options.time_limit}
-        run = partial(photo.scene.localize, photo.focal * photo.points2d, camera, **known)
-        yield Problem(
-            f"maps/{photo.name}", run, [(photo.rotation, photo.translation)], photo.points3d[photo.match3d >= 0]
-        )
+        run = partial(photo.scene.localize, *photo.pixels, seed=options.seed, time_limit=options.time_limit)
+        seen = photo.points3d[photo.match3d >= 0]
+        yield Problem(f"maps/{photo.name}", run, [(photo.rotation, photo.translation)], seen)
 
 
 def hard(options: Any) -> Iterator[Problem]:
@@ -111,13 +111,37 @@ def hard(options: Any) -> Iterator[Problem]:
             yield Problem(f"{draw.__name__}/{k}", run, poses, points3d)
 
 
-FAMILIES = {"leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal}
+def noise(options: Any) -> Iterator[Problem]:
+    for m, n in NOISE:
+        rng = np.random.default_rng([options.seed, m, n])
+        for k in range(options.limit):
+            points = rng.uniform((0, 0), (WIDTH, HEIGHT), (m, 2)), rng.uniform(-1, 1, (n, 3))
+            run = partial(solve, *points, CAMERA, time_limit=options.time_limit)
+            yield Problem(f"{m} x {n}/{k}", run, [], points[1])
+
+
+def shuffled(options: Any) -> Iterator[Problem]:
+    problems = [list(of_data(name, 0.0, options.data, 8, options.seed)) for name in (*options.scenes, "psb")]
+    for size in SHUFFLED:
+        rng = np.random.default_rng([options.seed, size])
+        for k in range(options.limit):
+            one, other = (problems[i] for i in rng.choice(len(problems), 2, replace=False))
+            points2d, points3d = one[rng.integers(len(one))][1], other[rng.integers(len(other))][2]
+            points = rng.permutation(points2d)[:size], rng.permutation(points3d)[:size]
+            run = partial(solve, *points, time_limit=options.time_limit)
+            yield Problem(f"shuffled, {size} points/{k}", run, [], points[1])
+
+
+FAMILIES = {
+    "leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal, "noise": noise,
+    "shuffled": shuffled,
+}  # fmt: skip
 
 
 def _photos(options: Any, outliers: float, views: int) -> Iterator[Any]:
     """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
-    known = {"limit": options.limit, "views": views, "outliers": outliers, "seed": options.seed}
-    turns = [scene_problems(options.data, scene, most=1024 if views else None, **known) for scene in options.scenes]
+    known = {"views": views, "outliers": outliers, "seed": options.seed, "most": MOST_POINTS if views else None}
+    turns = [scene_problems(options.data, scene, limit=options.limit, **known) for scene in options.scenes]
     for turn in zip(*turns, strict=False):
         yield from (photo for photo in turn if photo.matches >= LEAST_MATCHES)
 
@@ -217,15 +241,11 @@ def read(files: list[Path]) -> list[dict[str, Any]]:
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument(
-        "rows", nargs="*", type=Path, help="files to sum up and draw; without one, problems are solved"
-    )
+    options.add_argument("rows", nargs="*", type=Path, help="files to sum up and draw, in place of solving problems")
     options.add_argument("--draw", type=Path, help="picture to write of the files")
     options.add_argument("--families", nargs="*", choices=FAMILIES, default=list(FAMILIES))
     options.add_argument("--scenes", nargs="*", default=REPORTED)
-    options.add_argument(
-        "--time-limit", type=float, default=TIME_LIMIT, help="seconds a problem (default: %(default)s)"
-    )
+    options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds (default: %(default)s)")
     chosen = options.parse_args()
     files = chosen.rows or [chosen.output or Path("reliability.jsonl")]
     known = {(row["family"], row["name"]) for row in read(files)}

@@ -44,6 +44,11 @@ class ViewProblem:
         return int((self.match3d >= 0).sum())
 
     @property
+    def pixels(self) -> tuple[Array, Array]:
+        """Keypoints (m, 2) from the principal point, and the camera's matrix."""
+        return self.focal * self.points2d, np.diag([self.focal, self.focal, 1.0])
+
+    @property
     def distance(self) -> float:
         """Of the median point from the photo."""
         return float(np.median(np.linalg.norm(self.points3d @ self.rotation.T + self.translation, axis=-1)))
@@ -102,9 +107,8 @@ def view_problem(
     share = 1.0 if most is None else min(1.0, most / max(larger, 1))
     kept, extra2d, extra3d = (int(count * share) for count in counts)
     pick = rng.choice(len(true), kept, replace=False)
-    points2d = np.concatenate(
-        [query.points2d[place[pick]], others2d[rng.choice(len(others2d), extra2d, replace=False)]]
-    ).astype(np.float64)
+    clutter2d = others2d[rng.choice(len(others2d), extra2d, replace=False)]
+    points2d = np.concatenate([query.points2d[place[pick]], clutter2d]).astype(np.float64)
     index3d = np.concatenate([true[pick], rng.choice(others3d, extra3d, replace=False)]).astype(np.int64)
     order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
     match3d = np.full(len(index3d), -1)
@@ -126,18 +130,12 @@ def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64])
     """The map of some points, in their order, and of all views but the photo."""
     place = np.full(len(scene.points3d), -1, np.int32)
     place[points] = np.arange(len(points))
-    views = tuple(
-        View(
-            view.name,
-            view.camera,
-            view.rotation,
-            view.translation,
-            np.sort(place[view.observed[place[view.observed] >= 0]]),
-        )
-        for view in scene.images
-        if view is not query
-    )
-    return SceneMap(scene.points3d[points], points, np.zeros(len(points), np.int32), views).seen_by(1)
+    views = []
+    for view in scene.images:
+        if view is not query:
+            seen = np.sort(place[view.observed[place[view.observed] >= 0]])
+            views.append(View(view.name, view.camera, view.rotation, view.translation, seen))
+    return SceneMap(scene.points3d[points], points, np.zeros(len(points), np.int32), tuple(views)).seen_by(1)
 
 
 def scene_problems(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewProblem]:

@@ -130,7 +130,7 @@ def shares_of_partners(net: Matcher, batch: Batch) -> float:
 def test_packing_keeps_the_net_in_half_the_space(
     tmp_path: Path, unseen: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.syspath_prepend(ROOT / "examples")
     pack = importlib.import_module("pack_weights").pack
     net = small_net(normalise=True).eval()
     content = {

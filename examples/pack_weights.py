@@ -1,9 +1,7 @@
-"""How the weights of the package are made of a checkpoint: `python -m benchmarks pack_weights CHECKPOINT OUT`."""
+"""How the weights of the package are made of a checkpoint: `python examples/pack_weights.py CHECKPOINT OUT`."""
 
-import argparse
-from collections.abc import Sequence
+import sys
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -20,23 +18,14 @@ def pack(checkpoint: str | Path, out: str | Path) -> None:
     beyond float16's range.
     """
     content = read_checkpoint(checkpoint)
-    state: dict[str, Any] = {}
-    for key, value in content["state_dict"].items():
-        if key.startswith(PREFIX):
-            state[key] = value.half() if value.is_floating_point() else value
-            if not state[key].isfinite().all():
-                raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
+    state = {key: value for key, value in content["state_dict"].items() if key.startswith(PREFIX)}
+    for key, value in state.items():
+        state[key] = value.half() if value.is_floating_point() else value
+        if not state[key].isfinite().all():
+            raise ValueError(f"expected weights within float16's range, got others in {key} of {checkpoint}")
     with written_whole(Path(out)) as temporary, temporary.open("wb") as file:  # a path would be part of the file
         torch.save({key: content[key] for key in PACKED if key in content} | {"state_dict": state}, file)
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("checkpoint")
-    parser.add_argument("out")
-    chosen = parser.parse_args(arguments)
-    pack(chosen.checkpoint, chosen.out)
-
-
 if __name__ == "__main__":
-    main()
+    pack(*sys.argv[1:])
