@@ -3,8 +3,9 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Methods: views (the three views that share most points are named), map (none is); views-sift and map-sift, the same
-with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each photo on the first run and keeps it in
---maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
+with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words retrieves.
+pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of all
+photos, aligned by the views that both models have.
 """
 
 import argparse
@@ -22,7 +23,7 @@ from bpnp.maps.photos import detected_keypoints
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 FEATURES = 2048  # of a photo in the maps, the largest
 VIEWS = 3
-METHODS = ("views", "map", "views-sift", "map-sift")
+METHODS = ("views", "map", "views-sift", "map-sift", "words-sift")
 RIGHT_DEG = 1.0
 
 
@@ -36,6 +37,9 @@ def searches(
     def one(method: str) -> Callable[[], Solution]:
         named = views if method.startswith("views") else None
         if described is not None and method.endswith("-sift"):
+            if method == "words-sift":
+                described.open()
+                return lambda: described.localize(photo, scene.camera, described.retrieved(photo))
             return lambda: described.localize(photo, scene.camera, named)
         return lambda: place.localize(
             found.pixels, ("PINHOLE", scene.camera), views=named, scores=found.scores, seed=seed, time_limit=TIME_LIMIT

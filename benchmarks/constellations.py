@@ -36,12 +36,11 @@ class Camera:
 
     def project(self, camera: Array) -> Array:
         """Pixels (n, 2) of points (n, 3) in the camera frame, NaN where they cannot be seen."""
-        radius = np.linalg.norm(camera[:, :2], axis=-1)
-        theta = np.arctan2(radius, camera[:, 2])
+        radius, depth = np.linalg.norm(camera[:, :2], axis=-1), camera[:, 2]
         if self.fisheye:
-            scale = np.where(radius > 0, self.focal * theta / np.maximum(radius, 1e-12), self.focal / camera[:, 2])
+            scale = self.focal * np.arctan2(radius, depth) / np.maximum(radius, 1e-12)
         else:
-            scale = np.where(camera[:, 2] > 0, self.focal / np.where(camera[:, 2] > 0, camera[:, 2], 1), np.nan)
+            scale = self.focal / np.where(depth > 0, depth, np.nan)
         pixels = camera[:, :2] * scale[:, None] + self.size / 2
         inside = ((pixels >= 0) & (pixels < self.size)).all(-1, keepdims=True)
         return np.where(inside, pixels, np.nan)

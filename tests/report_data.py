@@ -6,6 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
+from planted import padded, plant
 from scipy.spatial.transform import Rotation
 
 from bpnp.report import ProblemRow, Results, write_results
@@ -44,25 +46,12 @@ def rows(count: int, seed: int, estimates: tuple[str, ...] = ("ransac", "pnp")) 
 
 
 def planted(sizes: tuple[int, ...], clutter: int) -> Batch:
-    """Exact problems; the last `clutter` points of each side have no match, and matches are shuffled."""
-    rng = np.random.default_rng(0)
-    sets2d, sets3d, matches = [], [], []
-    rotation = Rotation.random(len(sizes), rng=rng).as_matrix()
-    for i, size in enumerate(sizes):
-        points = rng.uniform(-1, 1, (size, 3))
-        camera = points @ rotation[i].T + [0, 0, 4]
-        order = rng.permutation(size - clutter)
-        match = np.full(size, -1)
-        match[: size - clutter] = order
-        image = rng.uniform(-1, 1, (size, 2))
-        image[order] = (camera[:, :2] / camera[:, 2:])[: size - clutter]
-        sets2d.append(image)
-        sets3d.append(points)
-        matches.append(match)
-    translation = np.tile([0.0, 0.0, 4.0], (len(sizes), 1))
-    return Batch.from_arrays(
-        sets2d, sets3d, list(rotation), list(translation), matches, ids=[f"problem {i}" for i in range(len(sizes))]
-    )
+    """Exact problems; `clutter` points of each side have no match, and matches are shuffled."""
+    scenes = [
+        plant(1, size - clutter, seed=i, outliers2d=clutter, outliers3d=clutter, dtype=torch.float32)
+        for i, size in enumerate(sizes)
+    ]
+    return replace(padded(scenes), ids=tuple(f"problem {i}" for i in range(len(sizes))))
 
 
 def row(index: int, estimate: str = "pnp", **changes: object) -> ProblemRow:

@@ -2,24 +2,11 @@
 
 import ast
 import functools
-import subprocess
-import sys
 from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
 FILES = sorted(PACKAGE.rglob("*.py"))
-GROUND = {
-    "types",
-    "geometry",
-    "cameras",
-    "files",
-    "lazy",
-    "metrics",
-    "loops",
-    "precision",
-    "checks",
-    "distinct_poses",
-}
+GROUND = {"types", "geometry", "cameras", "files", "lazy", "metrics", "loops", "precision", "checks", "distinct_poses"}
 # What each part may import beside itself and the ground floor.
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),
@@ -125,10 +112,3 @@ def test_only_the_command_line_prints_and_no_assertion_decides_anything() -> Non
             if isinstance(node, ast.Assert):
                 condition = ast.unparse(node.test)
                 assert condition.endswith("is not None") or "isinstance" in condition, named(file)
-
-
-def test_importing_the_package_leaves_plotting_and_logging_alone() -> None:
-    heavy = ("wandb", "plotly", "matplotlib", "lightning", "trimesh", "pycolmap", "jsonargparse")
-    script = f"import sys, bpnp; sys.stdout.write(' '.join(m for m in {heavy} if m in sys.modules))"
-    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert result.stdout == ""

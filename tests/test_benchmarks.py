@@ -26,7 +26,7 @@ from bpnp.maps.views import View
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    "bench_constellation", "bench_focal", "bench_layers", "bench_search", "cities", "descriptor_poses", "gpu",
+    "bench_constellation", "bench_layers", "bench_search", "cities", "descriptor_poses", "gpu",
     "paper_layers", "problems", "rebuilt_maps", "record", "reliability", "results",
 )  # fmt: skip
 
@@ -301,16 +301,22 @@ def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:
 
 
 def test_descriptors_are_matched_to_points_seen_from_several_views(bench: SimpleNamespace) -> None:
+    """And the views that see the photo's points are retrieved before those of another place."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 64))
     seen = np.concatenate([points + 0.1 * rng.normal(size=points.shape) for _ in range(3)])
     photo = np.concatenate([points[:100] + 0.1 * rng.normal(size=(100, 64)), rng.normal(size=(500, 64))])
-    theirs, own = (rows / np.linalg.norm(rows, axis=1, keepdims=True) for rows in (seen, photo))
-    keypoints, ids = bench.descriptor_poses.descriptor_matches(own, theirs, np.tile(np.arange(300) + 7, 3))
+    theirs, own = ((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32) for rows in (seen, photo))
+    ids = np.tile(np.arange(300) + 7, 3)
+    keypoints, matched = bench.descriptor_poses.descriptor_matches(own, theirs, ids)
     true = keypoints < 100
     assert true.sum() == 100
-    np.testing.assert_array_equal(ids[true], keypoints[true] + 7)
+    np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
     assert (~true).sum() < 25
+    described = object.__new__(bench.descriptor_poses.DescribedMap)
+    described._views = {f"{k}": (theirs[ids // 20 == k % 15], ids[ids // 20 == k % 15]) for k in range(30)}
+    described._features = lambda _: (None, own[:100])  # of the points 7 to 106: views 0 to 5, and 15 to 20
+    assert {int(name) % 15 for name in described.retrieved("photo")} <= set(range(6))
 
 
 def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNamespace, tmp_path: Path) -> None:
@@ -335,12 +341,3 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNames
         camera = larger.points3d[view.points] @ view.rotation.T + view.translation
         np.testing.assert_allclose(np.linalg.det(view.rotation), 1)
         assert (np.abs(camera[:, :2] / camera[:, 2:]) < 1).all()
-
-
-def test_an_unknown_focal_length_is_told_nothing(bench: SimpleNamespace) -> None:
-    """The image holds all keypoints about its middle."""
-    points2d = np.random.default_rng(0).uniform(-0.4, 0.5, (50, 2))
-    problem = SimpleNamespace(points2d=points2d, focal=800.0, scene=SimpleNamespace(views=()))
-    pixels, (width, height) = bench.bench_focal.image_of(problem)
-    assert ((pixels >= 0) & (pixels <= [width, height])).all()
-    np.testing.assert_allclose((pixels - [width / 2, height / 2]) / 800, points2d)
