@@ -86,12 +86,13 @@ def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
     if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
         return True
     error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), translation - found.translation]
-    covariance = found.covariance[:6, :6]
+    size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
+    error, covariance = error[:size], found.covariance[:size, :size]
     unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
     return any(
         (error * unit)[:d] @ np.linalg.pinv((covariance * np.outer(unit, unit))[:d, :d]) @ (error * unit)[:d]
         > chi2.ppf(BOUND, d)
-        for d in (3, 6)
+        for d in (3, size)
     )
 
 

@@ -183,6 +183,8 @@ def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(bench: SimpleName
         true = (Rotation.from_rotvec(error[:3]) * turn).as_matrix()
         beyond.append(bench.record.beyond_bound(found, true, shift + error[3:]))
     assert 1 <= sum(beyond) <= 16
+    found.covariance = (root @ root.T)[:3, :3]  # of directions at infinity
+    assert not bench.record.beyond_bound(found, found.rotation, shift)
     found.covariance = np.full((6, 6), np.nan)  # nothing is claimed
     assert bench.record.beyond_bound(found, found.rotation, shift)
     outcomes = [bench.record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
