@@ -39,6 +39,14 @@ class Place:
             views.append(replace(view, rotation=rotation, translation=scale * view.translation - rotation @ shift))
         return Place(scale * self.points3d @ turn.T + shift, tuple(views))
 
+    def only(self, chosen: NDArray[np.bool_], name: str = "") -> "Place":
+        """Some points, and all views with those of them that they see; `name` begins the names of the views."""
+        number = np.cumsum(chosen, dtype=np.int32) - 1
+        views = tuple(
+            replace(view, name=name + view.name, points=number[view.points[chosen[view.points]]]) for view in self.views
+        )
+        return Place(self.points3d[chosen], views)
+
     @property
     def distance(self) -> float:
         """From a view to the points that it sees: the median of the views' medians."""
@@ -85,24 +93,11 @@ def changed(place: Place, rng: np.random.Generator, name: str) -> Place:
         field += np.sin(points @ along + rng.uniform(0, 2 * np.pi))[:, None] * rng.standard_normal(3)
     field *= MOVED * unit / np.sqrt(WAVES * 3 / 2)
     mirror = np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0])  # of the scene and, so that views stay views, of the image
-    kept = rng.random(len(points)) > DROPPED
-    number = np.cumsum(kept, dtype=np.int32) - 1
     views = tuple(
-        replace(
-            view, name=f"{name}{view.name}", rotation=mirror @ view.rotation @ mirror,
-            translation=mirror @ view.translation, points=number[view.points[kept[view.points]]],
-        )
+        replace(view, rotation=mirror @ view.rotation @ mirror, translation=mirror @ view.translation)
         for view in place.views
-    )  # fmt: skip
-    return Place(((points + field) @ mirror)[kept], views)
-
-
-def without_some(place: Place, share: float, rng: np.random.Generator, name: str) -> Place:
-    """The place once more, this share of its points gone."""
-    kept = rng.random(len(place.points3d)) >= share
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    views = tuple(replace(v, name=f"{name}{v.name}", points=number[v.points[kept[v.points]]]) for v in place.views)
-    return Place(place.points3d[kept], views)
+    )
+    return Place((points + field) @ mirror, views).only(rng.random(len(points)) > DROPPED, name)
 
 
 def anywhere(rng: np.random.Generator, places: int, unit: float) -> tuple[float, Array, Array]:
@@ -137,7 +132,7 @@ def city(
         moves = [move] if twice is None else [move, anywhere(rng, len(scenes), place.distance)]
         places.append(place.moved(*move))
         if twice is not None:
-            places.append(without_some(place, twice, rng, "again/").moved(*moves[1]))
+            places.append(place.only(rng.random(len(place.points3d)) >= twice, "again/").moved(*moves[1]))
         for image in left_out[scene.name]:
             poses = tuple((image.rotation @ q.T, s * image.translation - image.rotation @ q.T @ c) for s, q, c in moves)
             keypoints = np.concatenate([image.points2d, image.clutter2d]).astype(np.float64)
@@ -161,9 +156,7 @@ def _copies(first: Sequence[Place], more: int, views: int, rng: np.random.Genera
 
 def _seen_twice(place: Place) -> Place:
     tracks = np.bincount(np.concatenate([view.points for view in place.views]), minlength=len(place.points3d))
-    number = np.cumsum(tracks >= 2, dtype=np.int32) - 1
-    views = tuple(replace(v, points=number[v.points[tracks[v.points] >= 2]]) for v in place.views)
-    return Place(place.points3d[tracks >= 2], views)
+    return place.only(tracks >= 2)
 
 
 def merged(places: Sequence[Place]) -> SceneMap:

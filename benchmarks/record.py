@@ -105,11 +105,13 @@ def degrees(one: Any, other: Any) -> float:
 
 def summary(outcomes: Sequence[Outcome], right_deg: float, right_shift: float = np.inf) -> dict[str, Any]:
     """Quartiles of the rotation's error, shares right and confident, how many are confident, wrong and beyond their own
-    bound, CPU seconds."""
+    bound, CPU seconds; the share of the focal lengths that are near, where they were not known."""
     turn, shift = (np.array([getattr(o, name) for o in outcomes]) for name in ("rotation_deg", "shift"))
     right = (turn < right_deg) & ((shift < right_shift) | np.isinf(right_shift))
     sure = np.array([o.verdict == "confident" for o in outcomes])
-    return {
+    focal = np.array([o.focal for o in outcomes])
+    near = {"focal_near": round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)} if np.isfinite(focal).any() else {}
+    return near | {
         "problems": len(outcomes),
         "rotation_q_deg": [round(float(q), 4) for q in np.percentile(turn, (25, 50, 75))],
         "right": round(float(right.mean()), 4),
@@ -128,6 +130,7 @@ def line(row: dict[str, Any]) -> str:
         f"{row['problems']} problems, rotation {quartiles} deg, right {row['right']:.0%}, confident {confident}, "
         f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s, "
         f"median {row['median_cpu_seconds']:.3g}"
+        + (f", focal length within {NEAR_FOCAL:.0%}: {row['focal_near']:.0%}" if "focal_near" in row else "")
     )
 
 
@@ -142,9 +145,7 @@ def measured(rows: Rows, options: argparse.Namespace, right_deg: float, right_sh
             print(f"{name}: no problems", flush=True)
             continue
         found[name] = summary(outcomes, right_deg, right_shift)
-        focal = np.array([outcome.focal for outcome in outcomes])
-        near = f", focal length {np.mean(np.abs(focal - 1) < NEAR_FOCAL):.0%}" if np.isfinite(focal).any() else ""
-        print(f"{name}: {line(found[name])}{near}", flush=True)
+        print(f"{name}: {line(found[name])}", flush=True)
         if options.output:
             found[name]["outcomes"] = [asdict(outcome) for outcome in outcomes]
             write(options.output, {"rows": found})

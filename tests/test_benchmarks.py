@@ -195,7 +195,18 @@ def test_reliability_goes_on_where_it_was(bench: SimpleNamespace, tmp_path: Path
     """One device of each setting; a second run solves none of them again, and finds the same."""
     out, told = tmp_path / "rows.jsonl", []
     for _ in range(2):
-        arguments = ["reliability", "--families", "leds", "noise", "--limit", "1", "--seed", "9", "--output", str(out)]
+        arguments = [
+            "reliability",
+            "--families",
+            "leds",
+            "noise",
+            "--limit",
+            "1",
+            "--time-limit",
+            "1",
+            "--output",
+            str(out),
+        ]
         monkeypatch.setattr("sys.argv", arguments)
         bench.reliability.main()
         told.append((out.read_text(), capsys.readouterr().out))
