@@ -38,9 +38,9 @@ class DescribedMap:
 
     @cached_property
     def _vocabulary(self) -> NDArray[np.float32]:
-        """Unit vectors (WORDS, 128): k-means of the descriptors of the map."""
+        """Unit vectors (WORDS or fewer, 128): k-means of the descriptors of the map."""
         rows = np.concatenate([descriptors for descriptors, _ in self._views.values()])[::EVERY]
-        words = np.random.default_rng(0).choice(rows, WORDS, replace=False)
+        words = np.random.default_rng(0).choice(rows, min(WORDS, len(rows)), replace=False)
         for _ in range(ROUNDS):
             order = np.argsort(nearest := (rows @ words.T).argmax(1), kind="stable")
             used, starts = np.unique(nearest[order], return_index=True)
@@ -57,7 +57,7 @@ class DescribedMap:
         return rarity, bags / np.linalg.norm(bags, axis=1, keepdims=True)
 
     def _counts(self, descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
-        return np.bincount((descriptors @ self._vocabulary.T).argmax(1), minlength=WORDS)
+        return np.bincount((descriptors @ self._vocabulary.T).argmax(1), minlength=len(self._vocabulary))
 
     def open(self) -> None:
         """What is made of the map before its first photo."""

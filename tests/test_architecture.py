@@ -27,7 +27,7 @@ MAY_IMPORT = {
 }
 LIGHTNING = {"training", "datamodules", "cli", "commands"}
 # Files that may import a library: of OpenCV the pose solvers and the detector of keypoints.
-USERS = {"cv2": 2, "poselib": 1, "pycolmap": 2, "trimesh": 1}
+USERS = {"cv2": 2, "poselib": 1, "pycolmap": 2, "trimesh": 2}
 
 
 def module(file: Path) -> str:
