@@ -1,8 +1,9 @@
 """Which views of a map a photo may be near: a rank from the density of its points, before any pose is tried.
 
 Where a place has texture, photos have keypoints and the map has points. Of a photo and of each view the contrast of
-the density of its points is drawn as a small picture; the photo's is moved and scaled, and the view's
-rank is that of the largest correlation. All views together are one product of matrices.
+the density of its points is drawn as a small picture, as wide as the points reach, whatever the focal length; the
+photo's is moved and scaled, and the view's rank is that of the largest correlation. All views together are one product
+of matrices.
 """
 
 from collections.abc import Iterator, Sequence
@@ -22,14 +23,15 @@ Pictures = NDArray[np.float32]
 class RankSettings:
     """Constants of the rank.
 
-    cells: along a side of a picture. half: its half width, tangent of the angle from the axis. fine, wide: standard
-    deviations of the smoothings whose difference is the contrast, cells. shifts: cells by which the photo is moved
-    along either axis; scales: by which it is scaled. apart: share of a view's points that no better one sees, from
-    which it is another place.
+    cells: along a side of a picture. half: its half width, in units within which the share `within` of the points lies.
+    fine, wide: standard deviations of the smoothings whose difference is the contrast, cells. shifts: cells by which
+    the photo is moved along either axis; scales: by which it is scaled. apart: share of a view's points that no better
+    one sees, from which it is another place.
     """
 
     cells: int = 32
-    half: float = 0.8
+    within: float = 0.9
+    half: float = 1.3
     fine: float = 1.0
     wide: float = 4.0
     shifts: tuple[int, ...] = (-9, -6, -3, 0, 3, 6, 9)
@@ -56,15 +58,17 @@ def pictures_of_photo(points2d: Array, rule: RankSettings = RANK) -> Pictures:
     """(moves, cells^2) contrast of a photo's normalised keypoints (m, 2), moved and scaled."""
     side, most, found = rule.cells, max(rule.shifts), []
     for scale in rule.scales:
-        wide = np.pad(contrast(scale * points2d, rule).reshape(side, side), most)
+        wide = np.pad(contrast(points2d, rule, scale).reshape(side, side), most)
         for down, right in product(rule.shifts, rule.shifts):
             found.append(wide[most + down :, most + right :][:side, :side].ravel())
     return np.stack(found)
 
 
-def contrast(points2d: Array, rule: RankSettings = RANK) -> Pictures:
-    """(cells^2,) of points (k, 2): density smoothed a little less that smoothed widely, of length one; 0 for none."""
-    edges = np.linspace(-rule.half, rule.half, rule.cells + 1)
+def contrast(points2d: Array, rule: RankSettings = RANK, scale: float = 1.0) -> Pictures:
+    """(cells^2,) of points (k, 2), `scale` times as large: density smoothed a little less that smoothed widely, of
+    length one; 0 for none."""
+    unit = np.quantile(np.abs(points2d).max(-1), rule.within) if len(points2d) else 1.0
+    edges = np.linspace(-rule.half, rule.half, rule.cells + 1) * max(unit, 1e-12) / scale
     counts, _, _ = np.histogram2d(points2d[:, 1], points2d[:, 0], bins=(edges, edges))
     density = np.sqrt(gaussian_filter(counts, rule.fine, mode="constant"))
     picture = (density - gaussian_filter(density, rule.wide, mode="constant")).ravel()

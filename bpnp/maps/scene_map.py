@@ -155,11 +155,9 @@ class SceneMap:
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
         cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]
-        pixels, turns = np.asarray(keypoints, np.float64), list[tuple[int, int, int]]()
-        for rung, camera in enumerate(cameras):
-            scores = scores_of_views(camera.normalise(pixels), self.pictures)
-            order = places_first(self.views, scores, len(self.points3d))
-            turns += [(place + RUNG * rung, rung, k) for place, k in enumerate(order)]
+        scores = scores_of_views(cameras[0].normalise(np.asarray(keypoints, np.float64)), self.pictures)
+        order = list(places_first(self.views, scores, len(self.points3d)))
+        turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
         tried = [lens.near(one)._replace(alone=True) if isinstance(lens, UnknownCamera) else lens for one in cameras]
         return [
             Place(view, view.points, tried[rung])

@@ -14,30 +14,35 @@ from bpnp.maps.views import View
 from bpnp.solving.focal_length import UnknownCamera
 
 Array = NDArray[np.float64]
-PLACES, POINTS = 60, 300
+PLACES, POINTS = 60, 900
 
 
 def city(seed: int) -> SceneMap:
-    """Each place a view of its own points, in clumps before the camera."""
+    """Each place a view, in the middle of clumps of points that reach beyond its image."""
     rng, points, views = np.random.default_rng(seed), [], []
     for k in range(PLACES):
-        clumps = rng.uniform((-2, -1.5, 4), (2, 1.5, 8), (25, 3))
-        camera = clumps[rng.integers(25, size=POINTS)] + 0.15 * rng.standard_normal((POINTS, 3))
+        clumps = rng.uniform((-6, -6, 4), (6, 6, 8), (80, 3))
+        camera = clumps[rng.integers(80, size=POINTS)] + 0.15 * rng.standard_normal((POINTS, 3))
         turn, centre = Rotation.random(rng=rng).as_matrix(), 100 * rng.standard_normal(3)
         points.append(camera @ turn + centre)
-        seen = np.arange(k * POINTS, (k + 1) * POINTS, dtype=np.int32)
-        views.append(View(f"{k}", camera_from(np.eye(3)), turn, -turn @ centre, seen))
+        seen = k * POINTS + np.flatnonzero(in_image(camera[:, :2] / camera[:, 2:]))
+        views.append(View(f"{k}", camera_from(np.eye(3)), turn, -turn @ centre, seen.astype(np.int32)))
     every = np.concatenate(points)
     return SceneMap(every, np.arange(len(every)), np.ones(len(every), np.int32), tuple(views))
 
 
+def in_image(points2d: Array) -> NDArray[np.bool_]:
+    return np.asarray((np.abs(points2d) < 0.6).all(-1))
+
+
 def photo(scene: SceneMap, k: int, seed: int, turned_deg: float = 6.0) -> Array:
-    """Half of the points of a view, from beside it, and as many keypoints of nothing."""
+    """Half of the points of a place, from beside its view, and as many keypoints of nothing."""
     rng, view = np.random.default_rng([seed, k]), scene.views[k]
-    camera = scene.points3d[view.points] @ view.rotation.T + view.translation
+    camera = scene.points3d[k * POINTS : (k + 1) * POINTS] @ view.rotation.T + view.translation
     turn = Rotation.from_rotvec(np.radians(turned_deg) * rng.standard_normal(3)).as_matrix()
     camera = camera[rng.random(POINTS) < 0.5] @ turn.T + turned_deg / 20 * rng.standard_normal(3)
     seen = camera[:, :2] / camera[:, 2:]
+    seen = seen[in_image(seen)]
     return np.concatenate([seen, rng.uniform(-0.6, 0.6, seen.shape)])
 
 
