@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from bpnp.commands.output import console, progress, say
+from bpnp.commands.output import progress, say
 from bpnp.files import claimed
+from bpnp.report.terminal import console
 
 if TYPE_CHECKING:
     from bpnp.maps.many_photos import Outcome, SolutionFolder

@@ -1,16 +1,7 @@
-"""What commands print: on a console at least as wide as the tables, and progress on stderr."""
+"""What commands print: lines as they are, and progress on stderr."""
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-
-from bpnp.report.terminal import WIDTH
-
-
-def console() -> Console:
-    """Standard output, at least `WIDTH` columns wide."""
-    terminal = Console()
-    terminal.width = max(terminal.width, WIDTH)
-    return terminal
 
 
 def say(line: object, *, to: Console | None = None) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-from bpnp.commands.output import console, say
+from bpnp.commands.output import say
 from bpnp.report.terminal import Paper
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ def report(
         say(f"wrote {page}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths), recall)}")
-    print_tables(paths, console(), paper=paper, untrained=untrained)
+    print_tables(paths, paper=paper, untrained=untrained)
 
 
 def view(
@@ -73,7 +73,7 @@ def view(
     """
     from bpnp.datamodules.colmap.scenes import photo_finder
     from bpnp.report.figures import plot_problem, save_figure
-    from bpnp.report.photos import box_of
+    from bpnp.report.photos import picture_box
     from bpnp.report.runs import named_runs
 
     names = problems or []
@@ -93,7 +93,7 @@ def view(
         drawn = chosen_problems(folder, names)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
-        under = photo and photo(problem.id, box_of(problem))
+        under = photo and photo(problem.id, picture_box(problem.points2d))
         figure = plot_problem(problem, estimate=estimate, lines=LINES[lines], photo=under)
         written = save_figure(figure, output or folder / "views" / f"{name}.png")
         say(f"wrote {written}")

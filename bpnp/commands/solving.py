@@ -9,8 +9,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.commands.output import console, progress, say
+from bpnp.commands.output import progress, say
 from bpnp.files import write_text
+from bpnp.report.terminal import console
 
 if TYPE_CHECKING:
     from bpnp.solving.solution import Solution

@@ -5,10 +5,10 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bpnp.commands.output import console, progress, say
+from bpnp.commands.output import progress, say
 from bpnp.commands.parser import at_least
 from bpnp.files import claimed, packaged_config, write_text
-from bpnp.report.terminal import Paper
+from bpnp.report.terminal import Paper, console
 
 if TYPE_CHECKING:
     from bpnp.report.tables import Row
@@ -54,7 +54,6 @@ def table(
         CAPTION,
         FILE_COLUMNS,
         as_latex,
-        as_markdown,
         note,
         paper_rows,
         table_frame,
@@ -100,11 +99,7 @@ def table(
     rows += paper_rows(None if published == "none" else published)
     out.print(table_of_rows("Pose errors", FILE_COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
     frame = table_frame(rows)
-    for name, text in (
-        ("table.csv", frame.to_csv(index=False)),
-        ("table.md", as_markdown(rows)),
-        ("table.tex", as_latex(rows)),
-    ):
+    for name, text in {"table.csv": frame.to_csv(index=False), "table.tex": as_latex(rows)}.items():
         say(f"wrote {write_text(output / name, text)}", to=out)
     if rho is not None:
         say(f"wrote {save_figure(outlier_curves(frame), output / 'outliers.png')}", to=out)

@@ -13,12 +13,11 @@ from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.page.charts import RECALLS, recall_chart
 from bpnp.report.points import FEW, ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_shares, read_results
-from bpnp.report.runs import named_runs
 
 MOST_PICTURES = 12
 
 
-def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None = None, directory: Path | str) -> Path:
+def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directory: Path | str) -> Path:
     """Log a results folder to W&B and return the folder of the run, below `directory`.
 
     Scalars "test/<estimate>/rotation_q1_deg" and so on, the first estimate's also without its name; tables "quartiles",
@@ -28,15 +27,15 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
     import wandb
 
     results, problems = read_results(folder), read_points(folder)
-    directory = Path(directory)
-    directory.mkdir(parents=True, exist_ok=True)
+    Path(directory).mkdir(parents=True, exist_ok=True)
+    mode: Any = os.environ.get("WANDB_MODE") or "offline"
     run = wandb.init(
         project=project,
-        name=name or next(iter(named_runs([folder]))),
+        name=name,
         dir=str(directory),
         job_type="test",
         config={"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written},
-        mode=mode(),
+        mode=mode,
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
     )
     try:
@@ -46,21 +45,14 @@ def log_results(folder: Path | str, *, project: str = "bpnp", name: str | None =
         run.finish()
 
 
-def mode() -> Any:
-    """WANDB_MODE, "offline" where it is not set: nothing is sent unless asked."""
-    return os.environ.get("WANDB_MODE") or "offline"
-
-
 def scalars(results: Results) -> dict[str, float]:
     """The numbers of `summary.json` under the names that a test logs."""
-    values: dict[str, float] = {}
-    for i, (estimate, numbers) in enumerate(results.estimates.items()):
+    first = next(iter(results.estimates.values()))
+    values = {f"test/{key}": value for key, value in first.items()}
+    for estimate, numbers in results.estimates.items():
         values |= {f"test/{estimate}/{key}": value for key, value in numbers.items()}
-        if i == 0:
-            values |= {f"test/{key}": value for key, value in numbers.items()}
-    if results.correspondence_loss is not None:
-        values["test/correspondence_loss"] = results.correspondence_loss
-    return values
+    loss = results.correspondence_loss
+    return values if loss is None else values | {"test/correspondence_loss": loss}
 
 
 def _media(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any]:
@@ -69,17 +61,15 @@ def _media(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any
     from pandas import DataFrame
 
     causes = {name: cause_shares(results.of(name)) for name in results.estimates}
-    frames = {
-        "quartiles": DataFrame.from_dict(results.estimates, orient="index"),
-        "causes": DataFrame.from_dict(causes, orient="index"),
+    tables = {
+        "quartiles": DataFrame.from_dict(results.estimates, orient="index").reset_index(names="estimate"),
+        "causes": DataFrame.from_dict(causes, orient="index").reset_index(names="estimate"),
         "problems": results.frame().map(lambda value: utf8(value) if isinstance(value, str) else value),
     }
-    tables = {
-        name: frame if name == "problems" else frame.reset_index(names="estimate") for name, frame in frames.items()
-    }
     media: dict[str, Any] = {f"test/{name}": wandb.Table(dataframe=frame) for name, frame in tables.items()}
-    charts = {f"test/recall_curve/{error}": recall_chart({"test": results}, error) for error in RECALLS}
-    media |= {key: chart for key, chart in charts.items() if chart is not None}
+    for error in RECALLS:
+        if (chart := recall_chart({"test": results}, error)) is not None:
+            media[f"test/recall_curve/{error}"] = chart
     media["test/recall"] = wandb.Image(recall_curve({"test": results}))
     # Problems with many points: the worst and some others, as a test keeps them.
     worst = sorted(problems, key=lambda problem: (len(problem.points2d) <= FEW, -problem.error))[:MOST_PICTURES]

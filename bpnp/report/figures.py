@@ -6,16 +6,17 @@ in normalised coordinates where there is none.
 """
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.cameras import Camera, in_front
+from bpnp.cameras import in_front
 from bpnp.files import interruptions_later, written_whole
 from bpnp.report.page.charts import RECALLS, Error, recall_of
 from bpnp.report.palette import DASHES, LIGHT, QUIET
-from bpnp.report.photos import Box, box_of, picture_box, size_in_camera
+from bpnp.report.photos import Box, picture_box, size_in_camera
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.runs import lines_of, read_runs
@@ -27,12 +28,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".svg", ".pdf")
 POINTS = 981  # of a curve
-LIMITS: dict[Error, float] = {  # of the recall curves
-    "rotation_deg": 20.0,
-    "translation": 1.0,
-    "joint": 20.0,
-    "reprojection_deg": 2.0,
-}
+LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
 
 
@@ -49,7 +45,7 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure"
         limits = np.linspace(0, limit, POINTS)
         for line in lines_of(runs):
             shares = recall_of(runs[line.run], line.estimate, key, limits)
-            axes.plot(limits, shares, **line_style(line.colour, line.dashes), label=_text(line.label))
+            axes.plot(limits, shares, **_line_style(line.colour, line.dashes), label=_text(line.label))
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
@@ -65,12 +61,13 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
     """
     from matplotlib.figure import Figure
 
-    recall = "recall_joint_15deg_0.5"
     drawn = frame[frame.rho.notna() & ~frame.method.str.contains("standard deviation")].astype({"rho": float})
     figure = Figure(figsize=(9, 3.4), layout="constrained")
-    for axes, key, scale in zip(figure.subplots(1, 2), ("rotation_q2_deg", recall), (1, 100), strict=True):
+    for axes, key, scale in zip(
+        figure.subplots(1, 2), ("rotation_q2_deg", "recall_joint_15deg_0.5"), (1, 100), strict=True
+    ):
         for i, (method, rows) in enumerate(drawn.sort_values("rho").groupby("method", sort=False)):
-            style = line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": _text(str(method))}
+            style = _line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": _text(str(method))}
             axes.plot(rows.rho, scale * rows[key].astype(float), **style)
         axes.set_xlabel("outliers a match, on both sides")
         axes.grid(alpha=0.3)
@@ -80,7 +77,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
     return figure
 
 
-def line_style(colour: int, dashes: int) -> dict[str, Any]:
+def _line_style(colour: int, dashes: int) -> dict[str, Any]:
     """Matplotlib's options of a line from the indices of `styles`."""
     lengths = DASHES[dashes % len(DASHES)]
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
@@ -91,19 +88,16 @@ def plot_problem(
 ) -> "Figure":
     """A problem in space, points with true and estimated cameras, and in the image, seen and reprojected points.
 
-    estimate, lines: see `plot_image`. photo: (h, w, 3) uint8 under the image points, undistorted, that fills
-    `bpnp.report.photos.box_of(problem)`. Raises ValueError for an unknown estimate.
+    estimate, lines, photo: see `plot_image`. Raises ValueError for an unknown estimate.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6), layout="constrained")
     figure.suptitle(_text(problem.id), fontsize=10)
     plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), problem)
-    box = None if photo is None else box_of(problem)
-    axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines, photo=photo, box=box)
-    name = estimate_of(problem, estimate)
-    posed = name is not None and np.isfinite(np.c_[problem.estimates[name]]).all()
-    axes.set_title(_text(f"reprojected by {name}") if posed else "no pose", fontsize=9)
+    axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines, photo=photo)
+    name, pose = _estimate(problem, estimate)
+    axes.set_title(_text(f"reprojected by {name}") if np.isfinite(np.c_[pose]).all() else "no pose", fontsize=9)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False, fontsize=8)
     return figure
 
@@ -113,7 +107,7 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
 
     axes: a matplotlib axes with projection="3d".
     """
-    colours = {name: LIGHT[i % len(LIGHT)] for i, name in enumerate(problem.estimates)}
+    colours = dict(zip(problem.estimates, cycle(LIGHT), strict=False))
     poses = {name: pose for name, pose in problem.estimates.items() if np.isfinite(np.c_[pose]).all()}
     frame = problem.pose or next(iter(poses.values()), (np.eye(3), np.zeros(3)))
     cameras = {"true pose": (problem.pose, "black")} if problem.pose is not None else {}
@@ -122,8 +116,10 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     axes.scatter(*points.T, s=4, color=QUIET, depthshade=False)
     centre = np.median(points, axis=0)
     depth = max(0.5 * float(np.linalg.norm(centre)), 1e-9)
-    for name, (pose, colour) in cameras.items():
-        corners = _upright(_frustum(pose, problem.points2d, depth), frame)
+    (left, top), (right, bottom) = np.nanmin(problem.points2d, axis=0), np.nanmax(problem.points2d, axis=0)
+    frustum = np.array([[0, 0, 0], [left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]]) * depth
+    for name, ((rotation, translation), colour) in cameras.items():
+        corners = _upright((frustum - translation) @ rotation, frame)
         if np.linalg.norm(corners[0] - centre) > 6 * depth + np.linalg.norm(np.ptp(points, axis=0)):
             axes.plot([], [], color=colour, label=_text(f"{name} (too far away)"))
             continue
@@ -140,38 +136,33 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
 
 def plot_image(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d",
-    photo: Array | None = None, box: Box | None = None,
+    photo: Array | None = None,
 ) -> "Axes":  # fmt: skip
     """Rings around the image points, crosses where a pose puts 3D points, and a line from each to its match.
 
     estimate: whose pose, the first by default. lines: to the true matches or to those assigned by the solver, which a
     problem without known matches always has; those that are not the true ones are dotted. photo: (h, w, 3) uint8, as it
-    was taken with the camera; or undistorted, filling a `box` of the normalised image plane, `picture_box` of the image
-    points for a problem without a camera. Under a photo, 3D points without a match are not drawn. Returns the axes.
+    was taken with the camera; without a camera, undistorted, and filling `bpnp.report.photos.picture_box` of the image
+    points. Under a photo, 3D points without a match are not drawn. Returns the axes.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
-    seen, projected, targets = _drawn(problem, estimate, lines)
-    if photo is not None and (box is not None or problem.camera is None):
-        frame = Box(
-            *_in_unit(np.reshape(box or picture_box(problem.points2d), (2, 2)), problem.camera).ravel().tolist()
-        )
-    else:
-        frame = picture_box(seen) if photo is None else Box(0, 0, *size_in_camera(photo, problem.camera))
-    if photo is not None:
-        axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
+    seen, projected, targets, colour = _drawn(problem, estimate, lines)
+    whole = None if problem.camera is None else photo
+    frame = picture_box(seen) if whole is None else Box(0, 0, *size_in_camera(whole, problem.camera))
     size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
     rim = "black" if photo is None else "white"
     rims = axes.plot(*seen.T, "o", mfc="none", mec=rim, mew=0.7, ms=size, label="image points", zorder=3)
     if photo is not None:
+        axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
         rims[0].set_path_effects([withStroke(linewidth=1.7, foreground="black")])  # for bright photos and the legend
     visible = np.isfinite(projected).all(-1)
-    matched, free = visible & ((targets >= 0) | (lines is None)), visible & (targets < 0) & (lines is not None)
+    joined = visible & (targets >= 0)
+    matched = visible if lines is None else joined
+    free = visible & ~matched
     if matched.any():
-        colour = _colour(problem, estimate)
         axes.plot(*projected[matched].T, "x", color=colour, ms=size, mew=0.9, label="3D points, matched", zorder=4)
-        joined = matched & (targets >= 0)
         wrong = joined & (problem.match3d != targets) & (problem.match3d >= 0)
         for some, ink, style in ((joined & ~wrong, colour, "-"), (wrong, LIGHT[3], ":")):
             if some.any():
@@ -187,16 +178,16 @@ def plot_image(
 
 def plot_residuals(
     axes: "Axes", problem: ProblemPoints, *, estimate: str | None = None, lines: Lines = "match3d"
-) -> "Axes":  # fmt: skip
+) -> "Axes":
     """A close-up: image point minus reprojected 3D point of each match; arguments as for `plot_image`."""
-    seen, projected, targets = _drawn(problem, estimate, lines)
+    seen, projected, targets, colour = _drawn(problem, estimate, lines)
     matched = targets >= 0
     residuals = seen[targets[matched]] - projected[matched]
     if not np.isfinite(residuals).any():
         axes.set_axis_off()
         return axes
     reach = 1.1 * float(np.nanmax(np.abs(residuals))) or 1.0
-    axes.plot(*residuals.T, ".", color=_colour(problem, estimate), ms=4)
+    axes.plot(*residuals.T, ".", color=colour, ms=4)
     axes.axhline(0, color=QUIET, lw=0.5)
     axes.axvline(0, color=QUIET, lw=0.5)
     axes.set(xlim=(-reach, reach), ylim=(reach, -reach), aspect="equal")
@@ -215,34 +206,33 @@ def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:
     return path
 
 
-def estimate_of(problem: ProblemPoints, estimate: str | None) -> str | None:
-    """The estimate, the first by default; None if there is none. Raises ValueError for one that the problem lacks."""
+def _estimate(problem: ProblemPoints, estimate: str | None) -> tuple[str, tuple[Array, Array]]:
+    """Name and pose, of the first estimate by default; NaN if there is none. Raises ValueError for an unknown name."""
     if estimate is not None and estimate not in problem.estimates:
         raise ValueError(f"expected an estimate among {list(problem.estimates)}, got {estimate!r}")
-    return estimate or next(iter(problem.estimates), None)
+    name = estimate or next(iter(problem.estimates), "")
+    return name, problem.estimates.get(name, (np.full((3, 3), np.nan), np.full(3, np.nan)))
 
 
-def _drawn(problem: ProblemPoints, estimate: str | None, lines: Lines | None) -> tuple[Array, Array, Array]:
-    """Image points, projected 3D points (n, 2), NaN without a pose, and the image point that each is joined to."""
-    pose = problem.estimates.get(estimate_of(problem, estimate) or "", (np.full((3, 3), np.nan), np.full(3, np.nan)))
-    projected = in_front(np.asarray(problem.points3d, float) @ pose[0].T + pose[1])[:, :2]
+def _drawn(problem: ProblemPoints, estimate: str | None, lines: Lines | None) -> tuple[Array, Array, Array, str]:
+    """Image points and projected 3D points (NaN without a pose) in the units of the axes, the image point that each 3D
+    point is joined to, and the colour of the estimate."""
+    name, (rotation, translation) = _estimate(problem, estimate)
+    seen = problem.points2d
+    projected = in_front(np.asarray(problem.points3d, float) @ rotation.T + translation)[:, :2]
+    if problem.camera is not None:
+        seen, projected = (
+            problem.camera.project(np.column_stack([points, np.ones(len(points))])) for points in (seen, projected)
+        )
     if lines == "match3d" and (problem.match3d < 0).all():
         lines = "assigned3d"
     targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
-    return _in_unit(problem.points2d, problem.camera), _in_unit(projected, problem.camera), targets
-
-
-def _in_unit(points: Array, camera: Camera | None) -> Array:
-    """Normalised coordinates (k, 2) as the axes have them."""
-    return points if camera is None else camera.project(np.column_stack([points, np.ones(len(points))]))
+    place = [*problem.estimates].index(name) if name else 0
+    return seen, projected, targets, LIGHT[place % len(LIGHT)]
 
 
 def _unit(problem: ProblemPoints) -> str:
     return "normalised coordinates" if problem.camera is None else "pixels"
-
-
-def _colour(problem: ProblemPoints, estimate: str | None) -> str:
-    return LIGHT[list(problem.estimates).index(estimate_of(problem, estimate) or "") % len(LIGHT)]
 
 
 def _text(name: str) -> str:
@@ -251,15 +241,8 @@ def _text(name: str) -> str:
     return f" {shown}" if shown.startswith("_") else shown
 
 
-def _frustum(pose: tuple[Array, Array], points2d: Array, depth: float) -> Array:
-    """Centre and corners of a camera in scene coordinates, as wide as its image points."""
-    (left, top), (right, bottom) = np.nanmin(points2d, axis=0), np.nanmax(points2d, axis=0)
-    corners = np.array([[0, 0, 0], [left, top, 1], [right, top, 1], [right, bottom, 1], [left, bottom, 1]]) * depth
-    rotation, translation = pose
-    return (corners - translation) @ rotation
-
-
 def _upright(points: Array, frame: tuple[Array, Array]) -> Array:
+    """Scene points in the axes right, forward, up of a camera."""
     rotation, translation = frame
     x, y, z = (points @ rotation.T + translation).T
     return np.stack([x, z, -y], -1)

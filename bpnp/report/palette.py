@@ -4,8 +4,6 @@ Eight of each scheme that stay apart for readers with normal vision, protanopia 
 Lab) and tritanopia (23), at a contrast of 3 or more against the background. Estimates also differ by their dashes.
 """
 
-from collections.abc import Mapping, Sequence
-
 LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#58006e", "#201816")
 DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
 # The page itself, light and dark: quiet text, lines between rows, panels, what has the focus, wrong matches.
@@ -21,18 +19,3 @@ INKS = {
 QUIET = INKS["quiet"][0]
 VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
 DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
-
-
-def styles(runs: Mapping[str, Sequence[str]]) -> dict[tuple[str, str], tuple[int, int]]:
-    """Indices of colour and dashes for each estimate of each run.
-
-    With at most eight series each has its own colour; with more, each run has one. Estimates of one name share a line.
-    """
-    series = [(run, estimate) for run, estimates in runs.items() for estimate in estimates]
-    names = list(dict.fromkeys(estimate for _, estimate in series))
-    places = {run: i for i, run in enumerate(runs)}
-    alone = len(series) <= len(LIGHT)
-    return {
-        (run, estimate): ((i if alone else places[run]) % len(LIGHT), names.index(estimate) % len(DASHES))
-        for i, (run, estimate) in enumerate(series)
-    }

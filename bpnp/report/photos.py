@@ -66,40 +66,27 @@ def picture_box(points2d: Array) -> Box:
     return Box(*(low - margin).tolist(), *(high + margin).tolist())
 
 
-def box_of(problem: ProblemPoints) -> Box:
-    """The `picture_box` of a problem."""
-    return picture_box(problem.points2d)
-
-
-def jpeg(photo: Array, *, quality: int = 70) -> bytes:
-    """The photo as JPEG."""
-    from PIL import Image
-
-    content = io.BytesIO()
-    Image.fromarray(photo).save(content, format="JPEG", quality=quality)
-    return content.getvalue()
-
-
 def page_photos(runs: Mapping[str, Sequence[ProblemPoints]], photo: PhotoFinder | None) -> dict[str, dict[str, object]]:
     """By problem, a plotly layout image that fills its box, the worst problems first while there is room."""
-    if photo is None:
-        return {}
-    worst_first = sorted(
-        (problem for problems in runs.values() for problem in problems), key=lambda problem: -problem.error
-    )
+    from PIL import Image
+
     images: dict[str, dict[str, object]] = {}
+    if photo is None:
+        return images
     left = MOST_BYTES
+    worst_first = sorted((problem for run in runs.values() for problem in run), key=lambda problem: -problem.error)
     for problem in {problem.id: problem for problem in worst_first}.values():
-        box = box_of(problem)
+        box, content = picture_box(problem.points2d), io.BytesIO()
         pixels = photo(problem.id, box)
         if pixels is None:
             continue
-        content = base64.b64encode(jpeg(pixels)).decode()
-        left -= len(content)
+        Image.fromarray(pixels).save(content, format="JPEG", quality=70)
+        text = base64.b64encode(content.getvalue()).decode()
+        left -= len(text)
         if left < 0:
             break
         images[problem.id] = {
-            "source": f"data:image/jpeg;base64,{content}", "xref": "x", "yref": "y", "sizing": "stretch",
+            "source": f"data:image/jpeg;base64,{text}", "xref": "x", "yref": "y", "sizing": "stretch",
             "layer": "below", "x": box.left, "y": box.top, "sizex": box.right - box.left, "sizey": box.bottom - box.top,
         }  # fmt: skip
     return images

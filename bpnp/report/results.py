@@ -20,7 +20,7 @@ from scipy.spatial import cKDTree
 from bpnp import __version__
 from bpnp.files import write_text, written_whole
 from bpnp.geometry import project, transform
-from bpnp.metrics import PoseErrors, RecallThresholds, pose_errors, pose_quartiles, pose_recalls
+from bpnp.metrics import PoseErrors, pose_errors, pose_quartiles, pose_recalls
 from bpnp.types import Batch, Pose, Prediction
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ FORMAT = 2  # 1 had pairs.csv
 ROWS, SUMMARY = "problems.csv", "summary.json"
 PIPELINE = ("ransac", "pnp", "refined")  # estimates are listed in this order, others after them
 SOLVED_DEG = 5.0  # largest rotation error of a solved problem
+INLIER_THRESHOLD = 0.01  # largest distance of an inlier, normalised image units
 PLAUSIBLE_INLIERS = 0.5  # share of the 2D points from which a wrong pose counts as fitting the image
 CAUSES = ("solved", "no pose", "wrong, not converged", "wrong, but fits the image", "wrong")
 
@@ -81,7 +82,6 @@ class ProblemRow:
 
 
 TYPES: dict[str, Any] = {field.name: field.type for field in fields(ProblemRow)}
-PARSE: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
 
 
 @dataclass(frozen=True)
@@ -118,12 +118,10 @@ class Results:
         return DataFrame([asdict(row) | {"cause": row.cause} for row in self.rows])
 
 
-def rows_from(
-    prediction: Prediction, batch: Batch, seconds: float, *, inlier_threshold: float = 0.01
-) -> list[ProblemRow]:
+def rows_from(prediction: Prediction, batch: Batch, seconds: float) -> list[ProblemRow]:
     """One row per problem and estimate. `seconds` is the time of the whole batch; each problem has an equal share.
 
-    `inlier_threshold` in normalised image units, see `count_inliers`. Raises ValueError if the batch has no true pose.
+    Raises ValueError if the batch has no true pose.
     """
     matches = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
     sizes = torch.stack([batch.count2d, batch.count3d, matches], -1).tolist()
@@ -132,7 +130,7 @@ def rows_from(
     for estimate, pose in prediction.poses.items():
         known, stats = pose_errors(pose, batch), pose.stats
         columns = (known.rotation_deg, known.translation, known.centre, known.reprojection_deg)
-        errors, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch, threshold=inlier_threshold)
+        errors, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch)
         told = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
         states = zip(*(values.tolist() for values in told), strict=True)
         for i, state in enumerate(states):
@@ -141,7 +139,7 @@ def rows_from(
     return rows
 
 
-def count_inliers(pose: Pose, batch: Batch, *, threshold: float = 0.01) -> list[int]:
+def count_inliers(pose: Pose, batch: Batch, *, threshold: float = INLIER_THRESHOLD) -> list[int]:
     """2D points of each problem with a projected 3D point nearer than `threshold` (normalised image units).
 
     Needs no true match: it is what a user of the pose can check. Points behind the camera do not count; without a pose
@@ -170,13 +168,13 @@ def cause_shares(rows: Iterable[ProblemRow]) -> dict[str, float]:
     return {cause: causes.count(cause) / len(causes) for cause in CAUSES}
 
 
-def summarise(rows: Sequence[ProblemRow], *, thresholds: RecallThresholds | None = None) -> dict[str, dict[str, float]]:
+def summarise(rows: Sequence[ProblemRow]) -> dict[str, dict[str, float]]:
     """By estimate: quartiles and recalls of its rows, the share that converged and the mean seconds per problem."""
     summary = {}
     for estimate in sorted({row.estimate for row in rows}, key=pipeline_order):
         chosen = [row for row in rows if row.estimate == estimate]
         errors = _errors(chosen)
-        figures = pose_quartiles(errors) | pose_recalls(errors, thresholds)
+        figures = pose_quartiles(errors) | pose_recalls(errors)
         values = {key: float(value) for key, value in figures.items()}
         values["converged"] = sum(row.converged for row in chosen) / len(chosen)
         values["seconds_mean"] = math.fsum(row.seconds for row in chosen) / len(chosen)
@@ -195,7 +193,6 @@ def write_results(
     *,
     correspondence_loss: float | None = None,
     settings: Mapping[str, Any] | None = None,
-    thresholds: RecallThresholds | None = None,
 ) -> Results:
     """Write `problems.csv` and `summary.json`, each whole or not at all, and return what was written.
 
@@ -208,8 +205,9 @@ def write_results(
 
     ordered = _ordered(rows)
     written = datetime.now(UTC).isoformat(timespec="seconds")
-    estimates = summarise(ordered, thresholds=thresholds)
-    results = Results(ordered, estimates, correspondence_loss, plain(dict(settings or {})), __version__, written)
+    results = Results(
+        ordered, summarise(ordered), correspondence_loss, plain(dict(settings or {})), __version__, written
+    )
     summary = {"format": FORMAT, "problems": results.problems} | vars(results)
     del summary["rows"]
     frame = DataFrame(map(astuple, ordered), columns=list(TYPES), dtype=object)
@@ -226,20 +224,20 @@ def write_results(
 def read_results(folder: Path | str) -> Results:
     """Read what `write_results` wrote. Raises ValueError that names the file: missing, of another format, incomplete,
     or with a value that is no number."""
-    path = _existing(Path(folder) / SUMMARY)
+    path, table = Path(folder) / SUMMARY, Path(folder) / ROWS
+    for file in (path, table):
+        if not file.is_file():
+            raise ValueError(f"expected a results folder with {file.name}, got no {file}; try `bpnp test` first")
+    rows = _read_rows(table)
     try:
         summary = dict(json.loads(path.read_bytes()))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"expected JSON in {path}, got {error}") from error
-    if (version := summary.pop("format", None)) != FORMAT:
-        wrong = f"expected results of format {FORMAT} in {path}, got {version!r}"
-        raise ValueError(f"{wrong}; try `bpnp test` again, or the bpnp that wrote them")
-    rows = _read_rows(_existing(Path(folder) / ROWS))
-    try:
+        if (version := summary.pop("format", None)) != FORMAT:
+            raise ValueError(f"format {version!r} in place of {FORMAT}; try `bpnp test` again")
         count, loss = summary.pop("problems"), summary.pop("correspondence_loss")
-        loss = None if loss is None else float(loss)
-        estimates = {name: {k: float(v) for k, v in values.items()} for name, values in summary["estimates"].items()}
-        results = Results(rows, correspondence_loss=loss, **summary | {"estimates": estimates})
+        estimates = {
+            name: {k: float(v) for k, v in values.items()} for name, values in summary.pop("estimates").items()
+        }
+        results = Results(rows, estimates, None if loss is None else float(loss), **summary)
     except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"expected what `bpnp test` writes in {path}, got {type(error).__name__}: {error}") from error
     if len(rows) != count * len(estimates):
@@ -258,44 +256,44 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
-def _existing(path: Path) -> Path:
-    if not path.is_file():
-        raise ValueError(f"expected a results folder with {path.name}, got no {path}; try `bpnp test` first")
-    return path
-
-
 def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     from pandas import read_csv
 
+    undefined = {name: ["nan"] for name, kind in TYPES.items() if kind is float}
     try:
-        frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
-        missing = [name for name in TYPES if name not in frame]
-        if missing:
-            raise ValueError(f"no column {missing[0]!r} among {', '.join(frame)}")
-        if frame.isna().any(axis=None):
-            raise ValueError(f"too few columns in row {int(frame.isna().any(axis=1).argmax()) + 1}")
-        columns = [[PARSE[kind](text) for text in frame[name]] for name, kind in TYPES.items()]
+        frame = read_csv(
+            path,
+            dtype=TYPES,
+            keep_default_na=False,
+            na_values=undefined,
+            float_precision="round_trip",
+            encoding_errors="surrogateescape",
+            index_col=False,
+        )[list(TYPES)]
     except (ValueError, KeyError) as error:
         raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
     if frame.empty:
         raise ValueError(f"expected at least one row in {path}, got none")
-    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
+    return tuple(ProblemRow(*values) for values in frame.itertuples(index=False, name=None))
 
 
 def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:
-    ids: dict[int, str] = {}
+    """The first row of each problem and estimate, sorted."""
+    problems: dict[int, tuple[str, int, int]] = {}
     first: dict[tuple[int, str], ProblemRow] = {}
     for row in rows:
-        if ids.setdefault(row.index, row.id) != row.id:
+        described = row.id, row.m, row.n
+        if (other := problems.setdefault(row.index, described)) != described:
             raise ValueError(
-                f"expected one id for index {row.index}, got {ids[row.index]!r}, {row.id!r}; try a folder per data set"
+                f"expected one number in `Batch.index` for each problem, got {row.index} for {other} and {described} "
+                "(id, 2D and 3D points); try Batch.from_arrays(..., index=...), and a folder for each data set"
             )
         first.setdefault((row.index, row.estimate), row)
     counts = Counter(row.estimate for row in first.values())
     if not counts:
         raise ValueError("expected at least one row, got none; try a test set with a problem in it")
-    if len(first) != len(ids) * len(counts):
-        raise ValueError(f"expected each estimate for all {len(ids)} problems, got {dict(counts)}")
+    if len(first) != len(problems) * len(counts):
+        raise ValueError(f"expected each estimate for all {len(problems)} problems, got {dict(counts)}")
     return tuple(sorted(first.values(), key=lambda row: (row.index, pipeline_order(row.estimate))))
 
 

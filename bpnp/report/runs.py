@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bpnp.report.palette import styles
+from bpnp.report.palette import DASHES, LIGHT
 from bpnp.report.results import SUMMARY, Results, read_results
 
 if TYPE_CHECKING:
@@ -60,9 +60,18 @@ class Line(NamedTuple):
 
 
 def lines_of(runs: Mapping[str, Results]) -> list[Line]:
-    """Every estimate of every run, with the run's name only where there are several."""
-    shapes = styles({run: list(results.estimates) for run, results in runs.items()})
-    return [Line(*key, key[1] if len(runs) == 1 else ": ".join(key), *shape) for key, shape in shapes.items()]
+    """Every estimate of every run, with the run's name only where there are several.
+
+    With at most eight lines each has its own colour; with more, each run has one. Estimates of one name share dashes.
+    """
+    keys = [(run, estimate) for run, results in runs.items() for estimate in results.estimates]
+    places, names = list(runs), list(dict.fromkeys(estimate for _, estimate in keys))
+    lines = []
+    for i, (run, estimate) in enumerate(keys):
+        colour = i if len(keys) <= len(LIGHT) else places.index(run) % len(LIGHT)
+        label = estimate if len(runs) == 1 else f"{run}: {estimate}"
+        lines.append(Line(run, estimate, label, colour, names.index(estimate) % len(DASHES)))
+    return lines
 
 
 def named_runs(paths: Sequence[Path | str]) -> dict[str, Path]:
@@ -121,12 +130,12 @@ def read_training_log(results: Path | str) -> TrainingLog | None:
     """
     folder = Path(results).absolute()
     for place in (folder, folder.parent):
-        files = [file for name in LOGS for file in (place / name).glob("version_*/metrics.csv")]
-        logs = {file: _read_log(file) for file in sorted(files, key=_version, reverse=True)}
+        files = [file for name in LOGS for file in (place / name).glob("version_*[0-9]/metrics.csv")]
+        files.sort(key=lambda file: int(file.parent.name.rpartition("_")[2]), reverse=True)
+        logs = {file: _read_log(file) for file in files}
+        # Of a test of untrained weights everything is at step 0.
         trained = {file: log for file, log in logs.items() if LOSS in log} or {
-            file: log
-            for file, log in logs.items()
-            if log.index.max() > 0  # untrained weights are at step 0
+            file: log for file, log in logs.items() if log.index.max() > 0
         }
         if trained:
             return _joined(trained)
@@ -167,8 +176,3 @@ def _thinned(curve: "Series[float]") -> tuple[list[float], list[float]]:
     parts = np.arange(len(curve)) // math.ceil(len(curve) / MOST_POINTS)
     means = curve.reset_index().groupby(parts).mean()
     return means.iloc[:, 0].tolist(), means.iloc[:, 1].tolist()
-
-
-def _version(path: Path) -> tuple[float, str]:
-    number = path.parent.name.removeprefix("version_")
-    return float(number if number.isdigit() else "inf"), str(path)

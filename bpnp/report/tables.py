@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich import box
-from rich.console import Console
-from rich.table import Table
 from rich.text import Text
 
 from bpnp.report.results import Results, read_results
 from bpnp.report.runs import TrainingLog, lines_of, read_runs, trained_only
-from bpnp.report.terminal import WIDTH, Paper, SplitTable, number
+from bpnp.report.terminal import Paper, SplitTable, console, number
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -79,12 +76,9 @@ RECALL_COLUMNS = tuple(
     for limit in limits
 )
 FILE_COLUMNS = (Column("problems", "problems", count=True), *RESULT_COLUMNS)
+HEADS = ("Rotation Error", "Translation Error", "Reproj. Error")
 LATEX_COLUMNS = {
-    **{
-        (f"{error} Error", f"Q{i + 1}"): QUARTILES[3 * k + i]
-        for k, error in enumerate(("Rotation", "Translation", "Reproj."))
-        for i in range(3)
-    },
+    **{(head, f"Q{i + 1}"): QUARTILES[3 * k + i] for k, head in enumerate(HEADS) for i in range(3)},
     ("T", r"$\bar{x}$"): SECONDS,
     (r"Recall (\%)", r"$15^\circ\!, 0.5$"): RECALLS[0],
     (r"Recall (\%)", r"$10^\circ\!, 1$"): RECALLS[1],
@@ -194,7 +188,7 @@ def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], ca
     return SplitTable(title, [column.header for column in columns], groups, caption)
 
 
-def learning_table(before: Results, after: Results) -> Table:
+def learning_table(before: Results, after: Results) -> SplitTable:
     """Correspondence loss and median rotation error of each estimate, untrained and trained, side by side.
 
     Raises ValueError if the two are not of the same problems.
@@ -202,15 +196,12 @@ def learning_table(before: Results, after: Results) -> Table:
     ids = [sorted({(row.index, row.id) for row in results.rows}) for results in (before, after)]
     if ids[0] != ids[1]:
         raise ValueError(f"expected the same problems untrained and trained, got {len(ids[0])} and {len(ids[1])}")
-    table = Table(title=_title("Learning", {"": after}), box=box.SIMPLE_HEAD)
-    table.add_column("")
-    for header in ("untrained", "trained"):
-        table.add_column(header, justify="right", no_wrap=True)
-    table.add_row("correspondence loss", *(number(results.correspondence_loss) for results in (before, after)))
-    for estimate in dict.fromkeys([*before.estimates, *after.estimates]):
-        medians = (results.estimates.get(estimate, {}).get("rotation_q2_deg") for results in (before, after))
-        table.add_row(Text(f"median rotation error, deg: {estimate}"), *map(number, medians))
-    return table
+    figures = {"correspondence loss": [results.correspondence_loss for results in (before, after)]} | {
+        f"{name}: median deg": [results.estimates.get(name, {}).get("rotation_q2_deg") for results in (before, after)]
+        for name in dict.fromkeys([*before.estimates, *after.estimates])
+    }
+    rows = [(Text(name), [Text(number(value)) for value in values]) for name, values in figures.items()]
+    return SplitTable(_title("Learning", {"": after}), ["untrained", "trained"], [rows])
 
 
 def training_table(logs: Mapping[str, TrainingLog]) -> SplitTable:
@@ -218,30 +209,25 @@ def training_table(logs: Mapping[str, TrainingLog]) -> SplitTable:
     rows = []
     for name, log in logs.items():
         for curve, (steps, values) in log.curves.items():
-            texts = (f"{steps[-1]:.0f}", number(values[-1]), number(min(values)))
-            rows.append((Text(curve if len(logs) == 1 else f"{name}: {curve}"), [Text(text) for text in texts]))
+            texts = f"{steps[-1]:.0f}", number(values[-1]), number(min(values))
+            rows.append((Text(curve if len(logs) == 1 else f"{name}: {curve}"), [*map(Text, texts)]))
     return SplitTable("Training", ["steps", "last", "smallest"], [rows], "Nothing tested yet; try `bpnp test`.")
 
 
-def report(
-    paths: Sequence[Path], console: Console | None = None, *, paper: Paper | None = None, untrained: Path | None = None
-) -> None:
+def report(paths: Sequence[Path], *, paper: Paper | None = None, untrained: Path | None = None) -> None:
     """Print the tables of one or several results folders, named by what their paths do not share.
 
-    `untrained` is the folder of the last run's untrained weights. Without `console`, standard output at least `WIDTH`
-    columns wide. Raises ValueError if a folder cannot be read.
+    `untrained` is the folder of the last run's untrained weights. Raises ValueError if a folder cannot be read.
     """
-    if console is None:
-        console = Console()
-        console.width = max(console.width, WIDTH)
+    out = console()
     if logs := trained_only(paths):
-        console.print(training_table(logs))
+        out.print(training_table(logs))
         return
     runs = read_runs(paths)
-    console.print(results_table(runs, paper=paper))
-    console.print(recall_table(runs))
+    out.print(results_table(runs, paper=paper))
+    out.print(recall_table(runs))
     if untrained is not None:
-        console.print(learning_table(read_results(untrained), list(runs.values())[-1]))
+        out.print(learning_table(read_results(untrained), list(runs.values())[-1]))
 
 
 def table_frame(rows: Sequence[Row]) -> "DataFrame":
@@ -254,17 +240,6 @@ def table_frame(rows: Sequence[Row]) -> "DataFrame":
 
     records = [[row.label, row.source, row.rho, *(full(column, row) for column in FILE_COLUMNS)] for row in rows]
     return DataFrame(records, columns=["method", "source", "rho", *(c.key for c in FILE_COLUMNS)], dtype=object)
-
-
-def as_markdown(rows: Sequence[Row]) -> str:
-    """A table with the caption beneath; what is published is in italics."""
-    lines = [["method", *(" ".join(column.header.split()) for column in FILE_COLUMNS)]]
-    lines += [["---", *["---:"] * len(FILE_COLUMNS)]]
-    for row in rows:
-        name = row.name.replace("|", r"\|")
-        cells = [cell(column, row.values) for column in FILE_COLUMNS]
-        lines.append([name if row.source == HERE else f"*{name}*", *cells])
-    return "\n".join([*(f"| {' | '.join(cells)} |" for cells in lines), "", CAPTION, *note(rows), ""])
 
 
 def as_latex(rows: Sequence[Row]) -> str:

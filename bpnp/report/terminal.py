@@ -14,6 +14,13 @@ Paper = Literal["modelnet40", "megadepth"]  # data sets of the paper, whose prin
 WIDTH = 80  # columns of the narrowest terminal; narrower ones wrap
 
 
+def console() -> Console:
+    """Standard output, at least `WIDTH` columns wide."""
+    terminal = Console()
+    terminal.width = max(terminal.width, WIDTH)
+    return terminal
+
+
 @dataclass(frozen=True)
 class SplitTable:
     """A table that is split into several, one below the other, where its columns do not fit side by side.

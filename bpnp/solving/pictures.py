@@ -12,7 +12,6 @@ from bpnp.cameras import Camera, Lens, camera_from
 from bpnp.files import written_whole
 from bpnp.report.figures import plot_image, plot_residuals
 from bpnp.report.palette import VERDICTS
-from bpnp.report.photos import Box
 from bpnp.report.points import ProblemPoints
 
 if TYPE_CHECKING:
@@ -50,16 +49,14 @@ def solution_points(solution: "Solution", *, title: str | None = None) -> Proble
     )  # fmt: skip
 
 
-def solution_picture(
-    solution: "Solution", *, title: str | None = None, photo: Array | None = None, box: Box | None = None
-) -> "Figure":
-    """The image of a solution and a close-up of its residuals; photo, box: see `bpnp.report.plot_image`."""
+def solution_picture(solution: "Solution", *, title: str | None = None, photo: Array | None = None) -> "Figure":
+    """The image of a solution and a close-up of its residuals; photo: see `bpnp.report.plot_image`."""
     from matplotlib.figure import Figure
 
     drawn = solution_points(solution, title=title)
     figure = Figure(layout="constrained")
     axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
-    plot_image(axes, drawn, photo=photo, box=box)
+    plot_image(axes, drawn, photo=photo)
     plot_residuals(close, drawn)
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     height = float(np.clip(WIDTH * (bottom - top) / (right - left), 3, 10))
