@@ -137,14 +137,7 @@ def solve(
             device=device,
             progress=lambda _, batch, __: shown.update(task, description=f"searching the pose, round {batch}"),
         )
-    if json:
-        say(solution.to_json())
-    else:
-        console().print(solution_table(solution))
-    said = Console(stderr=True) if json else None
-    if output is not None:
-        write_text(output, solution.to_json() + "\n")
-        say(f"wrote {output}", to=said)
+    said = _tell(solution, json=json, output=output)
     if picture is not None:
         figure = solution_picture(solution, title=points2d.stem, photo=under)
         say(f"wrote {save_figure(figure, picture)}", to=said)
@@ -196,11 +189,11 @@ def verify(
     from bpnp.commands.point_files import read_camera, read_pairs, read_points2d, read_points3d, read_pose
     from bpnp.solving.verify import verify as judge_pose
 
-    given: tuple[Any, Any]
+    judged: tuple[Any, Any]
     if pose is None and rotation is not None and translation is not None:
-        given = [rotation[:3], rotation[3:6], rotation[6:]], translation
+        judged = [rotation[:3], rotation[3:6], rotation[6:]], translation
     elif pose is not None and rotation is None and translation is None:
-        given = read_pose(pose)
+        judged = read_pose(pose)
     else:
         raise ValueError("expected the JSON of a pose, or --rotation and --translation")
     image_points, labels2d = read_points2d(points2d)
@@ -210,8 +203,8 @@ def verify(
         solution = judge_pose(
             image_points,
             scene_points,
-            given[0],
-            given[1],
+            judged[0],
+            judged[1],
             None if camera is None else read_camera(camera, image),
             normals3d=normals3d,
             labels2d=labels2d,
@@ -222,13 +215,20 @@ def verify(
             seed=seed,
             time_limit=time_limit,
         )
+    _tell(solution, json=json, output=output)
+
+
+def _tell(solution: "Solution", *, json: bool, output: Path | None) -> Console:
+    """Print and write a solution; gives the console for what else was written, stderr beside JSON."""
+    out = Console(stderr=True) if json else console()
     if json:
         say(solution.to_json())
     else:
-        console().print(solution_table(solution))
+        out.print(solution_table(solution))
     if output is not None:
         write_text(output, solution.to_json() + "\n")
-        say(f"wrote {output}", to=Console(stderr=True) if json else None)
+        say(f"wrote {output}", to=out)
+    return out
 
 
 def solution_table(solution: "Solution") -> Table:

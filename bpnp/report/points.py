@@ -21,7 +21,8 @@ from bpnp.types import Batch, Prediction
 
 FORMAT = 2
 FILE = "points.npz"
-FEW, MANY = 24, 1000
+FEW, MANY = 24, 1000  # points a side
+WORST, OTHERS = 12, 12  # problems with up to `MANY`
 IDS = ("ids2d", "ids3d")
 POINTS: dict[str, tuple[Any, ...]] = {  # columns of all problems one after the other: type and width
     "points2d": (np.float32, 2),
@@ -68,8 +69,8 @@ def utf8(name: str) -> str:
     return name.encode("utf-8", "replace").decode()
 
 
-def points_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY) -> list[ProblemPoints]:
-    """The points of a batch. Of larger sets `most_points` are kept on each side, evenly spaced, matched ones first."""
+def points_from(prediction: Prediction, batch: Batch) -> list[ProblemPoints]:
+    """The points of a batch. Of larger sets `MANY` are kept on each side, evenly spaced, matched ones first."""
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
     match3d = unknown if batch.match3d is None else _host(batch.match3d)
@@ -94,23 +95,21 @@ def points_from(prediction: Prediction, batch: Batch, *, most_points: int = MANY
             estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
             error=errors[i],
         )
-        problems.append(thin(problem, most_points))
+        problems.append(thin(problem, MANY))
     return problems
 
 
-def select_points(problems: Iterable[ProblemPoints], *, worst: int = 12, others: int = 12) -> tuple[ProblemPoints, ...]:
-    """The `worst` problems and `others` spread over the data set, by index.
+def select_points(problems: Iterable[ProblemPoints]) -> tuple[ProblemPoints, ...]:
+    """The `WORST` problems and `OTHERS` spread over the data set, by index.
 
     Choosing from what was chosen of the parts gives the same as choosing from the whole, so that problems can be
     selected batch by batch and process by process:
     `chosen = select_points([*chosen, *points_from(prediction, batch)])`.
     """
-    if worst < 0 or others < 0:
-        raise ValueError(f"expected `worst` and `others` >= 0, got {worst} and {others}")
     once = {problem.index: problem for problem in problems}
     by_error = sorted(once.values(), key=lambda problem: (-problem.error, problem.index))
     spread = sorted(once.values(), key=lambda problem: spread_key(problem.index))
-    chosen = {problem.index: problem for problem in [*by_error[:worst], *spread[:others]]}
+    chosen = {problem.index: problem for problem in [*by_error[:WORST], *spread[:OTHERS]]}
     return tuple(chosen[index] for index in sorted(chosen))
 
 

@@ -81,7 +81,8 @@ class ProblemRow:
         return "wrong, but fits the image" if self.inliers >= PLAUSIBLE_INLIERS * self.m else "wrong"
 
 
-TYPES: dict[str, Any] = {field.name: field.type for field in fields(ProblemRow)}
+TYPES: dict[Any, Any] = {int: int, float: float, str: str, bool: {"True": True, "False": False}.__getitem__}
+PARSE = {field.name: TYPES[field.type] for field in fields(ProblemRow)}
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ def write_results(
     )
     summary = {"format": FORMAT, "problems": results.problems} | vars(results)
     del summary["rows"]
-    frame = DataFrame(map(astuple, ordered), columns=list(TYPES), dtype=object)
+    frame = DataFrame(map(astuple, ordered), columns=list(PARSE), dtype=object)
     folder = Path(folder)
     # Old aggregates must not stand beside new rows, should the process end between the two files.
     (folder / SUMMARY).unlink(missing_ok=True)
@@ -259,22 +260,14 @@ def plain(value: Any) -> Any:
 def _read_rows(path: Path) -> tuple[ProblemRow, ...]:
     from pandas import read_csv
 
-    undefined = {name: ["nan"] for name, kind in TYPES.items() if kind is float}
     try:
-        frame = read_csv(
-            path,
-            dtype=TYPES,
-            keep_default_na=False,
-            na_values=undefined,
-            float_precision="round_trip",
-            encoding_errors="surrogateescape",
-            index_col=False,
-        )[list(TYPES)]
+        frame = read_csv(path, dtype=object, keep_default_na=False, encoding_errors="surrogateescape", index_col=False)
+        columns = [[parse(text) for text in frame[name]] for name, parse in PARSE.items()]
     except (ValueError, KeyError) as error:
         raise ValueError(f"expected the rows of a test in {path}, got {error}") from error
     if frame.empty:
         raise ValueError(f"expected at least one row in {path}, got none")
-    return tuple(ProblemRow(*values) for values in frame.itertuples(index=False, name=None))
+    return tuple(ProblemRow(*values) for values in zip(*columns, strict=True))
 
 
 def _ordered(rows: Iterable[ProblemRow]) -> tuple[ProblemRow, ...]:

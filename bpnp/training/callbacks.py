@@ -106,19 +106,18 @@ class OfflineWandbLogger(WandbLogger):
 
     def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str | None = None) -> None:
         mode = os.environ.get("WANDB_MODE") or "offline"  # as an argument too: wandb reads its variables only once
-        super().__init__(project=project, name=name, offline=mode == "offline", mode=mode)
+        super().__init__(project=project, name=name, save_dir=save_dir or ".", offline=mode == "offline", mode=mode)
         self._placed = save_dir is not None
-        if save_dir is not None:
-            self._place(save_dir)
 
     def keep_in(self, folder: str) -> None:
         """Put the run that is to begin below `folder`, unless a `save_dir` was given."""
         if not self._placed:
-            self._place(folder)
+            self._save_dir = self._wandb_init["dir"] = folder
 
-    def _place(self, folder: str) -> None:
-        os.makedirs(folder, exist_ok=True)
-        self._save_dir = self._wandb_init["dir"] = folder
+    @property
+    def experiment(self) -> Any:
+        os.makedirs(self._wandb_init["dir"], exist_ok=True)
+        return super().experiment
 
 
 class TrainingMonitor(Callback):
@@ -152,14 +151,8 @@ class TrainingMonitor(Callback):
         self.seen += len(batch)
         if trainer.is_last_batch:
             # Before the validation that ends the epoch, which is no training.
-            seconds = time.perf_counter() - self.started
-            pl_module.log(
-                "train/problems_per_second",
-                self.seen * trainer.world_size / seconds,
-                on_step=False,
-                on_epoch=True,
-                batch_size=1,
-            )
+            speed = self.seen * trainer.world_size / (time.perf_counter() - self.started)
+            pl_module.log("train/problems_per_second", speed, on_step=False, on_epoch=True, batch_size=1)
 
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
@@ -217,14 +210,15 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
 
 
 def _draw(trainer: Trainer, problems: list[ProblemPoints]) -> None:
-    for logger in trainer.loggers:
+    """To every logger that takes pictures; to files where none does."""
+    figures, loggers = [plot_problem(problem) for problem in problems], trainer.loggers
+    for logger in loggers:
         if isinstance(logger, WandbLogger):
-            names = [problem.id for problem in problems]
-            logger.log_image("val/problems", [plot_problem(problem) for problem in problems], caption=names)
+            logger.log_image("val/problems", figures, caption=[problem.id for problem in problems])
         elif isinstance(logger, TensorBoardLogger):
-            for number, problem in enumerate(problems):
-                logger.experiment.add_figure(f"val/problem{number}", plot_problem(problem), trainer.global_step)
-    if trainer.loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in trainer.loggers):
-        folder = os.path.join(trainer.default_root_dir, "pictures", f"epoch_{trainer.current_epoch:04d}")
-        for number, problem in enumerate(problems):
-            save_figure(plot_problem(problem), os.path.join(folder, f"problem{number}.png"))
+            for number, figure in enumerate(figures):
+                logger.experiment.add_figure(f"val/problem{number}", figure, trainer.global_step)
+    if loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in loggers):
+        folder = Path(trainer.default_root_dir) / "pictures" / f"epoch_{trainer.current_epoch:04d}"
+        for number, figure in enumerate(figures):
+            save_figure(figure, folder / f"problem{number}.png")

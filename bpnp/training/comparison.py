@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 import yaml
-from jsonargparse import ArgumentParser
+from jsonargparse import ArgumentParser, Namespace
 from lightning import LightningDataModule, Trainer
 from torch import nn
 from torch.utils.data import DataLoader, DistributedSampler
@@ -73,25 +73,18 @@ def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> l
 
     Raises ValueError for what names no method, a missing checkpoint, or two methods of one label.
     """
-    methods = [_parse(text, time_limit) for text in texts]
-    labels = [method.label for method in methods]
-    doubled = next((label for label in labels if labels.count(label) > 1), None)
-    if doubled is not None:
-        raise ValueError(f"expected a label for each method, got {doubled!r} twice; try LABEL=METHOD")
-    return methods
-
-
-def _parse(text: str, time_limit: float | None) -> Method:
-    label, equals, what = text.partition("=")
-    what, at, checkpoint = (what if equals else text).partition("@")
-    class_path, init_args = _solver(what, text)
-    return Method(
-        label=label if equals else Path(what).stem if what.endswith(".yaml") else what.rpartition(".")[2],
-        class_path=class_path,
-        init_args=init_args,
-        checkpoint=str(checkpoint_path(checkpoint)) if at else None,
-        time_limit=time_limit,
-    )
+    methods: dict[str, Method] = {}
+    for text in texts:
+        label, equals, what = text.partition("=")
+        what, at, checkpoint = (what if equals else text).partition("@")
+        class_path, init_args = _solver(what, text)
+        if not equals:
+            label = Path(what).stem if what.endswith(".yaml") else what.rpartition(".")[2]
+        if label in methods:
+            raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
+        weights = str(checkpoint_path(checkpoint)) if at else None
+        methods[label] = Method(label, class_path, init_args, weights, time_limit)
+    return list(methods.values())
 
 
 def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
@@ -100,8 +93,7 @@ def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
     what = packaged_config(what)
     if what.endswith((".yaml", ".yml")):
         solver = (_recipe(Path(what), "a solver").get("model") or {}).get("solver")
-        if isinstance(solver, str):
-            return solver, {}
+        solver = {"class_path": solver} if isinstance(solver, str) else solver
         if not isinstance(solver, dict) or "class_path" not in solver:
             raise ValueError(f"expected model.solver.class_path in {what}, got none")
         return solver["class_path"], solver.get("init_args") or {}
@@ -175,9 +167,8 @@ class MethodTest:
                 "`bpnp test` for each method, and `bpnp report` with their folders"
             )
         size = len(loader.dataset)
-        loader = DataLoader(
-            loader.dataset, sampler=[[(0, i)] for i in problem_order(size)[: self.limit]], batch_size=None
-        )
+        chosen = [[(0, i)] for i in problem_order(size)[: self.limit]]
+        loader = DataLoader(loader.dataset, sampler=chosen, batch_size=None)
         writer = ResultsWriter(str(self.folder))
         writer.settings = {
             "solver": {"class_path": self.method.class_path, "init_args": self.method.init_args},
@@ -212,23 +203,23 @@ def checked(base: type, name: str, settings: Mapping[str, Any], overrides: Seque
 
     Raises ValueError, naming the class, for one that cannot be imported and for settings that it does not accept.
     """
-    try:
-        chosen = _parser(base, name).parse_args([f"--{name}={json.dumps(settings)}", *overrides])
-    except Exception as error:
-        reason = str(error).strip().splitlines()[-1].strip()
-        raise ValueError(f"expected settings of {settings.get('class_path')}, got {reason}") from error
-    return dict(chosen.as_dict()[name])
+    return dict(_parsed(base, name, settings, overrides)[1].as_dict()[name])
 
 
 def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
     """The object; raises as `checked` does, and as its constructor."""
-    known = checked(base, name, settings)
-    parser = _parser(base, name)
+    parser, chosen = _parsed(base, name, settings)
     instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
-    return instantiate(parser.parse_object({name: known}))[name]
+    return instantiate(chosen)[name]
 
 
-def _parser(base: type, name: str) -> ArgumentParser:
+def _parsed(
+    base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()
+) -> tuple[ArgumentParser, Namespace]:
     parser = ArgumentParser(exit_on_error=False)
     parser.add_subclass_arguments(base, name)
-    return parser
+    try:
+        return parser, parser.parse_args([f"--{name}={json.dumps(settings)}", *overrides])
+    except Exception as error:
+        reason = str(error).strip().splitlines()[-1].strip()
+        raise ValueError(f"expected settings of {settings.get('class_path')}, got {reason}") from error

@@ -14,7 +14,7 @@ from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from bpnp.report.points import ProblemPoints, points_from, select_points, thin, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import report
-from bpnp.training.task import NUMBER, number_globally
+from bpnp.training.task import number_globally
 from bpnp.types import Batch
 
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
@@ -80,7 +80,6 @@ class ResultsWriter(Callback):
     def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
         if trainer.is_global_zero:
             rows = [row for part, _, _, _ in gathered for row in part]
-            _check_repeated(rows)
             losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer)
@@ -108,25 +107,12 @@ class ResultsWriter(Callback):
         return Path(self.folder) if self.folder else Path(trainer.default_root_dir) / "test"
 
 
-def _check_repeated(rows: Sequence[ProblemRow]) -> None:
-    """Among several processes the first problems are repeated to fill the last batch: raises ValueError for others."""
-    first: dict[tuple[int, str], ProblemRow] = {}
-    for row in rows:
-        other = first.setdefault((row.index, row.estimate), row)
-        if (other.id, other.m, other.n) != (row.id, row.m, row.n):
-            raise ValueError(
-                f"expected one number in `Batch.index` for each problem, got {row.index} for {other.id} and {row.id} "
-                f"of {other.m} and {row.m} 2D points; {NUMBER}"
-            )
-
-
 def _settings(trainer: Trainer) -> dict[str, Any]:
-    """The checkpoint and the seed of its training; of a test from the command line also its data and solver."""
+    """The checkpoint; of a test from the command line also its data and solver."""
     saved = next((each.config for each in trainer.callbacks if isinstance(each, SaveConfigCallback)), None)  # type: ignore[attr-defined]
     config = {} if saved is None else saved.as_dict()
-    settings = {"checkpoint": str(trainer.ckpt_path) if trainer.ckpt_path else None}
-    settings |= {"training_seed": getattr(trainer.lightning_module, "training_seed", None)}
-    return settings | {"data": config.get("data"), "solver": config.get("model", {}).get("solver")}
+    checkpoint = str(trainer.ckpt_path) if trainer.ckpt_path else None
+    return {"checkpoint": checkpoint, "data": config.get("data"), "solver": config.get("model", {}).get("solver")}
 
 
 def _gather(value: Any) -> list[Any]:

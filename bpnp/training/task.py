@@ -1,7 +1,6 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
 import math
-import os
 import time
 from dataclasses import replace
 from typing import Any, Literal, cast
@@ -29,7 +28,6 @@ Stage = Literal["val", "test"]
 DECAYED = 0.02  # of the learning rate, after its fall
 CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
 MOST_SKIPPED = 20  # steps in a row without a finite loss and gradient, which end the run
-NUMBER = "try Batch.from_arrays(..., index=...) with the position of each problem in its data set"
 
 
 class TrainingDivergedError(RuntimeError):
@@ -97,7 +95,6 @@ class BlindPnPTask(LightningModule):
         self.skipped: Tensor
         self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
         self.refine_validation = refine_validation
-        self.training_seed: str | None = None  # of the checkpoint that was loaded, if it is known
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
         self.tabled: set[str] = set()  # names of the figures that the tables of a test show
         estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
@@ -214,11 +211,9 @@ class BlindPnPTask(LightningModule):
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
         checkpoint["solver"] = described(self.solver)
         checkpoint["skipped_steps"] = self.skipped.tolist()
-        checkpoint["seed"] = os.environ.get("PL_GLOBAL_SEED")  # where `lightning.seed_everything` leaves it
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         fitting_state(checkpoint, self.solver)  # one clear error before any state is loaded
-        self.training_seed = checkpoint.get("seed")
         for schedule in checkpoint.get("lr_schedulers", ()):
             schedule["base_lrs"] = [self.learning_rate]  # as it is now, in a run that goes on at another one
         self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
@@ -295,7 +290,8 @@ def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:
     if len(set(index)) < len(index) or not numbers.isdisjoint(index):
         if processes > 1:
             raise ValueError(
-                f"expected one number in `Batch.index` for each problem, got some of {index} again; {NUMBER}"
+                f"expected one number in `Batch.index` for each problem, got some of {index} again; try "
+                "Batch.from_arrays(..., index=...) with the position of each problem in its data set"
             )
         first = max(numbers, default=-1) + 1
         unnamed = [name == str(number) for name, number in zip(batch.ids, index, strict=True)]

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from report_data import write_run
 
-from bpnp.report.dashboards import log_results, mode, scalars
+from bpnp.report.dashboards import log_results, scalars
 from bpnp.report.page.charts import recall_chart
 
 
@@ -51,9 +51,3 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
             return
         time.sleep(0.1)
     pytest.fail(f"expected the scalars in {log}, got {log.stat().st_size} bytes")
-
-
-def test_the_mode_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert mode() == "offline"
-    monkeypatch.setenv("WANDB_MODE", "disabled")
-    assert mode() == "disabled"

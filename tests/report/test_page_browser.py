@@ -15,7 +15,7 @@ from report_data import HOSTILE, drawn_problem, rows, write_run
 
 from bpnp.report import Results, write_page, write_results
 from bpnp.report.palette import DARK, LIGHT
-from bpnp.report.photos import box_of
+from bpnp.report.photos import picture_box
 from bpnp.report.points import thin, write_points
 from bpnp.report.terminal import number
 
@@ -231,7 +231,7 @@ def test_all_pairs_open_and_photos_lie_under_the_points(browser: Any, tmp_path: 
         assert len(images) == (not few)
         assert browser.find_element("id", "photo").is_displayed() != few
         if images:
-            box = box_of(problems[3])
+            box = picture_box(problems[3].points2d)
             assert [images[0][key] for key in ("x", "y")] == pytest.approx([box.left, box.top])
     choose(browser.execute_script, "drawn", "true")
     assert "30 of 30 problems" in texts(browser.execute_script, "#place")[0]

@@ -13,7 +13,7 @@ from report_data import drawn_problem, inflated, write_run
 from bpnp.cli import main
 from bpnp.datamodules.colmap.scenes import photo_finder
 from bpnp.report import plot_problem, write_page
-from bpnp.report.photos import Box, box_of
+from bpnp.report.photos import Box, picture_box
 from bpnp.report.points import write_points
 
 
@@ -71,5 +71,5 @@ def test_the_page_and_the_figure_carry_the_photo(tmp_path: Path) -> None:
     assert len(text) > plain + 3000
     figure = plot_problem(own, photo=np.zeros((4, 4, 3), np.uint8))
     (shown,) = figure.axes[1].images
-    box = box_of(own)
+    box = picture_box(own.points2d)
     assert shown.get_extent() == [box.left, box.right, box.bottom, box.top]

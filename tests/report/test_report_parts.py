@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 from report_data import rows
 
-from bpnp.report import cause_shares, read_training_log
+from bpnp.report.results import cause_shares
+from bpnp.report.runs import read_training_log
 
 
 def test_each_row_has_the_cause_that_its_numbers_say() -> None:

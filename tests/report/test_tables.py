@@ -8,8 +8,9 @@ from report_data import row
 from rich.console import Console
 from rich.table import Table
 
-from bpnp.report import Results, recall_table, results_table, write_results
+from bpnp.report import Results, write_results
 from bpnp.report.page.write import quartile_rows
+from bpnp.report.tables import recall_table, results_table
 from bpnp.report.terminal import SplitTable
 
 

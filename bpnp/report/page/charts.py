@@ -53,9 +53,7 @@ TRAINING = {  # curves by chart, and whether their axis is logarithmic
 def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
     """Errors of the problems that have one; in the joint curve one that is too far away is infinite."""
     errors = results.errors(estimate)
-    if error == "joint":
-        return joint_error(errors, JOINT_TRANSLATION)
-    values: torch.Tensor = getattr(errors, error)
+    values: torch.Tensor = joint_error(errors, JOINT_TRANSLATION) if error == "joint" else getattr(errors, error)
     return values[~values.isnan()]
 
 
@@ -96,17 +94,17 @@ def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
 
 def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
     """Share of problems done within a time; the estimates of a run are made together and share it."""
-    first = {line.run: (place, line) for place, line in reversed(list(enumerate(lines_of(runs))))}
-    times = {
-        run: torch.tensor([row.seconds for row in runs[run].of(line.estimate)]) for run, (_, line) in first.items()
-    }
-    positive = torch.cat([seconds[seconds > 0] for seconds in times.values()])
+    first: dict[str, tuple[int, Line]] = {}
+    for place, line in enumerate(lines_of(runs)):
+        first.setdefault(line.run, (place, line._replace(label=line.run)))
+    times = [torch.tensor([row.seconds for row in runs[run].of(line.estimate)]) for run, (_, line) in first.items()]
+    positive = torch.cat([seconds[seconds > 0] for seconds in times])
     if not len(positive):
         return None
     limits = np.geomspace(float(positive.min()) * 0.9, float(positive.max()) * 1.1, POINTS)
     figure = _figure("Problems done within a time", "seconds per problem", "problems within", share=True)
-    for run, (place, line) in reversed(first.items()):
-        _add(figure, place, line._replace(label=run), limits, recall_curve(times[run], limits.tolist()), "%{y:.1%}")
+    for (place, line), seconds in zip(first.values(), times, strict=True):
+        _add(figure, place, line, limits, recall_curve(seconds, limits.tolist()), "%{y:.1%}")
     return _logarithmic(figure)
 
 
