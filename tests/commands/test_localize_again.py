@@ -112,15 +112,6 @@ def test_a_photo_that_was_overwritten_is_another_one(place: Place, capsys: pytes
     assert "solved again, with another photo: b.png" in capsys.readouterr().out
 
 
-def test_another_photo_of_that_name_in_another_folder(place: Place) -> None:
-    place.run("a.png")
-    (place.folder / "other").mkdir()
-    shot(place.folder / "other/a.png", 9)
-    place.write({"a.png": 1})
-    place.run("other/a.png")
-    assert place.is_right("a.png", 1)
-
-
 def test_a_map_that_was_rebuilt_has_another_frame(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     place.run("a.png", "b.png")
     place.truth = plant_model(place.folder / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15, seed=5)

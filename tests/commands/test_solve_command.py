@@ -159,19 +159,6 @@ def test_an_unwritable_output_is_known_before_the_search(
     assert "file" in fails("solve", *write(tmp_path), "--output", str(tmp_path / "file" / "r.json"))
 
 
-def test_an_interruption_is_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def interrupted(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("bpnp.solving.solve.solve", interrupted)
-    with pytest.raises(SystemExit) as stop:
-        main(["solve", *write(tmp_path)])
-    assert stop.value.code == 130
-    assert capsys.readouterr().err == "bpnp: interrupted\n"
-
-
 def test_the_picture_shows_every_match(tmp_path: Path) -> None:
     main(["solve", *write(tmp_path), "--output", str(tmp_path / "r.json"), "--json"])
     figure = solution_picture(Solution.from_json(tmp_path / "r.json"), title="a $ sign")
