@@ -5,21 +5,7 @@ from typing import Any
 from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
-from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
 from numba.core.types import BaseFunction
-from numba.core.untyped_passes import InlineClosureLikes
-
-
-class _LoopCode(JITCodeLibrary):
-    """The code of a loop, and of its wrapper for Python, which only takes arrays apart and is not optimised."""
-
-    def add_ir_module(self, ir_module: Any) -> None:
-        if ir_module.name == "wrapper":
-            for function in ir_module.functions:
-                if not function.is_declaration:
-                    function.attributes.add("noinline")
-                    function.attributes.add("optnone")
-        super().add_ir_module(ir_module)
 
 
 class _PartCode(JITCodeLibrary):
@@ -32,26 +18,14 @@ class _PartCode(JITCodeLibrary):
         self._finalized = True
 
 
-class LoopCompiler(Compiler):
-    """Compiles a loop, or a part of one, which gets no machine code of its own."""
+class PartCompiler(Compiler):
+    """Compiles a part of a loop, which gets no machine code of its own."""
 
     def __init__(self, typing: Any, target: Any, _: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
-        code = (_PartCode if flags.no_cpython_wrapper else _LoopCode)(target.codegen(), "loop")
+        code = _PartCode(target.codegen(), "part")
         code.enable_object_caching()
         super().__init__(typing, target, code, args, result, flags, *rest)
-        if flags.no_cpython_wrapper:
-            self.state.targetctx.get_executable = _without_machine_code
-
-    def define_pipelines(self) -> Any:
-        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
-        the end of each variable's life, which matters where references are counted."""
-        (pipeline,) = super().define_pipelines()
-        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
-        if not self.state.flags.nrt:
-            unused.add(IRLegalization)
-        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
-        pipeline.finalize()
-        return [pipeline]
+        self.state.targetctx.get_executable = _without_machine_code
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:

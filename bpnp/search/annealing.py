@@ -46,12 +46,11 @@ def anneal_on_clusters(
 
 def _annealed(scene: Scene, starts: Candidates, sides: Sides, scales: Array, outlier: np.float32) -> Candidates:
     """The poses for which there was time, after a step at each of the scales (k,), radians."""
-    bearings, points = map(tuple, sides)
     rotation, translation, score = starts.rotation.copy(), starts.translation.copy(), starts.score.copy()
 
     def anneal(i: int, j: int) -> None:
         scratch = dense_scratch(*(len(side.label) for side in sides))
-        descend(bearings, points, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
+        descend(*sides, rotation[i:j], translation[i:j], scales, outlier, score[i:j], scratch)
 
     done = in_time(anneal, len(starts), scene.deadline, scene.settings.starts_a_check)
     return replace(starts, rotation=rotation, translation=translation, score=score)[:done]
@@ -70,12 +69,16 @@ def anneal_on_points(
     scales = (first_scale * fine.cooling ** np.arange(rounds)).astype(np.float32)
     tiles, points = scene.tiles(bearings)
     tiles, outlier = tiles.with_margin(first_scale), scene.outlier_density(outliers)
-    sides, rotation, translation = (tuple(tiles), tuple(points)), starts.rotation.copy(), starts.translation.copy()
+    rotation, translation = starts.rotation.copy(), starts.translation.copy()
     result = np.zeros((len(starts), 3), np.float32)
 
     def anneal(i: int, j: int) -> None:
-        scratch = sparse_scratch(tiles, len(points.b))
-        descend_sparse(*sides, rotation[i:j], translation[i:j], scales, outlier, fine.patience, result[i:j], scratch)
+        pairs = 0
+        while i < j:
+            scratch = sparse_scratch(tiles, len(points.b), pairs)
+            poses = rotation[i:j], translation[i:j]
+            i += descend_sparse(tiles, points, *poses, scales, outlier, fine.patience, result[i:j], scratch)
+            pairs = 2 * len(scratch.near.point)  # where more points lie together than there was place for
 
     done = in_time(anneal, len(starts), scene.deadline, torch.get_num_threads())
     score = result[:, 0] + np.float32(math.log(1 - outliers))  # the mixture's factor, for shares to be compared

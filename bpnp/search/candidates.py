@@ -115,3 +115,9 @@ def in_user_frame(candidates: Candidates, scene: Scene) -> Candidates:
         values.astype(np.float64) for values in (candidates.score, candidates.matched, candidates.scale)
     )
     return replace(candidates, rotation=rotation, translation=translation, score=score, matched=matched, scale=scale)
+
+
+def in_scene_frame(candidates: Candidates, scene: Scene) -> Candidates:
+    """Candidates of the user in the frame of a scene."""
+    rotation, translation = scene.enter(candidates.rotation, candidates.translation)
+    return replace(candidates, rotation=rotation, translation=translation)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose
 from bpnp.search.annealing import finish
-from bpnp.search.candidates import Candidates, best_distinct, in_user_frame, merged
+from bpnp.search.candidates import Candidates, best_distinct, in_scene_frame, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.point_sets import PointSets
@@ -31,8 +31,7 @@ class Pool:
         self._tests = log10_tests(sets)
         self.forget()
         if len(enumerated.candidates):
-            rotation, translation = scene.enter(enumerated.candidates.rotation, enumerated.candidates.translation)
-            self.candidates = replace(enumerated.candidates, rotation=rotation, translation=translation)
+            self.candidates = in_scene_frame(enumerated.candidates, scene)
 
     def forget(self) -> None:
         """Drop all poses."""
@@ -91,9 +90,7 @@ class Pool:
     @property
     def leader(self) -> Candidates:
         """The best pose, in the scene's frame."""
-        leaders = self.leaders()[:1]
-        rotation, translation = self.scene.enter(leaders.rotation, leaders.translation)
-        return replace(leaders, rotation=rotation, translation=translation)
+        return in_scene_frame(self.leaders()[:1], self.scene)
 
     def looks(self, leaders: Candidates) -> int:
         """How often the surroundings of the first one, in the user's frame, were searched in vain."""

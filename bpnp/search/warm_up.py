@@ -9,7 +9,7 @@ from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.neighbours import HashedPoints, sums_near
-from bpnp.search.kernels.raster import add_shifted, add_up
+from bpnp.search.kernels.raster import Raster, add_shifted, add_up
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, blocks_of
 from bpnp.search.kernels.sparse import build_tiles, descend_sparse, sparse_scratch
 from bpnp.search.point_sets import PointSets
@@ -47,5 +47,5 @@ def _warm_annealing(points: np.ndarray, rays: np.ndarray) -> None:
     tiles = build_tiles(image).with_margin(0.1)
     descend_sparse(tiles, scene, *pose, scales, outlier, 3, np.empty((1, 3), F), sparse_scratch(tiles, POINTS))
     raster, weight, cell = np.zeros((4, 4), F), np.empty(POINTS, F), np.empty(POINTS, np.int32)
-    add_up(raster, F(1), F(2), tuple(scene), *pose, score, weight, cell)
-    add_shifted(np.zeros((1, 16, 16), F), np.zeros((4, 36), F), F(1), F(2), tuple(scene), *pose, weight)
+    add_up(Raster(raster, F(1), F(2)), scene, *pose, score, weight, cell)
+    add_shifted(np.zeros((1, 16, 16), F), Raster(np.zeros((4, 36), F), F(1), F(2)), scene, *pose, weight)

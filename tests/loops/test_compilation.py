@@ -144,7 +144,7 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
     warm, used = done.stdout.splitlines()
     versions = dict(entry.split(":") for entry in warm.split())
     assert versions.pop("explore") == "2"  # with a known direction, and without
-    assert {"descend_on_clusters", "descend_on_points", "add_shifted", "add_up"} <= set(versions)
+    assert {"descend", "descend_sparse", "add_shifted", "add_up"} <= set(versions)
     assert set(versions.values()) == {"1"}
     assert used == warm
 

@@ -21,7 +21,7 @@ def test_hypotheses_that_were_left_out_are_not_excluded(monkeypatch, exhausted: 
     sets = PointSets(rays / np.linalg.norm(rays, axis=1, keepdims=True), points)
     pose = Candidates.unscored(np.eye(3)[None], np.array([[0, 0, 6.0]]))
     found = replace(pose, matched=np.ones(1), scale=np.full(1, 0.005))
-    ended = Enumerated(found, 50_000, exhausted, safe=False, interrupted=False)
+    ended = Enumerated(found, exhausted, safe=False)
     monkeypatch.setattr(search, "search_by_enumeration", lambda *_: ended)
     result = search.search_poses(sets, settings=replace(DEFAULT, least_annealed=30))
     assert -20 < result.log10_false_alarms < -2

@@ -36,17 +36,16 @@ def explore(
     budget: int,
     stop: float,
     reach: float,
-    exchanged: bool,
     block: Any,
     heading: Any,
     problem: Any,
     kept: Any,
     work: Any,
 ) -> Any:
-    """`sweep` with a budget, and `vary` without: one entry, so that what both call is compiled once."""
+    """`sweep` with a budget, and without one `settle` the first pose in `work`: what both call is compiled once."""
     if budget > 0:
         return sweep(row, first, budget, stop, block, heading, problem, kept, work)
-    vary(reach, exchanged, problem, kept, work)
+    settle(work.poses[0], reach, problem, kept, work)
     return row, first, 0
 
 
@@ -100,16 +99,7 @@ def sweep(
                     and facing(pose, normals, c, rays, k)
                 ):
                     continue
-                if allowed(pose, problem.prior) and witnessed(
-                    pose,
-                    (a, b, c),
-                    (i, j, k),
-                    block.witnesses,
-                    block.need,
-                    block.reach,
-                    problem.scene,
-                    problem.image.grid,
-                ):
+                if allowed(pose, problem.prior) and witnessed(pose, (a, b, c), (i, j, k), block, problem):
                     consider(pose, block.reach, problem, kept, work)
         row, t = row + 1, 0
     return row, t, solved
@@ -131,11 +121,10 @@ def facing(pose: Any, normals: Any, a: int, rays: Any, i: int) -> bool:
 
 
 @part
-def witnessed(
-    pose: Any, points: Any, seen: Any, witnesses: Any, need: int, reach: float, scene: Any, grid: Any
-) -> bool:
+def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bool:
     """Whether enough of the points near the first of a hypothesis, other than its own, are seen near image points other
     than its own."""
+    witnesses, need, reach, scene, grid = block.witnesses, block.need, block.reach, problem.scene, problem.image.grid
     hits, left = 0, witnesses.shape[1]
     for w in range(witnesses.shape[1]):
         if hits + left < need:
@@ -169,13 +158,11 @@ class Kept(NamedTuple):
 
 
 class Work(NamedTuple):
-    """What the loops overwrite: poses (4, 4, 3) of a hypothesis, matches of the pose at hand, the normal equations
-    (8, 6), and the points (m,) that the best pose matches."""
+    """What the loops overwrite: poses (4, 4, 3) of a hypothesis, matches of the pose at hand, equations (8, 6)."""
 
     poses: Array
     matches: Matches
     system: Array
-    best_point: Places
 
 
 @part
@@ -222,12 +209,12 @@ def settle(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
 @part
 def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, system: Any) -> bool:
     """Gauss-Newton steps, in place, on matches within a radius that shrinks from `reach` to `last`, and two at it."""
-    left, directions = RULES.final, problem.prior.directions
+    left, known = RULES.final, len(problem.prior.in_scene)
     while left > 0:
         count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
-        if count < 3 and count + len(directions) < 3:
+        if count < 3 and count + known < 3:
             return False
-        if not step(pose, matches.point, problem.image.rays, problem.scene.points, directions, system):
+        if not step(pose, matches.point, problem.image.rays, problem.scene.points, problem.prior, system):
             return False
         left -= reach <= last
         reach = max(last, RULES.tighter * reach)
@@ -237,15 +224,15 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
 @part
 def allowed(pose: Any, prior: Any) -> bool:
     """Whether the pose agrees with what is known of its translation and of directions."""
-    place, directions, shift2 = prior.place, prior.directions, 0.0
+    in_scene, in_camera, shift2 = prior.in_scene, prior.in_camera, 0.0
     for k in range(3):
-        shift2 += (pose[3, k] - place[k]) ** 2
-    if shift2 > place[3]:
+        shift2 += (pose[3, k] - prior.translation[k]) ** 2
+    if shift2 > prior.farthest_shift2:
         return False
-    for k in range(len(directions)):
-        x, y, z = rotated(pose, directions[k, 0], directions[k, 1], directions[k, 2])
-        dx, dy, dz = x - directions[k, 3], y - directions[k, 4], z - directions[k, 5]
-        if dx * dx + dy * dy + dz * dz > directions[k, 7]:
+    for k in range(len(in_scene)):
+        x, y, z = rotated(pose, in_scene[k, 0], in_scene[k, 1], in_scene[k, 2])
+        dx, dy, dz = x - in_camera[k, 0], y - in_camera[k, 1], z - in_camera[k, 2]
+        if dx * dx + dy * dy + dz * dz > prior.farthest2:
             return False
     return True
 
@@ -279,78 +266,12 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
 
 
 @part
-def _trace(pose: Any, other: Any) -> float:
-    """Of the turn between two poses: 1 + 2 cos."""
-    trace = 0.0
-    for r in range(3):
-        for c in range(3):
-            trace += pose[r, c] * other[r, c]
-    return trace
-
-
-@part
 def _same(pose: Any, other: Any) -> bool:
-    shift2 = depth2 = 0.0
+    shift2 = depth2 = trace = 0.0  # trace of the turn between them: 1 + 2 cos
     for k in range(3):
         shift2 += (pose[3, k] - other[3, k]) ** 2
         depth2 += other[3, k] ** 2
+        for c in range(3):
+            trace += pose[k, c] * other[k, c]
     near = shift2 < (RULES.same_shift + RULES.same_depth * math.sqrt(depth2)) ** 2
-    return near and _trace(pose, other) > RULES.same_trace
-
-
-@part
-def vary(reach: float, exchanged: bool, problem: Any, kept: Any, work: Any) -> None:
-    """Refine the first pose in `work` from matches within `reach` radii, and keep it.
-
-    exchanged: keep too what follows from the best pose when one of its matches is left out, or goes to the nearest
-    other scene point. A single wrong match can turn a pose of few points by some degrees and still lie near its image
-    point; no refinement finds the pose without it, since the wrong match holds it.
-    """
-    pose, best, matched, points = work.poses[0], work.poses[1], work.matches.point, work.best_point
-    settle(pose, reach, problem, kept, work)
-    count = 0
-    if exchanged:
-        copy_pose(kept.poses[kept.best[0]], best)
-        copy(kept.point[kept.best[0]], points)
-        count = kept.counts[kept.best[0]]
-    for i in range(len(points)):
-        if points[i] < 0 or count - 1 <= problem.fixing:
-            continue
-        other = -1
-        for turn in range(2):
-            copy_pose(best, pose)
-            copy(points, matched)
-            for k in range(len(points)):
-                if turn and points[k] == other:
-                    matched[k] = -1
-            matched[i] = other
-            if not _stepped(pose, problem, matched, work.system):
-                break
-            other = _nearest_other(pose, i, points[i], problem.scene, problem.image.grid)
-            if _trace(pose, best) < RULES.moved_trace and allowed(pose, problem.prior):
-                settle(pose, 0.0, problem, kept, work)
-            if other < 0:
-                break
-
-
-@part
-def _stepped(pose: Any, problem: Any, matched: Any, system: Any) -> bool:
-    """Gauss-Newton steps, in place, on the matches (m,)."""
-    rays, points, directions, steps = problem.image.rays, problem.scene.points, problem.prior.directions, 0
-    while steps < RULES.exchanged and step(pose, matched, rays, points, directions, system):
-        steps += 1
-    return steps == RULES.exchanged
-
-
-@part
-def _nearest_other(pose: Any, i: int, matched: int, scene: Any, grid: Any) -> int:
-    """The scene point nearest to image point i, of those that are not its match and fit its label; -1 for none."""
-    place, least = -1, (RULES.farthest / grid.flat[i, 2]) ** 2
-    for j in range(len(scene.points)):
-        if j == matched or not fits(scene.labels[j], grid.labels[i]):
-            continue
-        u, v, cosine = sight(pose, scene, j)
-        d2 = (u - grid.flat[i, 0]) ** 2 + (v - grid.flat[i, 1]) ** 2
-        if cosine >= RULES.matched_cosine and d2 < least:
-            place, least = j, d2
-    return place
+    return near and trace > RULES.same_trace

@@ -120,20 +120,21 @@ def _log_choose(n: int, k: int) -> float:
 
 
 @part
-def step(pose: Any, matched: Any, rays: Any, points: Any, directions: Any, system: Any) -> bool:
+def step(pose: Any, matched: Any, rays: Any, points: Any, prior: Any, system: Any) -> bool:
     """One Gauss-Newton step, in place, on sum_i w_i^2 |f_i - g(R p + t)|^2 over the matches (m,) and what is known of
     directions; False if it has none. g(y) = y/|y|, w_i one over a radius. The step is y -> y + w x Rp + s."""
+    in_scene, in_camera = prior.in_scene, prior.in_camera
     for a in range(7):
         for b in range(6):
             system[a, b] = 0.0
     row = system[7]
-    for i in range(len(matched) + len(directions)):
+    for i in range(len(matched) + len(in_scene)):
         k = i - len(matched)  # of the prior, whose directions have no translation: the step s moves none of them
         ux = uy = uz = shift = 0.0
         if k >= 0:
-            x, y, z = rotated(pose, directions[k, 0], directions[k, 1], directions[k, 2])
-            turned = w = directions[k, 6]
-            rx, ry, rz = directions[k, 3] - x, directions[k, 4] - y, directions[k, 5] - z
+            x, y, z = rotated(pose, in_scene[k, 0], in_scene[k, 1], in_scene[k, 2])
+            turned = w = prior.weight
+            rx, ry, rz = in_camera[k, 0] - x, in_camera[k, 1] - y, in_camera[k, 2] - z
         elif matched[i] >= 0:
             j = matched[i]
             x, y, z = rotated(pose, points[j, 0], points[j, 1], points[j, 2])

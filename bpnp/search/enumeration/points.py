@@ -64,12 +64,16 @@ class ImagePoints(NamedTuple):
 class PriorArrays(NamedTuple):
     """What is known of the pose, in the frames of the points.
 
-    directions: (k, 8) rows a, b, weight and largest squared distance of R a from b. place: (4,) the translation and the
-    largest squared distance from it.
+    in_scene, in_camera: (k, 3) directions a and b = R a. weight: of R a - b. farthest2: its largest square.
+    translation: (3,). farthest_shift2: largest squared distance from it.
     """
 
-    directions: Array
-    place: Array
+    in_scene: Array
+    in_camera: Array
+    weight: float
+    farthest2: float
+    translation: Array
+    farthest_shift2: float
 
 
 class Heading(NamedTuple):
@@ -82,6 +86,14 @@ class Heading(NamedTuple):
     points: Array
     turns: Array
     sine2: float
+
+
+class KnownPose(NamedTuple):
+    """A prior as the loops read it, and the log of the share of poses that it allows."""
+
+    arrays: PriorArrays
+    heading: Heading
+    log_share: float
 
 
 class SceneSide:
@@ -249,41 +261,35 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
     return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
 
 
-def prior_arrays(
-    sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
-) -> tuple[PriorArrays, Heading, float]:
-    """The prior in the frames of both sides, what P2P reads of it, and the log of the share of poses that it allows.
+def prior_arrays(sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings) -> KnownPose:
+    """The prior in the frames of both sides.
 
     Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
     image shows a turn best.
     """
-    prior, place, log_share = sets.prior, np.array([0, 0, 0, math.inf]), 0.0
-    none, sine2 = np.empty((0, 3)), 1.0
+    prior, none = sets.prior, np.empty((0, 3))
+    translation, farthest_shift2, log_share, sine2 = np.zeros(3), math.inf, 0.0, 1.0
     if prior is None:
-        return PriorArrays(np.empty((0, 8)), place), Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share
+        arrays = PriorArrays(none, none, 0.0, 0.0, translation, farthest_shift2)
+        return KnownPose(arrays, Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share)
     if isinstance(prior, GravityPrior):
         camera, up = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (prior.up_camera, prior.up_scene))
-        directions = _rows(up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg), settings)
-        from_camera, from_scene = turned_to(image.turn @ camera), turned_to(up)
+        in_scene, in_camera, off = up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg)
+        from_camera, from_scene = turned_to(in_camera[0]), turned_to(up)
     else:
         known, sigma = np.asarray(prior.rotation, np.float64), math.radians(prior.rotation_sigma_deg)
         rotation = image.turn @ known
         from_camera, from_scene = np.eye(3), rotation
-        directions = _rows(np.eye(3), rotation.T, math.sqrt(2) * sigma, settings)
+        in_scene, in_camera, off = np.eye(3), np.ascontiguousarray(rotation.T), math.sqrt(2) * sigma
         if (predicted := predicted_pose(prior)) is not None:
-            middle = image.turn @ (known @ scene.centre + predicted[1]) / scene.size
-            place = np.append(middle, (settings.sigmas * prior.translation_sigma / scene.size) ** 2)
+            translation = image.turn @ (known @ scene.centre + predicted[1]) / scene.size
+            farthest_shift2 = (settings.sigmas * prior.translation_sigma / scene.size) ** 2
         most = min(settings.sigmas * sigma, math.pi)
         log_share, sine2 = math.log((most - math.sin(most)) / math.pi), math.sin(min(most, math.pi / 2)) ** 2
     about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
     rays = np.ascontiguousarray(image.arrays.rays[:, :3] @ from_camera.T)
     points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
     heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
-    return PriorArrays(directions, place), heading, log_share
-
-
-def _rows(scene: Array, camera: Array, sigma: float, settings: EnumerationSettings) -> Array:
-    """Directions (k, 3) of the scene that are seen as those of the camera, with `sigma` radians."""
-    weight = np.full((len(scene), 1), settings.prior_weight / sigma)
-    farthest = np.full((len(scene), 1), (2 * math.sin(min(settings.sigmas * sigma, math.pi) / 2)) ** 2)
-    return np.ascontiguousarray(np.concatenate([scene, camera, weight, farthest], 1))
+    weight, farthest2 = settings.prior_weight / off, (2 * math.sin(min(settings.sigmas * off, math.pi) / 2)) ** 2
+    arrays = PriorArrays(in_scene, in_camera, float(weight), float(farthest2), translation, float(farthest_shift2))
+    return KnownPose(arrays, heading, log_share)

@@ -16,10 +16,9 @@ from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
 from bpnp.search.enumeration.matching import Matches, Problem
 from bpnp.search.enumeration.points import (
     Array,
-    Heading,
     ImageSide,
+    KnownPose,
     Places,
-    PriorArrays,
     SceneSide,
     pairs,
     predicted_pose,
@@ -35,7 +34,6 @@ ORDERS = {
     2: np.array([[0, 1, 1], [1, 0, 0]]),
     3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
 }
-
 
 SLOWEST = 2e-6  # seconds a hypothesis, before it is known
 BUILT, BUILT_FACING = 5e-7, 5e-6  # seconds a set of points when a stage begins, and one with normals
@@ -74,7 +72,7 @@ class Enumeration:
         self,
         scene: SceneSide,
         image: ImageSide,
-        prior: tuple[PriorArrays, Heading, float],
+        known: KnownPose,
         fixing: int,
         reach: float,
         settings: EnumerationSettings,
@@ -82,7 +80,7 @@ class Enumeration:
         self.scene, self.image, self.settings, self.reach = scene, image, settings, reach
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
-        self.problem = Problem(scene.arrays, image.arrays, prior[0], fixing, image.density)
+        self.problem = Problem(scene.arrays, image.arrays, known.arrays, fixing, image.density)
         self.kept = Kept(
             np.zeros((kept, 4, 3)),
             np.full(kept, -math.inf),
@@ -93,16 +91,16 @@ class Enumeration:
             np.zeros(1),
         )
         matches = Matches(np.empty(m, np.int64), np.empty(m))
-        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)), np.empty(m, np.int64))
+        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
         seen = settings.seen_witnesses * n / max(m - fixing, 1)
         near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
-        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + prior[2]
+        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + known.log_share
         self.tests = math.log(RULES.ladder) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
         self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
-        self._heading = prior[1] if fixing == 2 else None
+        self._heading = known.heading if fixing == 2 else None
 
     @property
     def best(self) -> float:
@@ -127,10 +125,8 @@ class Enumeration:
     def begin(self, stage: Stage) -> None:
         """Go on with the hypotheses of a stage; those that were solved before are not solved again."""
         m, n = len(self.image.arrays.rays), len(self.scene.arrays.points)
-        sets, triangles = (
-            sets_within(self.image.nearest, stage.near2d, stage.matches),
-            self.scene.triangles(stage.matches, stage.near3d),
-        )
+        sets = sets_within(self.image.nearest, stage.near2d, stage.matches)
+        triangles = self.scene.triangles(stage.matches, stage.near3d)
         before = self._done.get((stage.matches, stage.reach), (0, 0))
         self._done[stage.matches, stage.reach] = len(sets), len(triangles.triples)
         # How many witnesses make a hypothesis worth a look depends on what chance gives it.
@@ -138,16 +134,8 @@ class Enumeration:
         one, two = self.settings.witness_chances
         need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
         need = min(need, m - stage.matches, n - stage.matches)
-        self._block = self._block._replace(
-            size=stage.matches,
-            sets=sets,
-            orders=ORDERS[stage.matches],
-            triangles=triangles,
-            old_image=before[0],
-            old_scene=before[1],
-            need=need,
-            reach=stage.reach,
-        )
+        size, orders = stage.matches, ORDERS[stage.matches]
+        self._block = Block(size, sets, orders, triangles, *before, self._witnesses, need, stage.reach)
         self._row, self._triangle = 0, 0
         self.kept.most[0] = 0.0
 
@@ -161,36 +149,24 @@ class Enumeration:
         over."""
         start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
         most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
-        self._row, self._triangle, solved = explore(
-            self._row,
-            self._triangle,
-            most,
-            stop,
-            1.0,
-            False,
-            self._block,
-            self._heading,
-            self.problem,
-            self.kept,
-            self.work,
-        )
+        self._row, self._triangle, solved = self._explored(self._row, self._triangle, most, stop, 1.0)
         self.solved += solved
         if solved >= most:
             self._pace = (Clock.now() - start) / solved
 
     def vary_best(self) -> None:
-        """Refine the best pose again on wider and on other matches."""
+        """Refine the best pose again on wider matches."""
         if math.isfinite(self.best):
             for reach in (0.5 * self.reach, self.reach):
-                self.refine(self.best_pose, reach, exchanged=reach == self.reach)
+                self.refine(self.best_pose, reach)
 
-    def refine(self, pose: Array, reach: float, *, exchanged: bool = False) -> None:
-        """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it.
-
-        exchanged: and what follows from the best pose with other matches.
-        """
+    def refine(self, pose: Array, reach: float) -> None:
+        """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
         self.work.poses[0] = pose
-        explore(0, 0, 0, 0.0, reach, exchanged, self._block, self._heading, self.problem, self.kept, self.work)
+        self._explored(0, 0, 0, 0.0, reach)
+
+    def _explored(self, *where: float) -> tuple[int, int, int]:
+        return explore(*where, self._block, self._heading, self.problem, self.kept, self.work)
 
     def enter(self, rotation: Array, translation: Array) -> Array:
         """A pose of the given points as (4, 3) in these frames."""

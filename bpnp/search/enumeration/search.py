@@ -33,16 +33,13 @@ def exceeds_enumeration(sets: PointSets) -> bool:
 class Enumerated(NamedTuple):
     """What an enumeration found, and how it ended.
 
-    candidates: in the user's coordinates, best first. solved: hypotheses, each a minimal problem. exhausted: whether
-    every hypothesis of these points was tried. safe: whether it ended before that, since the best pose was certain.
-    interrupted: whether the deadline passed first. None of the three: as many hypotheses were solved as are allowed.
+    candidates: in the user's coordinates, best first. exhausted: whether every hypothesis of these points was tried.
+    safe: whether it ended before that, since the best pose was certain.
     """
 
     candidates: Candidates
-    solved: int
     exhausted: bool
     safe: bool
-    interrupted: bool
 
 
 def search_by_enumeration(
@@ -69,19 +66,14 @@ def search_by_enumeration(
         poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
         return poses, _candidates(poses, annotated, settings, rule) if certain is None else certain
 
-    def ended(candidates: Candidates, poses: EnumeratedPoses, solved: int) -> Enumerated:
-        exhausted, interrupted = (certain is None and poses.ended == end for end in ("exhausted", "interrupted"))
-        return Enumerated(candidates, solved, exhausted, certain is not None, interrupted)
-
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
     poses, candidates = enumerated(sets, replace(rule, stages=()) if near else rule)
-    if certain is not None or not tracked or not (near or margin(poses, rule) < 0):
-        return ended(candidates, poses, poses.solved)
-    free, others = enumerated(replace(sets, prior=None), rule)
-    candidates = Candidates.concatenated([candidates, others])
-    order = np.argsort(-candidates.score, kind="stable")[: settings.kept]
-    return ended(candidates[order], free, poses.solved + free.solved)
+    if certain is None and tracked and (near or margin(poses, rule) < 0):
+        poses, others = enumerated(replace(sets, prior=None), rule)
+        candidates = Candidates.concatenated([candidates, others])
+        candidates = candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]]
+    return Enumerated(candidates, certain is None and poses.ended == "exhausted", certain is not None)
 
 
 def _candidates(

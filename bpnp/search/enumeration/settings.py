@@ -29,9 +29,7 @@ class Rules(NamedTuple):
     skipped: matches of the best pose from which its own triples are not solved again.
     tighter, final: factor of the radius from one step of a refinement to the next, and steps at the last one.
     same_trace, same_shift, same_depth: poses are the same if the trace of the turn between them is larger and the shift
-    smaller than the sum of these shares of the scene's extent and of its distance. moved_trace: beyond this turn a pose
-    without one of its matches is looked at. exchanged: Gauss-Newton steps on the matches that are left then.
-    farthest: radii from an image point within which another partner is looked for.
+    smaller than the sum of these shares of the scene's extent and of its distance.
     """
 
     cells: int = 48
@@ -47,9 +45,6 @@ class Rules(NamedTuple):
     same_trace: float = 1 + 2 * math.cos(math.radians(2.0))
     same_shift: float = 0.1
     same_depth: float = 0.05
-    moved_trace: float = 1 + 2 * math.cos(math.radians(0.3))
-    exchanged: int = 3
-    farthest: float = 4.0
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from bpnp.distinct_poses import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_points, finish, shaken
-from bpnp.search.candidates import Candidates, in_user_frame, merged
+from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.false_alarms import directions_of, likeliest_scale, log10_tests
@@ -96,14 +96,14 @@ def _met(
     """Distinct poses that annealing reaches from a claim, and others around it and far away; how often was looked
     around it, and whether all poses of these points were tried."""
     scene = Scene(sets, seed, settings, deadline)
-    start = _entered(scene, claim)
+    start = in_scene_frame(claim, scene)
     wide = settings.middle[-1].last_scale * scene.spread
     around = Candidates.concatenated([start, shaken(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     exhaustive, looks = False, 0
     if is_enumerable(sets):
         found = search_by_enumeration(sets, deadline, settings)
-        parts.append(_entered(scene, found.candidates))
+        parts.append(in_scene_frame(found.candidates, scene))
         exhaustive = found.exhausted or found.safe
     while looks < settings.schedule.looks and not exhaustive and not deadline.passed():
         leader = merged(parts, scene)[:1]
@@ -125,12 +125,6 @@ def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
     across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, normal))
     rotation = (across @ pose.rotation[0] @ flipped).astype(np.float32)
     return Candidates.unscored(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
-
-
-def _entered(scene: Scene, poses: Candidates) -> Candidates:
-    rotation, translation = scene.enter(poses.rotation, poses.translation)
-    score, matched, scale = (x.astype(np.float32) for x in (poses.score, poses.matched, poses.scale))
-    return replace(poses, rotation=rotation, translation=translation, score=score, matched=matched, scale=scale)
 
 
 def _unrefined(sets: PointSets, rotation: Array, translation: Array, settings: SearchSettings) -> Candidates:

@@ -62,28 +62,19 @@ class Alarms(NamedTuple):
     rough: Array
 
 
-def log10_false_alarms(sets: PointSets, rotation: Array, translation: Array, scale: float | None = None) -> float:
-    """log10 of the expected number of poses that fit unrelated points as well as (rotation, translation); see above.
+def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
+    """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None.
 
-    scale: of the pose's residuals, radians, if it is known. A pose under which three points or fewer are seen has the
-    log10 of the number of tests: no evidence at all.
+    A pose under which three points or fewer are seen has as many as there are tests: no evidence at all.
 
     >>> import numpy as np
-    >>> rng = np.random.default_rng(0)
-    >>> points = rng.uniform(-1, 1, (12, 3))
+    >>> points = np.random.default_rng(0).uniform(-1, 1, (12, 3))
     >>> seen = points + [0, 0, 6]
     >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
-    >>> log10_false_alarms(sets, np.eye(3), np.array([0.0, 0, 6])) < -10  # the true pose
-    True
-    >>> log10_false_alarms(sets, np.eye(3), np.array([0.3, 0, 5])) > 0  # another one
-    True
+    >>> alarms = alarms_of(sets, np.stack([np.eye(3)] * 2), np.array([[0.0, 0, 6], [0.3, 0, 5]])).own
+    >>> bool(alarms[0] < -10), bool(alarms[1] > 0)
+    (True, True)
     """
-    scales = None if scale is None else np.array([scale])
-    return float(alarms_of(sets, rotation[None], translation[None], scales).own[0])
-
-
-def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Array | None = None) -> Alarms:
-    """Of poses (c, 3, 3), (c, 3) with residuals of `scales` (c,), radians; all s are a pose's own if that is None."""
     tests = log10_tests(sets)
     cells = np.minimum(log10_cells(sets.image) + log10_focal_lengths(sets), tests)
     share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]

@@ -10,6 +10,7 @@ of them gives it: that none was met bounds the probability that there is one.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -64,10 +65,11 @@ class Sight(NamedTuple):
     known: Background
     reach: float
     sample: Labels
+    settings: InfinitySettings
 
 
 @dataclass
-class Enumerated:
+class TriedPairs:
     """Which pairs of image points were tried: how many, how many without a common point; `first` points all pairs of
     which were, and `every` if no pair is left."""
 
@@ -114,32 +116,28 @@ def search_rotation(
     pixels, if it is known. zooms: of a focal length that is one of several, the log of the largest over the smallest.
     """
     catalogue = catalogue_of(directions, settings.table)
-    result = RotationResult([], "failed", "no rotation was found")
-    for scale in settings.noise if noise is None else (noise,):
-        if result.turns and deadline.passed():
+    scales = settings.noise if noise is None else (noise,)
+
+    @cache
+    def sight(scale: float) -> Sight:
+        return _sight(image, catalogue, scale, zooms, seed, settings)
+
+    result, turns = RotationResult([], "failed", "no rotation was found"), 0
+    for scale in scales:
+        if turns and deadline.passed():
             break
-        turns, result = result.turns, _search(image, catalogue, scale, zooms, scores, seed, deadline, settings)
-        result = replace(result, turns=result.turns + turns)
-        if (
-            result.found
-            and result.verdict != "failed"
-            and not _is_rougher(result, image, catalogue, scale, zooms, settings)
-        ):
+        result = _search(sight(scale), scores, seed, deadline)
+        turns += result.turns
+        rougher = (sight(other) for other in settings.noise if other > scale)
+        if result.verdict != "failed" and not any(_explains_better(one, result.found[0]) for one in rougher):
             break
-    return result
+    return replace(result, turns=turns)
 
 
-def _is_rougher(
-    result: RotationResult, image: Image, catalogue: Catalogue, noise: float, zooms: float, settings: InfinitySettings
-) -> bool:
-    """Whether the best rotation explains the points better at a noise that was not yet searched for."""
-    best = result.found[0]
-    for rougher in (scale for scale in settings.noise if scale > noise):
-        sight = _sight(image, catalogue, rougher, zooms, 0, settings)
-        weight = _information(image, np.flatnonzero(best.match >= 0))
-        if _fitted(sight, best.rotation, weight, settings).log10_false_alarms < best.log10_false_alarms:
-            return True
-    return False
+def _explains_better(sight: Sight, best: Rotated) -> bool:
+    """Whether the best rotation explains the points better at the noise of a sight that was not yet searched for."""
+    weight = _information(sight.image, np.flatnonzero(best.match >= 0))
+    return _fitted(sight, best.rotation, weight).log10_false_alarms < best.log10_false_alarms
 
 
 def _information(image: Image, places: Labels) -> Array:
@@ -148,11 +146,10 @@ def _information(image: Image, places: Labels) -> Array:
     return np.asarray(weight.sum() * np.eye(3) - (weight[:, None] * bearings).T @ bearings)
 
 
-def _fitted(sight: Sight, rotation: Array, weight: Array, settings: InfinitySettings) -> Rotated:
-    m = len(sight.image.bearings)
-    state = Fit(rotation.copy(), weight, np.empty(m, np.int64), np.full(m, np.inf))
-    rounds, scratch = settings.rounds, np.empty((4, 3))
-    fit(sight.image, np.arange(m), sight.sky, sight.reach, rounds, state, scratch)
+def _fitted(sight: Sight, rotation: Array, weight: Array) -> Rotated:
+    every = np.arange(len(sight.image.bearings))
+    state = Fit(rotation.copy(), weight, np.empty_like(every), np.full(len(every), np.inf))
+    fit(sight.image, every, sight.sky, sight.reach, sight.settings.rounds, state, np.empty((4, 3)))
     return _weighed(sight, state)
 
 
@@ -164,25 +161,15 @@ def _sight(
     cell = settings.cell * reach * float(np.median(image.pixel))
     background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise, zooms)
     sample = np.random.default_rng(seed).permutation(len(image.bearings))[: settings.sample]
-    return Sight(image, catalogue, catalogue.sky(cell), background, reach, sample)
+    return Sight(image, catalogue, catalogue.sky(cell), background, reach, sample, settings)
 
 
-def _search(
-    image: Image,
-    catalogue: Catalogue,
-    noise: float,
-    zooms: float,
-    scores: Array | None,
-    seed: int,
-    deadline: Deadline,
-    settings: InfinitySettings,
-) -> RotationResult:
-    sight, bearings = _sight(image, catalogue, noise, zooms, seed, settings), image.bearings
+def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> RotationResult:
+    settings, count = sight.settings, len(sight.image.bearings)
     found: list[Rotated] = []
-    tried = Enumerated()
-    result = _judged(found, sight, tried, settings)
-    for i, k, last in _image_pairs(sight, scores, seed, settings, tried):
-        for one in _rotations(sight, i, k, found, settings):
+    tried = TriedPairs()
+    for i, k, last in _image_pairs(sight, scores, seed, tried):
+        for one in _rotations(sight, i, k, found):
             found = _merged(found, one, sight)
         tried.turns += 1
         if not {i, k} & tried.used:
@@ -190,30 +177,26 @@ def _search(
             tried.used |= {i, k}
         if not last:
             continue
-        result = _judged(found, sight, tried, settings)
-        least = max(math.ceil(settings.least_share * len(bearings)), FIXING + 1)
-        hopeless = tried.log10_missed(len(bearings), least, settings.power) <= SEARCH.evidence.missed
+        result = _judged(found, sight, tried)
+        least = max(math.ceil(settings.least_share * count), FIXING + 1)
+        hopeless = tried.log10_missed(count, least, settings.power) <= SEARCH.evidence.missed
         if result.verdict == "confident" or (result.verdict == "failed" and hopeless):
             return result
         if tried.turns >= settings.turns or deadline.passed():
             return result
     tried.every = True
-    return _judged(found, sight, tried, settings)
+    return _judged(found, sight, tried)
 
 
-def _image_pairs(
-    sight: Sight, scores: Array | None, seed: int, settings: InfinitySettings, tried: Enumerated
-) -> Iterator[tuple[int, int, bool]]:
+def _image_pairs(sight: Sight, scores: Array | None, seed: int, tried: TriedPairs) -> Iterator[tuple[int, int, bool]]:
     """Pairs of image points, and whether the verdict is to be asked: of few points all pairs of the first ones, of more
     each one with a near partner."""
-    bearings, rng = sight.image.bearings, np.random.default_rng(seed)
+    bearings, settings, rng = sight.image.bearings, sight.settings, np.random.default_rng(seed)
     order = rng.permutation(len(bearings))
     if scores is not None:
         order = order[np.argsort(-scores[order], kind="stable")]
-    widest = (
-        float(np.max(np.linalg.norm(bearings[:, None] - bearings, axis=-1))) if len(order) <= settings.together else 9
-    )
-    if widest <= sight.catalogue.widest:
+    few = len(order) <= settings.together
+    if few and float(np.max(np.linalg.norm(bearings[:, None] - bearings, axis=-1))) <= sight.catalogue.widest:
         for t in range(1, len(order)):
             for s in range(t):
                 if s == t - 1:
@@ -234,8 +217,9 @@ def _image_pairs(
                     yield i, k, True
 
 
-def _rotations(sight: Sight, i: int, k: int, found: list[Rotated], settings: InfinitySettings) -> Iterator[Rotated]:
+def _rotations(sight: Sight, i: int, k: int, found: list[Rotated]) -> Iterator[Rotated]:
     """The fitted rotations that a pair of image points gives and that could contest the best one found."""
+    settings = sight.settings
     bearings, pixel = sight.image.bearings, sight.image.pixel
     one, other = bearings[i], bearings[k]
     chord = float(np.linalg.norm(one - other))
@@ -286,7 +270,7 @@ def _merged(found: list[Rotated], new: Rotated, sight: Sight) -> list[Rotated]:
     return sorted([*rest, new], key=lambda one: one.log10_false_alarms)[: SEARCH.kept]
 
 
-def _judged(found: list[Rotated], sight: Sight, tried: Enumerated, settings: InfinitySettings) -> RotationResult:
+def _judged(found: list[Rotated], sight: Sight, tried: TriedPairs) -> RotationResult:
     """The verdict on rotations, best first, by the rules of `bpnp.search.verdict`."""
     rule, turns = SEARCH.evidence, tried.turns
     if not found:
@@ -300,7 +284,7 @@ def _judged(found: list[Rotated], sight: Sight, tried: Enumerated, settings: Inf
     worth = best.decades[hit]
     most = float(worth.mean() + 2 * worth.std() / math.sqrt(len(hit)))  # that a match of an alternative may be worth
     least = max(math.ceil((float(worth.sum()) - rule.lead) / most), FIXING + 1)
-    missed = tried.log10_missed(len(sight.image.bearings), min(least, len(sight.image.bearings)), settings.power)
+    missed = tried.log10_missed(len(sight.image.bearings), min(least, len(sight.image.bearings)), sight.settings.power)
     lead = found[1].log10_false_alarms - alarms if len(found) > 1 else math.inf
     doubt = known = None
     if alarms > rule.false_alarms:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.loops.vectors import F, compiled, cross, direction, part, rotated, sum_of, turn
-from bpnp.search.kernels.sides import Array, WeightedBearings, WeightedPoints, visible_weights
+from bpnp.search.kernels.sides import Array, visible_weights
 
 RELAXATION = 1.7  # times the Gauss-Newton step on clusters: expectation and maximisation in turns take short steps
 DAMPING = 1e-3  # of each diagonal entry of the Hessian, so that a direction that the points do not fix stays put
@@ -110,7 +110,7 @@ def move(q: Any, p: Any, rotation: Any, translation: Any, length: Any, system: A
 
 
 @part
-def directions(p: Any, rotation: Any, translation: Any, u: Any) -> None:
+def see(p: Any, rotation: Any, translation: Any, u: Any) -> None:
     """u (3, n): the offsets of the directions in which a pose sees points (3, n)."""
     for j in range(p.shape[1]):
         x, y, z = rotated(rotation, p[0, j], p[1, j], p[2, j])
@@ -151,7 +151,7 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
     for i in range(m):
         row[i] = outlier * total_b * bearings.odds[i]
         base[i] = F(1) - F(0.5) * sharp * (f[0, i] * f[0, i] + f[1, i] * f[1, i] + f[2, i] * f[2, i])
-    directions(p, rotation, translation, u)
+    see(p, rotation, translation, u)
     for j in range(n):
         column[j] = outlier * total_a * points.odds[j]
         q[0, j], q[1, j], q[2, j], q[3, j] = F(0), F(0), F(0), F(0)
@@ -199,10 +199,14 @@ def assign(bearings: Any, points: Any, rotation: Any, translation: Any, scale: A
 
 
 @compiled
-def descend_on_clusters(
+def descend(
     bearings: Any, points: Any, rotation: Any, translation: Any, scales: Any, outlier: Any, score: Any, scratch: Any
 ) -> None:
-    """`descend`."""
+    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians; outlier: o / s^2 of the scene.
+
+    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
+    not fix.
+    """
     for k in range(len(rotation)):
         for step in range(len(scales)):
             scale = scales[step]
@@ -212,14 +216,3 @@ def descend_on_clusters(
             if not (fixed and math.isfinite(score[k])):
                 score[k] = -np.inf
                 break
-
-
-def descend(bearings: Any, points: Any, *rest: Any) -> None:
-    """Anneal starts (S, 3, 3), (S, 3) in place through `scales` (k,), radians.
-
-    bearings, points: as for `assign`, or the same as plain tuples. rest: rotation, translation, scales, outlier,
-    o / s^2 of `Scene.outlier_density`, score, and `dense_scratch`.
-    score (S,): the mean log-likelihood at the last scale; -inf for a pose that is not finite, or that the points do
-    not fix.
-    """
-    descend_on_clusters(WeightedBearings(*bearings), WeightedPoints(*points), *rest)

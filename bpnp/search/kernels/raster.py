@@ -11,13 +11,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bpnp.loops.vectors import F, compiled, part, rotated
-from bpnp.search.kernels.sides import WeightedPoints, visible_weights
+from bpnp.search.kernels.sides import Array, visible_weights
 
 
 class Raster(NamedTuple):
-    """What a point adds to the score of a pose by where it falls: the arguments of `add_up`."""
+    """What a point adds to the score of a pose by where it falls.
 
-    values: Any
+    values: (g, g), rows are y; the outermost ones are 0. The first cell begins at -half in both coordinates. per_cell:
+    cells a unit.
+    """
+
+    values: Array
     half: np.float32
     per_cell: np.float32
 
@@ -32,30 +36,23 @@ def place(half: Any, per_cell: Any, p: Any, j: Any, turn: Any, t: Any) -> Any:
 
 
 @compiled
-def add_up(
-    raster: Any,
-    half: Any,
-    per_cell: Any,
-    points: Any,
-    rotation: Any,
-    translation: Any,
-    score: Any,
-    weight: Any,
-    cell: Any,
-) -> None:
+def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any, weight: Any, cell: Any) -> None:
     """score (S,): the sum of the points' weights times the raster's values where pose k sees them, 0 outside it.
 
-    points: a `WeightedPoints`, or the same as a plain tuple, whose labels are ignored.
-    raster (g, g), rows are y; its outermost cells are 0. The first one begins at -half in both coordinates; per_cell
-    cells a unit. rotation (S, 3, 3), translation (S, 3). weight (n,), cell (n,) int32: overwritten.
+    raster, points: a `Raster` and a `WeightedPoints`, whose labels are ignored. rotation (S, 3, 3), translation (S, 3).
+    weight (n,), cell (n,) int32: overwritten.
     """
-    scene = WeightedPoints(*points)  # they may come as a plain tuple
-    cells, values = np.int32(len(raster)), raster.reshape(-1)
+    cells, values, half, per_cell = (
+        np.int32(len(raster.values)),
+        raster.values.reshape(-1),
+        raster.half,
+        raster.per_cell,
+    )
     last = F(cells - 1)
     for k in range(len(rotation)):
-        visible_weights(scene, rotation[k], translation[k], weight)
+        visible_weights(points, rotation[k], translation[k], weight)
         for j in range(len(cell)):  # in a loop of its own, without a branch: several points at once
-            column, row = place(half, per_cell, scene.p, j, rotation[k], translation[k])
+            column, row = place(half, per_cell, points.p, j, rotation[k], translation[k])
             column = column if column > F(0) else F(0)  # NaN too
             row = row if row > F(0) else F(0)
             cell[j] = np.int32(min(row, last)) * cells + np.int32(min(column, last))
@@ -66,21 +63,18 @@ def add_up(
 
 
 @compiled
-def add_shifted(
-    scores: Any, padded: Any, half: Any, per_cell: Any, points: Any, rotation: Any, translation: Any, weight: Any
-) -> None:
+def add_shifted(scores: Any, padded: Any, points: Any, rotation: Any, translation: Any, weight: Any) -> None:
     """scores (S, k, k): to [s, r, c] what `add_up` gives pose s if its points move by r - k/2 rows, c - k/2 columns.
 
-    padded (g, g + 2 k): the raster, k columns of 0 on each side. half: that of k more cells. The rest as in `add_up`.
+    padded: the `Raster` with k columns of 0 on each side, (g, g + 2 k), and the half of k more cells.
     """
-    scene = WeightedPoints(*points)
-    shifts, rows, across = scores.shape[1], len(padded), padded.shape[1]
-    values, last = padded.reshape(-1), F(rows + shifts)
+    shifts, rows, across = scores.shape[1], len(padded.values), padded.values.shape[1]
+    values, last, half, per_cell = padded.values.reshape(-1), F(rows + shifts), padded.half, padded.per_cell
     for s in range(len(rotation)):
-        visible_weights(scene, rotation[s], translation[s], weight)
+        visible_weights(points, rotation[s], translation[s], weight)
         sums = scores[s].reshape(-1)
         for j in range(len(weight)):
-            column, row = place(half, per_cell, scene.p, j, rotation[s], translation[s])
+            column, row = place(half, per_cell, points.p, j, rotation[s], translation[s])
             if column >= 0 and row >= 0 and column < last and row < last:
                 b, above = weight[j], int(row) - shifts
                 for r in range(max(0, -above), min(shifts, rows - above)):

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.loops.vectors import F, compiled, part, sum_of
-from bpnp.search.kernels.dense import directions, move
-from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, visible_weights
+from bpnp.search.kernels.dense import move, see
+from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
 
 SWEEPS = 2
 TILES = 12  # with neighbours, of a point in the mean, before there is place for more
@@ -33,12 +33,12 @@ class Tiles(NamedTuple):
     its cells. shape: (2,) cells along x and y. Cell (i, j) is number 1 + i * shape[1] + j; number 0 is outside.
     """
 
-    f: NDArray[np.float32]
-    a: NDArray[np.float32]
-    odds: NDArray[np.float32]
+    f: Array
+    a: Array
+    odds: Array
     label: NDArray[np.int32]
-    box: NDArray[np.float32]
-    low: NDArray[np.float32]
+    box: Array
+    low: Array
     cell: np.float32
     shape: NDArray[np.int32]
 
@@ -57,7 +57,7 @@ class Near(NamedTuple):
     """
 
     point: NDArray[np.int32]
-    kernel: NDArray[np.float32]
+    kernel: Array
     end: NDArray[np.int32]
 
 
@@ -252,7 +252,7 @@ def assign_sparse(
         scratch.column,
         scratch.weight,
     )
-    directions(points.p, rotation, translation, u)
+    see(points.p, rotation, translation, u)
     sort_points(tiles, u, scratch.cells, scratch.start, scratch.order)
     if not meet(tiles, points.label, u, scale, scratch.start, scratch.order, near):
         return F(0), F(0), False
@@ -301,7 +301,7 @@ def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation:
 
 
 @compiled
-def descend_on_points(
+def descend_sparse(
     tiles: Any,
     points: Any,
     rotation: Any,
@@ -312,7 +312,13 @@ def descend_on_points(
     result: Any,
     scratch: Any,
 ) -> int:
-    """`descend_sparse`, of as many starts as there was place for; the next one is as it was."""
+    """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best;
+    of how many there was place in the scratch for the pairs that are near. The next one is as it was.
+
+    A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
+    result (S, 3): likelihood, matched share and scale there; -inf, 0, 0 for a pose that is not finite. outlier: o / s^2
+    of `Scene.outlier_density`.
+    """
     best, first = scratch.best, scratch.first
     for k in range(len(rotation)):
         copy_pose(rotation[k], translation[k], best, best[3])
@@ -339,29 +345,3 @@ def descend_on_points(
                 break
         copy_pose(best, best[3], rotation[k], translation[k])
     return len(rotation)
-
-
-def descend_sparse(
-    tiles: Any,
-    points: Any,
-    rotation: Any,
-    translation: Any,
-    scales: Any,
-    outlier: Any,
-    patience: int,
-    result: Any,
-    scratch: SparseScratch,
-) -> None:
-    """Anneal starts (S, 3, 3), (S, 3) in place to the one of `scales` (k,), radians, that explains the bearings best.
-
-    A start stops `patience` scales after its likelihood was highest and returns to the pose of that scale.
-    result (S, 3): likelihood, matched share and scale there; -inf, 0, 0 for a pose that is not finite. outlier: o / s^2
-    of `Scene.outlier_density`. scratch: `sparse_scratch`, or a larger one where more points lie together.
-    """
-    tiles, points, done = Tiles(*tiles), WeightedPoints(*points), 0
-    while True:
-        rest = rotation[done:], translation[done:], scales, outlier, patience, result[done:], scratch
-        done += int(descend_on_points(tiles, points, *rest))
-        if done == len(rotation):
-            return
-        scratch = sparse_scratch(tiles, len(points.b), 2 * len(scratch.near.point))

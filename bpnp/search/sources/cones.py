@@ -67,10 +67,10 @@ def best_shifts(poses: Candidates, raster: Raster, points: WeightedPoints) -> tu
     """The largest score (s,) of each pose over all shifts of its points by up to half of the raster, and that shift
     (s, 2), whole cells."""
     count = LANES * math.ceil(len(raster.values) / LANES)
-    padded = np.pad(raster.values, ((0, 0), (count, count)))
     half = np.float32(raster.half + count / 2 / raster.per_cell)
+    padded = Raster(np.pad(raster.values, ((0, 0), (count, count))), half, raster.per_cell)
     scores, weight = np.zeros((len(poses), count, count), np.float32), np.empty_like(points.b)
-    add_shifted(scores, padded, half, raster.per_cell, tuple(points), poses.rotation, poses.translation, weight)
+    add_shifted(scores, padded, points, poses.rotation, poses.translation, weight)
     flat = scores.reshape(len(poses), -1)
     best = flat.argmax(1)
     shift = (np.stack([best % count, best // count], -1) - count // 2) / raster.per_cell

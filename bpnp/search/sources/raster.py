@@ -145,11 +145,11 @@ def looked_up(
 ) -> tuple[Candidates, NDArray[np.int64]]:
     """The `kept` poses under which the points fall best, best first, and their places; of `family` in a row the best
     one only."""
-    side, score = tuple(points), poses.score.copy()
+    score = poses.score.copy()
 
     def look_up(i: int, j: int) -> None:
         weight, cell = np.empty_like(points.b), np.empty(len(points.b), np.int32)
-        add_up(*raster, side, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight, cell)
+        add_up(raster, points, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight, cell)
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
