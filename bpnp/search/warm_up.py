@@ -14,7 +14,6 @@ from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints, blocks_o
 from bpnp.search.kernels.sparse import build_tiles, descend_sparse, sparse_scratch
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT
-from bpnp.search.starts import GravityPrior
 
 POINTS = 8
 
@@ -28,8 +27,7 @@ def warm_up() -> None:
     points = np.random.default_rng(0).uniform(-1, 1, (POINTS, 3))
     rays = points + (0, 0, 6)
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-    for prior in (None, GravityPrior((0, 1, 0), (0, 1, 0))):  # P2P is compiled with the second one
-        search_by_enumeration(PointSets(rays, points, prior=prior), NEVER, DEFAULT)
+    search_by_enumeration(PointSets(rays, points), NEVER, DEFAULT)
     HashedPoints(points, 0.1).count_on(points, points, 1)
     sums_near(rays, rays, np.eye(3)[:, :2].copy(), np.array([0.1, 0.2]), np.array([1.0, 0.0]))
     search_rotation(Image(rays, np.full(POINTS, 1e-3)), rays)

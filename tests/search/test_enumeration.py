@@ -1,5 +1,6 @@
 import itertools
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,12 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
 from bpnp.robust.minimal_solvers import p3p, solve_p2p
-from bpnp.search.enumeration.points import (
-    ImageSide,
-    prior_arrays,
-    scene_side,
-)
+from bpnp.search import search, settings
+from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.poses import EnumeratedPoses, Enumeration, enumerate_poses, margin
+from bpnp.search.enumeration.search import Enumerated
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -146,11 +145,9 @@ def test_two_matches_and_a_direction_give_the_pose(entry: Any, kind: str) -> Non
         up = unit(rng)
         prior = GravityPrior(rotation @ up, up, 1.0) if kind == "gravity" else PosePrior(rotation, None, 1.0)
         sets = PointSets(rays, points, prior=prior)
-        scene, image = scene_side(points, None, None), ImageSide(rays, RADIUS, None, 2.0)
-        known = prior_arrays(sets, scene, image, DEFAULT)
-        run = Enumeration(scene, image, known, 2, 2.0, DEFAULT)
-        poses = np.empty((4, 4, 3))
-        count = entry(solve_p2p)(0, 1, match[0], match[1], known[1], image.arrays.rays, scene.arrays.points, poses)
+        run, poses = Enumeration(sets, RADIUS, DEFAULT), np.empty((4, 4, 3))
+        seen = run.image.arrays.rays, run.scene.arrays.points
+        count = entry(solve_p2p)(0, 1, match[0], match[1], run.problem.heading, *seen, poses)
         assert 0 < count <= 2
         rotations, translations = run.leave(poses[:count])
         off = np.abs(rotations - rotation).max((1, 2)) + np.abs(translations - translation).max(1)
@@ -206,3 +203,18 @@ def test_the_deadline_ends_the_enumeration() -> None:
     poses = solved(rays, rng.standard_normal((60, 3)), deadline=Clock.now())
     assert poses.ended == "interrupted"
     assert poses.solved < DEFAULT.most / 2
+
+
+@pytest.mark.parametrize(("exhausted", "verdict"), [(True, "confident"), (False, "ambiguous")])
+def test_hypotheses_that_were_left_out_are_not_excluded(monkeypatch: Any, exhausted: bool, verdict: str) -> None:
+    """20 matches of little weight: without all hypotheses tried, a better pose may have been missed."""
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-1, 1, (20, 3))
+    sets = PointSets(directions(points + (0, 0, 6) + 0.03 * rng.standard_normal((20, 3))), points)
+    pose = Candidates.unscored(np.eye(3)[None], np.array([[0, 0, 6.0]]))
+    found = replace(pose, matched=np.ones(1), scale=np.full(1, 0.005))
+    monkeypatch.setattr(search, "search_by_enumeration", lambda *_: Enumerated(found, exhausted, safe=False))
+    result = search.search_poses(sets, settings=replace(settings.DEFAULT, least_annealed=30))
+    assert -20 < result.log10_false_alarms < -2
+    assert result.verdict == verdict
+    assert ("missed" in result.reason) == (not exhausted)

@@ -17,6 +17,7 @@ from bpnp.search import pool, schedule
 from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
+from bpnp.search.refine import score_poses
 from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
@@ -120,19 +121,40 @@ def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
     assert pose.stats.converged[:2].all()
 
 
-def test_wrong_budgets_are_refused(problem):
-    with pytest.raises(ValueError, match="expected a positive `time_limit`"):
-        Search(time_limit=0.0)
-    with pytest.raises(ValueError, match="expected `clutter`"):
-        search(problem.bearings, problem.points3d, clutter=1.0)
+def test_given_poses_are_fitted_and_judged():
+    """One near the true pose is believed; a wrong one alone is not, and none is none."""
+    planted = plant(1, 60, noise=0.001)
+    sets = PointSets(planted.bearings[0].numpy(), planted.points3d[0].numpy())
+    (wrong, right), missing = (
+        ([x.numpy() for x in planted.near(off)] for off in (1.0, 0.003)),
+        np.full((1, 3, 3), np.nan),
+    )
+    poses = np.concatenate([missing, wrong[0], right[0]]), np.concatenate([missing[:, 0], wrong[1], right[1]])
+    result = score_poses(sets, *poses, Deadline())
+    assert result.verdict == "confident"
+    assert rotation_error(torch.as_tensor(result.best[0])[None], planted.rotation) < 0.3
+    assert result.batches == 2
+    alone = score_poses(sets, *wrong, Deadline())
+    assert alone.verdict == "failed"
+    assert (alone.candidates.hits == 0).all()
+    assert score_poses(sets, missing, wrong[1], Deadline()).verdict == "failed"
 
 
 @pytest.mark.parametrize(
-    "wrong", [{"schedule": Schedule(turns=0)}, {"starts": 0}, {"first_starts": 0}, {"recipes": ()}, {"outliers": 1.0}]
+    ("call", "named"),
+    [
+        (lambda: Search(time_limit=0.0), "positive `time_limit`"),
+        (lambda: DEFAULT.expecting(1.0), "`clutter`"),
+        (lambda: SearchSettings(Schedule(turns=0)), "`turns`"),
+        (lambda: SearchSettings(starts=0), "`starts`"),
+        (lambda: SearchSettings(first_starts=0), "`first_starts`"),
+        (lambda: SearchSettings(recipes=()), "`recipes`"),
+        (lambda: SearchSettings(outliers=1.0), "outliers"),
+    ],
 )
-def test_settings_without_a_meaning_are_refused(wrong):
-    with pytest.raises(ValueError, match="expected"):
-        SearchSettings(**wrong)
+def test_settings_without_a_meaning_are_refused(call, named):
+    with pytest.raises(ValueError, match=f"expected.*{named}"):
+        call()
 
 
 def test_a_time_limit_ends_the_search():

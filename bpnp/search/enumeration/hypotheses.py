@@ -31,32 +31,21 @@ class Block(NamedTuple):
 
 @compiled
 def explore(
-    row: int,
-    first: int,
-    budget: int,
-    stop: float,
-    reach: float,
-    block: Any,
-    heading: Any,
-    problem: Any,
-    kept: Any,
-    work: Any,
+    row: int, first: int, budget: int, stop: float, reach: float, block: Any, problem: Any, kept: Any, work: Any
 ) -> Any:
     """`sweep` with a budget, and without one `settle` the first pose in `work`: what both call is compiled once."""
     if budget > 0:
-        return sweep(row, first, budget, stop, block, heading, problem, kept, work)
+        return sweep(row, first, budget, stop, block, problem, kept, work)
     settle(work.poses[0], reach, problem, kept, work)
     return row, first, 0
 
 
 @part
-def sweep(
-    row: int, first: int, budget: int, stop: float, block: Any, heading: Any, problem: Any, kept: Any, work: Any
-) -> Any:
+def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: Any, kept: Any, work: Any) -> Any:
     """Solve up to `budget` hypotheses from row `row` on, one of an image set in one order, there from triangle `first`.
 
-    Ends after an image set too when the best pose's evidence is `stop` nats. heading: None where three matches fix a
-    pose. Returns the next row, the next triangle of it, and the number of hypotheses that were solved.
+    Ends after an image set too when the best pose's evidence is `stop` nats. Returns the next row, the next triangle of
+    it, and the number of hypotheses that were solved.
     """
     triangles, orders, rays, best, poses = block.triangles, block.orders, problem.image.rays, kept.best, work.poses
     labels2d, labels3d, normals = problem.image.grid.labels, problem.scene.labels, problem.scene.normals
@@ -87,8 +76,8 @@ def sweep(
             if kept.counts[best[0]] >= RULES.skipped and known[i] == a and known[j] == b and known[k] == c:
                 continue
             solved += 1
-            if heading is not None and block.size == 2:  # without a heading P2P is not even compiled
-                count = solve_p2p(i, j, a, b, heading, rays, problem.scene.points, poses)
+            if block.size == 2:
+                count = solve_p2p(i, j, a, b, problem.heading, rays, problem.scene.points, poses)
             else:
                 count = solve_p3p(rays, (i, j, k), chords, triangles, t - 1, poses)
             for s in range(count):

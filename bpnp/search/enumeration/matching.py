@@ -11,18 +11,19 @@ import numpy as np
 
 from bpnp.loops.vectors import rotated, turn
 from bpnp.robust.minimal_solvers import part
-from bpnp.search.enumeration.points import Array, ImagePoints, Places, PriorArrays, ScenePoints
+from bpnp.search.enumeration.points import Array, Heading, ImagePoints, Places, PriorArrays, ScenePoints
 from bpnp.search.enumeration.settings import RULES
 from bpnp.search.kernels.dense import solve_normal_equations
 
 
 class Problem(NamedTuple):
-    """What the compiled loops read. fixing: matches that fix a pose, which its freedom takes up. density: chance that
-    one scene point lies within one radius of an image point that is anywhere."""
+    """What the compiled loops read. heading: where two matches fix a pose. fixing: matches that fix a pose, which its
+    freedom takes up. density: chance that one scene point lies within one radius of an image point that is anywhere."""
 
     scene: ScenePoints
     image: ImagePoints
     prior: PriorArrays
+    heading: Heading
     fixing: int
     density: float
 

@@ -17,7 +17,6 @@ from bpnp.search.enumeration.matching import Matches, Problem
 from bpnp.search.enumeration.points import (
     Array,
     ImageSide,
-    KnownPose,
     Places,
     SceneSide,
     pairs,
@@ -68,19 +67,15 @@ class Enumeration:
     many were solved.
     """
 
-    def __init__(
-        self,
-        scene: SceneSide,
-        image: ImageSide,
-        known: KnownPose,
-        fixing: int,
-        reach: float,
-        settings: EnumerationSettings,
-    ) -> None:
-        self.scene, self.image, self.settings, self.reach = scene, image, settings, reach
+    def __init__(self, sets: PointSets, radius: float | Array, settings: EnumerationSettings) -> None:
+        scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
+        self.reach = _reach(sets, scene, radius, settings)
+        image = ImageSide(sets.bearings, radius, sets.labels2d, self.reach)
+        known, fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
+        self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
-        self.problem = Problem(scene.arrays, image.arrays, known.arrays, fixing, image.density)
+        self.problem = Problem(scene.arrays, image.arrays, known.arrays, known.heading, fixing, image.density)
         self.kept = Kept(
             np.zeros((kept, 4, 3)),
             np.full(kept, -math.inf),
@@ -100,7 +95,6 @@ class Enumeration:
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)
         self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
-        self._heading = known.heading if fixing == 2 else None
 
     @property
     def best(self) -> float:
@@ -166,7 +160,7 @@ class Enumeration:
         self._explored(0, 0, 0, 0.0, reach)
 
     def _explored(self, *where: float) -> tuple[int, int, int]:
-        return explore(*where, self._block, self._heading, self.problem, self.kept, self.work)
+        return explore(*where, self._block, self.problem, self.kept, self.work)
 
     def enter(self, rotation: Array, translation: Array) -> Array:
         """A pose of the given points as (4, 3) in these frames."""
@@ -203,11 +197,7 @@ def enumerate_poses(
     >>> np.allclose(found.rotation[0], np.eye(3)), found.match[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
-    scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
-    reach = _reach(sets, scene, radius, settings)
-    image = ImageSide(sets.bearings, radius, sets.labels2d, reach)
-    prior = prior_arrays(sets, scene, image, settings)
-    run = Enumeration(scene, image, prior, sets.pairs_that_fix, reach, settings)
+    run = Enumeration(sets, radius, settings)
 
     def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
         if run.best < run.tests:
@@ -222,7 +212,7 @@ def enumerate_poses(
 
     complete = False
     if (predicted := predicted_pose(sets.prior)) is not None:
-        run.refine(run.enter(*predicted), reach)
+        run.refine(run.enter(*predicted), run.reach)
         if (poses := enough(0.0)) is not None:
             return poses
     for stage in settings.stages:

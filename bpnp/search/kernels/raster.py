@@ -42,12 +42,8 @@ def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any
     raster, points: a `Raster` and a `WeightedPoints`, whose labels are ignored. rotation (S, 3, 3), translation (S, 3).
     weight (n,), cell (n,) int32: overwritten.
     """
-    cells, values, half, per_cell = (
-        np.int32(len(raster.values)),
-        raster.values.reshape(-1),
-        raster.half,
-        raster.per_cell,
-    )
+    cells, values = np.int32(len(raster.values)), raster.values.reshape(-1)
+    half, per_cell = raster.half, raster.per_cell
     last = F(cells - 1)
     for k in range(len(rotation)):
         visible_weights(points, rotation[k], translation[k], weight)

@@ -244,14 +244,8 @@ def assign_sparse(
     outlier: o of `Scene.outlier_density`.
     """
     a, odds2d, odds3d, n = tiles.a, tiles.odds, points.odds, points.p.shape[1]
-    u, near, sums, row, column, weight = (
-        scratch.u,
-        scratch.near,
-        scratch.sums,
-        scratch.row,
-        scratch.column,
-        scratch.weight,
-    )
+    u, near, sums = scratch.u, scratch.near, scratch.sums
+    row, column, weight = scratch.row, scratch.column, scratch.weight
     see(points.p, rotation, translation, u)
     sort_points(tiles, u, scratch.cells, scratch.start, scratch.order)
     if not meet(tiles, points.label, u, scale, scratch.start, scratch.order, near):
