@@ -40,17 +40,8 @@ class Candidates:
     def unscored(cls, rotation: NDArray[Any], translation: NDArray[Any], *, hits: int = 0) -> "Candidates":
         """Poses to start from."""
         c = len(rotation)
-        zero = np.zeros(c, np.float32)
-        return cls(
-            rotation,
-            translation,
-            np.full(c, -math.inf, np.float32),
-            zero,
-            zero,
-            np.full(c, hits, np.int64),
-            np.full(c, math.nan),
-            np.full(c, math.nan),
-        )
+        score, zero, unknown = np.full(c, -math.inf, np.float32), np.zeros(c, np.float32), np.full(c, math.nan)
+        return cls(rotation, translation, score, zero, zero, np.full(c, hits, np.int64), unknown, unknown)
 
     @classmethod
     def none(cls) -> "Candidates":

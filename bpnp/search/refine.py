@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.loops.parallel import Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.kernels.sides import FORWARD
@@ -35,7 +35,8 @@ def refine_poses(
     `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
     pose, there are no candidates.
     """
-    scene, starts = _entered(sets, rotation, translation, seed, settings)
+    scene = Scene(sets, seed, settings)
+    starts = _entered(scene, rotation, translation)
     if not len(starts) or degenerate(sets.bearings) or degenerate(sets.points3d):
         return no_pose("no start, or points that fix no pose")
     crowd = len(starts)
@@ -58,37 +59,26 @@ def _on_clusters(scene: Scene, poses: Candidates, stages: Stages) -> Candidates:
 
 @one_blas_thread
 def score_poses(
-    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline,
-    scale: float | None = None,
-) -> SearchResult:  # fmt: skip
+    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], deadline: Deadline
+) -> SearchResult:
     """Poses (c, 3, 3), (c, 3) annealed a little and scored as those of a search; NaN for a missing one.
 
-    scale: of their residuals, radians; by default the median distance of a point to the nearest bearing.
-
-    They have no hits, since no other starts were tried: only overwhelming evidence makes the best of them certain.
+    Their residuals are taken to be the median distance of a point to the nearest bearing. They have no hits, since no
+    other starts were tried: only overwhelming evidence makes the best of them certain.
     """
-    scene, starts = _entered(sets, rotation, translation, 0, DEFAULT, deadline)
+    scene = Scene(sets, 0, DEFAULT, deadline)
+    starts = _entered(scene, rotation, translation)
     if not len(starts):
         return no_pose("the module found no pose")
-    poses = finish(scene, replace(starts, scale=_own_scales(scene, starts, scale)))
-    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
-
-
-def _own_scales(scene: Scene, starts: Candidates, known: float | None) -> NDArray[np.float32]:
-    """Scales (c,) of the residuals of poses of a scene, radians."""
-    if known is not None:
-        return np.full(len(starts), max(known, scene.smallest_scale), np.float32)
     camera = scene.points3d @ starts.rotation.transpose(0, 2, 1) + starts.translation[:, None]
     length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-12)
     distance, _ = cKDTree(scene.offsets + FORWARD).query(camera / length)
-    return np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
+    scale = np.asarray(np.maximum(np.median(distance, -1), scene.smallest_scale), np.float32)
+    poses = finish(scene, replace(starts, scale=scale))
+    return judged(in_user_frame(poses, scene), sets, batches=len(starts))
 
 
-def _entered(
-    sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64], seed: int,
-    settings: SearchSettings, deadline: Deadline = NEVER,
-) -> tuple[Scene, Candidates]:  # fmt: skip
-    """The scene, and those of the user's poses in its frame that are not missing."""
-    scene = Scene(sets, seed, settings, deadline)
-    given = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
-    return scene, Candidates.unscored(*scene.enter(rotation[given], translation[given]))
+def _entered(scene: Scene, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> Candidates:
+    """Those of the user's poses in the frame of a scene that are not missing."""
+    known = np.isfinite(rotation).all((-2, -1)) & np.isfinite(translation).all(-1)
+    return Candidates.unscored(*scene.enter(rotation[known], translation[known]))

@@ -149,9 +149,9 @@ def test_the_time_of_compilation_is_in_no_limit(tmp_path: Path) -> None:
     """The clock of deadlines stands still while a loop is compiled, and only then."""
     script = (
         "from bpnp.loops.parallel import Clock\n"
-        "from bpnp.search.kernels.neighbours import HashedPoints\n"
+        "from bpnp.search.kernels.neighbours import hashed\n"
         "import numpy as np\n"
-        "HashedPoints(np.eye(3), 0.1).count_on(np.eye(3), np.zeros((1, 3)), 1)\n"
+        "hashed(np.eye(3), 0.1).count_on(np.eye(3), np.zeros((1, 3)), 1)\n"
         "print(Clock.compiling)\n"
     )
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}

@@ -63,7 +63,7 @@ def judge_claim(
     one = replace(sets, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation, settings)
     others, looks, exhaustive = _met(sets, claim, seed, deadline, settings)
-    others = with_false_alarms(replace(others, log10_false_alarms=np.full(len(others), math.nan)), one)
+    others = _weighed_anew(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
@@ -75,8 +75,7 @@ def judge_claim(
         near = replace(sets, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
         one = replace(sets, log10_tried=max(log10_tests(sets) + near, 0.0))
         claim = optimum
-    candidates = Candidates.concatenated([claim, others[~same]])
-    candidates = with_false_alarms(replace(candidates, log10_false_alarms=np.full(len(candidates), math.nan)), one)
+    candidates = _weighed_anew(Candidates.concatenated([claim, others[~same]]), one)
     result = judged(candidates, one, batches=looks, looks=looks, exhaustive=exhaustive, rule=rule)
     scene = Scene(one, seed, settings, deadline)
     result = against_rivals(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
@@ -113,6 +112,11 @@ def _met(
         parts.append(multistart(scene, batch, None, merged(parts, scene))[0])
     poses = finish(scene, merged(parts, scene), settings.finished)
     return in_user_frame(poses, scene), looks, exhaustive
+
+
+def _weighed_anew(candidates: Candidates, sets: PointSets) -> Candidates:
+    """With the false alarms of as many tests as these sets have."""
+    return with_false_alarms(replace(candidates, log10_false_alarms=np.full(len(candidates), math.nan)), sets)
 
 
 def _mirrored(scene: Scene, pose: Candidates) -> Candidates:

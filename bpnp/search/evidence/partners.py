@@ -78,15 +78,12 @@ def by_focal_length(seen: Array) -> Array:
 
 
 class Zoomed(NamedTuple):
-    """A pose with a focal length, `zoom` over the given one, that some image points are compared with.
-
-    density: (k,) of these. products: (7, 7), gradient: (7,) of a Gauss-Newton step of turn, shift and log zoom.
-    """
+    """A pose with a focal length, `zoom` over the given one, and products (7, 7) and gradient (7,) of a Gauss-Newton
+    step of turn, shift and log zoom."""
 
     rotation: Array
     middle: Array
     zoom: float
-    density: Array
     products: Array
     gradient: Array
 
@@ -114,7 +111,7 @@ def _zoomed(
     jacobian = np.concatenate([np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift, by_zoom], -1)
     products = np.tensordot(jacobian * weights[:, None, None], jacobian, ((0, 1), (0, 1)))
     gradient = np.tensordot(jacobian, seen_as[used] - weights[:, None] * u, ((0, 1), (0, 1)))
-    return Zoomed(rotation, middle, zoom, every, products, gradient)
+    return Zoomed(rotation, middle, zoom, products, gradient)
 
 
 def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
-from bpnp.search.kernels.neighbours import HashedPoints
+from bpnp.search.kernels.neighbours import HashedPoints, hashed
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import Evidence, Repetitions
 
@@ -52,7 +52,7 @@ def repeated_poses(
     some = np.linspace(limits.references, len(own) - 1, limits.most).astype(int)
     own = own[np.unique(np.r_[: limits.references, some])]
     around = points[np.argsort(np.linalg.norm(points - own[0], axis=-1), kind="stable")[: limits.around]]
-    scene = HashedPoints(points, tolerance)
+    scene = hashed(points, tolerance)
     found = [(share, np.eye(3), shift) for share, shift in _shifts(scene, around, own, np.eye(3), limits)]
     turns = [] if sets.knows_rotation else _turns(own, found[0][2] if found else None)
     for turn in turns:

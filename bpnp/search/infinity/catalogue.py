@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.search.infinity.kernels import Pairs, Sky
-from bpnp.search.kernels.neighbours import HashedPoints
+from bpnp.search.kernels.neighbours import hashed
 
 Array = NDArray[np.float64]
 DENSITIES = (8, 32)  # neighbours from whose distance the density around a direction is taken; the larger one counts
@@ -27,8 +27,8 @@ class Catalogue(NamedTuple):
 
     def sky(self, reach: float) -> Sky:
         """The directions in cells, to be looked up within a chord of `reach`."""
-        table = HashedPoints(self.directions.copy(), reach)  # one that may be written to, as elsewhere: compiled once
-        return Sky(table.points, self.density, table.heads, table.links, reach)
+        # A copy may be written to, as the points that are looked up elsewhere: the loops are compiled once.
+        return Sky(hashed(self.directions.copy(), reach), self.density)
 
 
 def catalogue_of(directions: Array, most_pairs: int) -> Catalogue:

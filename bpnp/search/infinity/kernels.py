@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.loops.vectors import compiled, cross, part, rotated, turn
-from bpnp.search.kernels.neighbours import entry
+from bpnp.search.kernels.neighbours import HashedPoints, entry
 
 Array = NDArray[np.float64]
 LOG_HALF = math.log(0.5)  # of a point that the true rotation explains
@@ -15,14 +15,11 @@ CROWDED = 0.45  # probability that chance puts a direction within reach of a poi
 
 
 class Sky(NamedTuple):
-    """Directions (n, 3) in a hash table with cells of twice the `reach` (chord), and how many there are around each
-    (n,), a steradian."""
+    """Directions (n, 3) in a table to be looked up within a chord, and how many there are around each (n,), a
+    steradian."""
 
-    directions: Array
+    table: HashedPoints
     density: Array
-    heads: NDArray[np.int64]
-    links: NDArray[np.int64]
-    reach: float
 
 
 class Pairs(NamedTuple):
@@ -61,15 +58,16 @@ class Fit(NamedTuple):
 @part
 def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
     """Place of the direction nearest to (x, y, z) within the squared chord, -1 for none, and its squared chord."""
+    directions, reach, heads, links = sky.table
     place, least = -1, squared
-    e = sky.heads[entry(sky.heads, x, y, z, 2 * sky.reach)]
+    e = heads[entry(heads, x, y, z, 2 * reach)]
     while e >= 0:
         j = e >> 3
-        dx, dy, dz = sky.directions[j, 0] - x, sky.directions[j, 1] - y, sky.directions[j, 2] - z
+        dx, dy, dz = directions[j, 0] - x, directions[j, 1] - y, directions[j, 2] - z
         distance = dx * dx + dy * dy + dz * dz
         if distance < least:
             place, least = j, distance
-        e = sky.links[e]
+        e = links[e]
     return place, least
 
 
@@ -80,11 +78,11 @@ def propose(sky: Any, pairs: Any, low: int, high: int, patch: Any, abandoned: fl
     kept (b, 3, 3): axes of the catalogue's pair, as rows; value (b,): nats by which the matches of the patch are
     likelier than by chance, descending; -inf for an empty place.
     """
-    last = len(value) - 1
+    last, directions = len(value) - 1, sky.table.points
     for t in range(low, high):
         a, b = pairs.first[t], pairs.second[t]
-        ax, ay, az = sky.directions[a, 0], sky.directions[a, 1], sky.directions[a, 2]
-        bx, by, bz = sky.directions[b, 0], sky.directions[b, 1], sky.directions[b, 2]
+        ax, ay, az = directions[a, 0], directions[a, 1], directions[a, 2]
+        bx, by, bz = directions[b, 0], directions[b, 1], directions[b, 2]
         sx, sy, sz = ax + bx, ay + by, az + bz
         scale = 1 / math.sqrt(sx * sx + sy * sy + sz * sz)
         sx, sy, sz = scale * sx, scale * sy, scale * sz
@@ -142,7 +140,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
     For the turn w of a direction v seen at f, (I - f f^T) summed is the normal matrix and v x f the gradient.
     """
     covariance, step, turned, normal = scratch[:3], scratch[3], result.rotation, result.normal
-    total = 0.0
+    directions, widest, total = sky.table.points, sky.table.tolerance, 0.0
     for _ in range(rounds):
         for r in range(3):
             step[r] = 0.0
@@ -160,7 +158,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
             variance = image.pixel[i] ** 2 + 0.5 * (trace - x * cx - y * cy - z * cz)
             squared = reach * reach * variance
             result.match[i] = -1
-            if squared > sky.reach * sky.reach:
+            if squared > widest * widest:
                 continue
             place, distance = _nearest(
                 sky,
@@ -177,7 +175,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
                 continue
             total += LOG_HALF - math.log(likely)
             result.match[i], result.squared[i] = place, distance / image.pixel[i] ** 2
-            vx, vy, vz = rotated(turned, sky.directions[place, 0], sky.directions[place, 1], sky.directions[place, 2])
+            vx, vy, vz = rotated(turned, directions[place, 0], directions[place, 1], directions[place, 2])
             sx, sy, sz = cross(vx, vy, vz, x, y, z)
             weight = 1 / variance
             gx, gy, gz = gx + weight * sx, gy + weight * sy, gz + weight * sz

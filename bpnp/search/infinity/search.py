@@ -233,7 +233,7 @@ def _rotations(sight: Sight, i: int, k: int, found: list[Rotated]) -> Iterator[R
     off[[i, k]] = np.inf
     near = np.argsort(off, kind="stable")[: min(settings.patch, len(bearings) - 2)]
     squared = (sight.reach * pixel[near]) ** 2 * (1.5 + 2 * (off[near] / chord) ** 2)
-    patch = Patch(np.ascontiguousarray(bearings[near] @ axes.T), np.minimum(squared, sight.sky.reach**2))
+    patch = Patch(np.ascontiguousarray(bearings[near] @ axes.T), np.minimum(squared, sight.sky.table.tolerance**2))
     kept, value = np.empty((settings.refined, 3, 3)), np.full(settings.refined, -math.inf)
     propose(sight.sky, sight.catalogue.pairs, int(low), int(high), patch, settings.abandoned, kept, value)
     weight = _information(sight.image, np.array([i, k]))

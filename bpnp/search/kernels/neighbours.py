@@ -2,7 +2,7 @@
 scene points in a hash table, which tells how many of other points many shifts take onto one."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,24 +65,31 @@ def _add_up(
                     sums[s, i] += weights[j] * math.exp(-sharpness[s] * squared)
 
 
-class HashedPoints:
+class HashedPoints(NamedTuple):
     """Points (n, 3) in cells of twice a tolerance: each in those of the corners of the cube around it.
 
     heads (2^k,): the last slot of a cell, or -1. links (8 n,): the slot before it; slot e is of point e // 8.
     """
 
-    def __init__(self, points: Array, tolerance: float) -> None:
-        slots = 8 * len(points)
-        self.points, self.tolerance = np.ascontiguousarray(points), tolerance
-        self.heads, self.links = np.full(1 << slots.bit_length(), -1), np.empty(slots, np.int64)
-        _enter(self.points, tolerance, self.heads, self.links)
+    points: Array
+    tolerance: float
+    heads: NDArray[np.int64]
+    links: NDArray[np.int64]
 
     def count_on(self, moved: Array, shifts: Array, least: int) -> NDArray[np.int64]:
         """(s,) how many of `moved` (k, 3) each shift (s, 3) takes to within the tolerance of a point; of a shift with
         fewer than `least` any number below it."""
         counts = np.empty(len(shifts), np.int64)
-        _count_on(self.points, self.tolerance, self.heads, self.links, moved, shifts, least, counts)
+        _count_on(self, moved, shifts, least, counts)
         return counts
+
+
+def hashed(points: Array, tolerance: float) -> HashedPoints:
+    slots = 8 * len(points)
+    heads, links = np.full(1 << slots.bit_length(), -1), np.empty(slots, np.int64)
+    table = HashedPoints(np.ascontiguousarray(points), tolerance, heads, links)
+    _enter(table)
+    return table
 
 
 @part
@@ -93,8 +100,9 @@ def entry(heads: Any, x: Any, y: Any, z: Any, cell: Any) -> Any:
 
 
 @compiled
-def _enter(points: Any, tolerance: float, heads: Any, links: Any) -> None:
+def _enter(table: Any) -> None:
     """Fill links, and heads that are -1."""
+    points, tolerance, heads, links = table
     for e in range(len(links)):
         x, y, z = points[e >> 3, 0], points[e >> 3, 1], points[e >> 3, 2]
         x, y, z = x + tolerance * (2 * (e & 1) - 1), y + tolerance * ((e & 2) - 1), z + tolerance * ((e & 4) / 2 - 1)
@@ -103,9 +111,8 @@ def _enter(points: Any, tolerance: float, heads: Any, links: Any) -> None:
 
 
 @compiled
-def _count_on(
-    points: Any, tolerance: float, heads: Any, links: Any, moved: Any, shifts: Any, least: int, counts: Any
-) -> None:
+def _count_on(table: Any, moved: Any, shifts: Any, least: int, counts: Any) -> None:
+    points, tolerance, heads, links = table
     for s in range(len(shifts)):
         counts[s] = 0
         for k in range(len(moved)):
