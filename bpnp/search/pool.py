@@ -123,8 +123,7 @@ class Pool:
         ends = finish(scene, self.candidates, annealed) if len(self.candidates) else self.candidates
         if len(ends) and sets.prior is not None:  # of a pose before and after, that which chance explains less
             ends = self._weighed(ends)
-            before = self.candidates.without_hits()
-            ends = best_distinct(Candidates.concatenated([ends, before]), scene, scene.settings.kept)
+            ends = merged([ends, self.candidates.without_hits()], scene)
         leaders = weighed(in_user_frame(ends, scene), sets, rule)
         looks = self.looks(leaders)
         result = judged(leaders, sets, batches=self.turns, looks=looks, rule=rule)

@@ -203,7 +203,7 @@ def tightened(pose: Any, reach: float, last: float, problem: Any, matches: Any, 
         count, _, _ = match(pose, reach, problem.scene, problem.image.grid, matches)
         if count < 3 and count + known < 3:
             return False
-        if not step(pose, matches.point, problem.image.rays, problem.scene.points, problem.prior, system):
+        if not step(pose, matches.point, problem, system):
             return False
         left -= reach <= last
         reach = max(last, RULES.tighter * reach)

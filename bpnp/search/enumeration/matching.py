@@ -65,12 +65,12 @@ def cell_of(u: float, v: float, grid: Any) -> Any:
 @part
 def nearest(u: float, v: float, cell: int, label: int, reach2: float, grid: Any) -> tuple[int, float]:
     """The image point nearest to (u, v) whose label fits, -1 for none within the root of reach2, and squared radii."""
-    flat, place = grid.flat, -1
+    flat, gain, place = grid.flat, grid.gain, -1
     if cell >= 0:
         for item in range(grid.starts[cell], grid.starts[cell + 1]):
             i = grid.items[item]
             if fits(label, grid.labels[i]):
-                d2 = flat[i, 2] * flat[i, 2] * ((u - flat[i, 0]) ** 2 + (v - flat[i, 1]) ** 2)
+                d2 = gain[i] * gain[i] * ((u - flat[i, 0]) ** 2 + (v - flat[i, 1]) ** 2)
                 if d2 < reach2:
                     place, reach2 = i, d2
     return place, reach2
@@ -121,10 +121,11 @@ def _log_choose(n: int, k: int) -> float:
 
 
 @part
-def step(pose: Any, matched: Any, rays: Any, points: Any, prior: Any, system: Any) -> bool:
+def step(pose: Any, matched: Any, problem: Any, system: Any) -> bool:
     """One Gauss-Newton step, in place, on sum_i w_i^2 |f_i - g(R p + t)|^2 over the matches (m,) and what is known of
     directions; False if it has none. g(y) = y/|y|, w_i one over a radius. The step is y -> y + w x Rp + s."""
-    in_scene, in_camera = prior.in_scene, prior.in_camera
+    rays, per_radian, points = problem.image.rays, problem.image.per_radian, problem.scene.points
+    in_scene, in_camera, weight = problem.prior.in_scene, problem.prior.in_camera, problem.prior.weight
     for a in range(7):
         for b in range(6):
             system[a, b] = 0.0
@@ -134,7 +135,7 @@ def step(pose: Any, matched: Any, rays: Any, points: Any, prior: Any, system: An
         ux = uy = uz = shift = 0.0
         if k >= 0:
             x, y, z = rotated(pose, in_scene[k, 0], in_scene[k, 1], in_scene[k, 2])
-            turned = w = prior.weight
+            turned = w = weight
             rx, ry, rz = in_camera[k, 0] - x, in_camera[k, 1] - y, in_camera[k, 2] - z
         elif matched[i] >= 0:
             j = matched[i]
@@ -143,8 +144,8 @@ def step(pose: Any, matched: Any, rays: Any, points: Any, prior: Any, system: An
             inverse = 1 / math.sqrt(ux * ux + uy * uy + uz * uz)
             ux, uy, uz = ux * inverse, uy * inverse, uz * inverse
             along = rays[i, 0] * ux + rays[i, 1] * uy + rays[i, 2] * uz
-            turned = shift = rays[i, 3] * inverse
-            w = rays[i, 3] / (along if along > 0.1 else 0.1)
+            turned = shift = per_radian * inverse
+            w = per_radian / (along if along > 0.1 else 0.1)
             rx, ry, rz = rays[i, 0] - along * ux, rays[i, 1] - along * uy, rays[i, 2] - along * uz
         else:
             continue

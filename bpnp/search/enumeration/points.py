@@ -35,12 +35,13 @@ class ScenePoints(NamedTuple):
 class Grid(NamedTuple):
     """Image points in the cells of a grid, each in all that lie within reach of it.
 
-    flat: (m, 3), coordinates and gain of `ImagePoints`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
+    flat: (m, 2) coordinates, gain: (m,), of `ImagePoints`. labels: (m,), -1 fits any. low_u, low_v: the lower corner.
     per_cell: cells a unit. starts: where the items of a cell begin (cells^2 + 1,), those along the second coordinate
     next to each other. items: image points.
     """
 
     flat: Array
+    gain: Array
     labels: Places
     low_u: float
     low_v: float
@@ -54,10 +55,11 @@ class ImagePoints(NamedTuple):
 
     A difference s of coordinates is an angle of s (1 + cos theta), theta from the axis: `gain` turns differences near
     an image point into units of its radius.
-    rays: (m, 4), unit vectors and one over the radius.
+    rays: (m, 3) unit vectors. per_radian: radii a radian.
     """
 
     rays: Array
+    per_radian: float
     grid: Grid
 
 
@@ -134,18 +136,18 @@ class ImageSide:
     given image point, if it may be anywhere among them. nearest: (m, k) each point's nearest.
     """
 
-    def __init__(self, bearings: Array, radius: float | Array, labels2d: Places | None, reach: float) -> None:
+    def __init__(self, bearings: Array, radius: float, labels2d: Places | None, reach: float) -> None:
         self.turn = turned_to(bearings.mean(0))
         rays = bearings @ self.turn.T
-        inverse = np.broadcast_to(1 / np.asarray(radius, np.float64), len(rays))
-        flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * inverse
+        per_radian = 1 / float(radius)
+        flat, gain = rays[:, :2] / np.maximum(1 + rays[:, 2:], 1e-9), (1 + rays[:, 2]) * per_radian
         labels = np.full(len(rays), -1) if labels2d is None else np.array(labels2d, np.int64)
-        self.arrays = ImagePoints(np.column_stack([rays, inverse]), grid_of(flat, gain, labels, reach))
+        self.arrays = ImagePoints(np.ascontiguousarray(rays), per_radian, grid_of(flat, gain, labels, reach))
         self.density = float(math.pi * (1 / gain**2).mean() / _area(flat, float(1 / gain.mean())))
 
     @functools.cached_property
     def nearest(self) -> Places:
-        return nearest_of(self.arrays.rays[:, :3], np.empty((0, 3)))
+        return nearest_of(self.arrays.rays, np.empty((0, 3)))
 
 
 def scene_side(points3d: Array, normals3d: Array | None, labels3d: Places | None) -> SceneSide:
@@ -244,7 +246,7 @@ def grid_of(flat: Array, gain: Array, labels: Places, reach: float) -> Grid:
     cell = row * cells + column
     order = np.argsort(cell, kind="stable")
     starts = np.searchsorted(cell[order], np.arange(cells**2 + 1))
-    return Grid(np.column_stack([flat, gain]), labels, float(low[0]), float(low[1]), per_cell, starts, item[order])
+    return Grid(np.ascontiguousarray(flat), gain, labels, float(low[0]), float(low[1]), per_cell, starts, item[order])
 
 
 def _area(flat: Array, radius: float) -> float:
@@ -287,7 +289,7 @@ def prior_arrays(sets: PointSets, scene: SceneSide, image: ImageSide, settings: 
         most = min(settings.sigmas * sigma, math.pi)
         log_share, sine2 = math.log((most - math.sin(most)) / math.pi), math.sin(min(most, math.pi / 2)) ** 2
     about = np.array([np.diag([0.0, 0, 1]), np.diag([1.0, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]]])
-    rays = np.ascontiguousarray(image.arrays.rays[:, :3] @ from_camera.T)
+    rays = np.ascontiguousarray(image.arrays.rays @ from_camera.T)
     points = np.ascontiguousarray(scene.arrays.points @ from_scene.T)
     heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
     weight, farthest2 = settings.prior_weight / off, (2 * math.sin(min(settings.sigmas * off, math.pi) / 2)) ** 2

@@ -67,7 +67,7 @@ class Enumeration:
     many were solved.
     """
 
-    def __init__(self, sets: PointSets, radius: float | Array, settings: EnumerationSettings) -> None:
+    def __init__(self, sets: PointSets, radius: float, settings: EnumerationSettings) -> None:
         scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
         self.reach = _reach(sets, scene, radius, settings)
         image = ImageSide(sets.bearings, radius, sets.labels2d, self.reach)
@@ -176,17 +176,17 @@ class Enumeration:
 def enumerate_poses(
     sets: PointSets,
     *,
-    radius: float | Array,
+    radius: float,
     deadline: float = math.inf,
     is_safe: Callable[[EnumeratedPoses], bool] | None = None,
     settings: EnumerationSettings = DEFAULT,
 ) -> EnumeratedPoses:
     """Poses under which image points see scene points, one-to-one within `radius`.
 
-    radius: radians, one for all or one for each bearing: the largest residual of a match, a few standard deviations of
-    the noise. deadline: of `Clock`. is_safe: asked whether to stop, once the best pose exceeds chance and
-    every other pose; None for always. Where gravity is known, or the rotation to a few degrees, two matches fix a pose;
-    where a whole pose is known, it is tried first.
+    radius: radians, the largest residual of a match, a few standard deviations of the noise. deadline: of `Clock`.
+    is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
+    gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
+    first.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -237,14 +237,14 @@ def enumerate_poses(
     return _poses(run, "exhausted" if complete else "most")
 
 
-def _reach(sets: PointSets, scene: SceneSide, radius: float | Array, settings: EnumerationSettings) -> float:
+def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: EnumerationSettings) -> float:
     """Radii within which points are looked up: as far as a predicted pose may be off, `settings.widest` at most."""
     needed = max([1.0, *(stage.reach for stage in settings.stages)])
     if (predicted := predicted_pose(sets.prior)) is not None and isinstance(sets.prior, PosePrior):
         distance = max(float(np.linalg.norm(predicted[0] @ scene.centre + predicted[1])), 1e-12)
         turn = math.radians(sets.prior.rotation_sigma_deg) * min(scene.size / distance, 1.0)
         off = 2 * math.hypot(turn, sets.prior.translation_sigma / distance)
-        needed = max(needed, min(off / float(np.mean(radius)), settings.widest))
+        needed = max(needed, min(off / radius, settings.widest))
     return needed
 
 
@@ -255,7 +255,7 @@ def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
     order = order[np.isfinite(kept.evidence[order])]
     rotation, translation = run.leave(kept.poses[order])
     match, radii = kept.point[order], np.sqrt(kept.distance2[order])
-    residual = np.where(match >= 0, radii / run.image.arrays.rays[:, 3], math.inf)
+    residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
     evidence = kept.evidence[order]
     return EnumeratedPoses(rotation, translation, evidence, match, residual, run.fixing, run.tests, run.solved, ended)
 
