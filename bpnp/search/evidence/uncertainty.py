@@ -1,5 +1,5 @@
-"""How well points fix a pose: its covariance, bounds of its rotation and of the camera's centre that allow for few
-residuals, and residuals that no pose explains, but another focal length or other proportions of the scene would."""
+"""How well points fix a pose: its covariance, bounds of its rotation and focal length that allow for few residuals, and
+residuals that no pose explains, but another focal length or other proportions of the scene would."""
 
 import math
 from typing import NamedTuple
@@ -9,14 +9,7 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.distinct_poses import turned_by
-from bpnp.search.evidence.partners import (
-    Zoomed,
-    across,
-    by_focal_length,
-    facing,
-    partners,
-    with_focal_length,
-)
+from bpnp.search.evidence.partners import Zoomed, across, by_focal_length, facing, partners, with_focal_length
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT, Evidence
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -57,14 +50,6 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     """
     covariance = local_covariance(linear)
     return math.inf if covariance is None else _bound(covariance[:3, :3], 2 * count - sets.fitted)
-
-
-def centre_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
-    """Distance, scene units, that the error of the camera's centre exceeds once in a thousand; see `_bound`."""
-    covariance = local_covariance(linear)
-    if covariance is None or linear is None:
-        return math.inf
-    return _bound(centre_covariance(covariance, linear.middle), 2 * count - sets.fitted)
 
 
 def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
