@@ -54,27 +54,25 @@ def test_search_finds_planted_poses(problem):
     torch.testing.assert_close(rotation @ rotation.mT, identity, atol=1e-5, rtol=0)
 
 
-@pytest.mark.parametrize("case", ["three", "line2d", "line3d", "same2d", "same3d"])
-def test_what_fixes_no_pose_has_none(problem, case):
-    f, p = problem.bearings[:1].clone(), problem.points3d[:1].clone()
-    along = torch.linspace(0, 1, f.shape[1]).unsqueeze(-1).to(p)
-    if case == "three":
-        f, p = f[:, :3], p[:, :3]
-    elif case == "line2d":
-        f = bearings(along.repeat(1, 2).unsqueeze(0) * 0.1)
-    elif case == "line3d":
-        p = (along * torch.ones(3).to(p)).unsqueeze(0)
-    elif case == "same2d":
-        f = f[:, :1].expand_as(f).contiguous()
-    else:
-        p = p[:, :1].expand_as(p).contiguous()
-    # Points of a line within rounding are on it; in two dimensions a bearing on a line has a plane of its own.
-    rotation, translation, stats = search(f, p, settings=DEFAULT.limited(4))
-    if case != "line2d":
-        assert rotation.isnan().all()
-        assert translation.isnan().all()
-        assert stats.residual.isinf().all()
-        assert not stats.converged.any()
+LINE = torch.linspace(0, 1, 200, dtype=torch.float64)[None, :, None].expand(1, 200, 3)
+
+
+@pytest.mark.parametrize(
+    "lacking",
+    [
+        lambda f, p: (f[:, :3], p[:, :3]),
+        lambda f, _: (f, LINE),
+        lambda f, p: (f[:, :1].expand_as(f), p),
+        lambda f, p: (f, p[:, :1].expand_as(p)),
+    ],
+    ids=["three", "3D points on a line", "2D points in one place", "3D points in one place"],
+)
+def test_what_fixes_no_pose_has_none(problem, lacking):
+    rotation, translation, stats = search(*lacking(problem.bearings[:1], problem.points3d[:1]))
+    assert rotation.isnan().all()
+    assert translation.isnan().all()
+    assert stats.residual.isinf().all()
+    assert not stats.converged.any()
 
 
 @pytest.mark.parametrize("off", [0.05, 1.0])
