@@ -159,7 +159,7 @@ class Enumeration:
         self.work.poses[0] = pose
         self._explored(0, 0, 0, 0.0, reach)
 
-    def _explored(self, *where: float) -> tuple[int, int, int]:
+    def _explored(self, *where: int | float) -> tuple[int, int, int]:
         return explore(*where, self._block, self.problem, self.kept, self.work)
 
     def enter(self, rotation: Array, translation: Array) -> Array:
