@@ -1,5 +1,6 @@
 """How loops on the CPU are compiled, and where the result is kept."""
 
+import gc
 import inspect
 import logging
 import os
@@ -41,8 +42,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
     part = "no_cpython_wrapper" in options
     options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    if KNOWN and part:
-        options["pipeline_class"] = shortcuts.PartCompiler
+    if KNOWN:
+        options["pipeline_class"] = shortcuts.LoopCompiler
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -65,11 +66,12 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 class _Compilation(event.Listener):
     """Logs one line when the first of this package's functions is compiled, for it takes seconds.
 
-    Meanwhile operators are looked up once, and the clock of deadlines stands still. numba compiles one function at a
-    time, whatever the thread, and those that it calls within.
+    Meanwhile Python's collector of cycles rests, which would find nothing, operators are looked up once, and the clock
+    of deadlines stands still. numba compiles one function at a time, whatever the thread, and those that it calls
+    within.
     """
 
-    made, depth, begun = False, 0, 0.0
+    made, depth, collected, begun = False, 0, False, 0.0
 
     def on_start(self, event: event.Event) -> None:
         if not _is_ours(event):
@@ -79,6 +81,8 @@ class _Compilation(event.Listener):
             logging.getLogger(__name__).warning("compiling bpnp's loops, which takes some seconds once an installation")
         if not self.depth:
             self.begun = time.monotonic()
+            self.collected = gc.isenabled()
+            gc.disable()
             if KNOWN:
                 shortcuts.resolve_once(True)
         self.depth += 1
@@ -90,6 +94,8 @@ class _Compilation(event.Listener):
                 Clock.compiling += time.monotonic() - self.begun
                 if KNOWN:
                     shortcuts.resolve_once(False)
+                if self.collected:
+                    gc.enable()
 
 
 def _is_ours(event: event.Event) -> bool:

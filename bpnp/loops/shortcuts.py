@@ -5,7 +5,9 @@ from typing import Any
 from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
 from numba.core.types import BaseFunction
+from numba.core.untyped_passes import InlineClosureLikes
 
 
 class _PartCode(JITCodeLibrary):
@@ -18,14 +20,27 @@ class _PartCode(JITCodeLibrary):
         self._finalized = True
 
 
-class PartCompiler(Compiler):
-    """Compiles a part of a loop, which gets no machine code of its own."""
+class LoopCompiler(Compiler):
+    """Compiles a loop, or a part of one, which gets no machine code of its own."""
 
-    def __init__(self, typing: Any, target: Any, _: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
-        code = _PartCode(target.codegen(), "part")
-        code.enable_object_caching()
+    def __init__(self, typing: Any, target: Any, code: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
+        if flags.no_cpython_wrapper:
+            code = _PartCode(target.codegen(), "part")
+            code.enable_object_caching()
         super().__init__(typing, target, code, args, result, flags, *rest)
-        self.state.targetctx.get_executable = _without_machine_code
+        if flags.no_cpython_wrapper:
+            self.state.targetctx.get_executable = _without_machine_code
+
+    def define_pipelines(self) -> Any:
+        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
+        the end of each variable's life, which matters where references are counted."""
+        (pipeline,) = super().define_pipelines()
+        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
+        if not self.state.flags.nrt:
+            unused.add(IRLegalization)
+        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
+        pipeline.finalize()
+        return [pipeline]
 
 
 def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
