@@ -109,7 +109,11 @@ def test_the_likelihood_on_tiles_is_exact_where_points_lie_together_and_in_a_mir
         turned, moved = np.eye(3, dtype=np.float32)[None].copy(), (translation * (sign, 1, 1))[None].astype(np.float32)
         result = np.zeros((1, 3), np.float32)
         scales = np.array([scale], np.float32)
-        descend_sparse(tiles, scene, turned, moved, scales, outlier, 3, result, sparse_scratch(tiles, 40))
+        for pairs in (0, 40 * len(tiles.f)):  # the place that is enough for most problems, and for all pairs
+            scratch = sparse_scratch(tiles, 40, pairs)
+            done = descend_sparse(tiles, scene, turned, moved, scales, outlier, 3, result, scratch)
+            assert done == (0 if clumped and not pairs else 1)
+            assert (turned == np.eye(3)).all()
         found.append(result[0].copy())
         camera = mirrored.T.astype(float) + translation * (sign, 1, 1)
         seen = camera / np.linalg.norm(camera, axis=1, keepdims=True)

@@ -277,10 +277,12 @@ def assign_sparse(
 @part
 def is_finite(rotation: Any, translation: Any) -> bool:
     """Whether a pose has neither NaN nor infinity."""
-    total = F(0)
+    finite = True
     for r in range(3):
-        total += rotation[r, 0] + rotation[r, 1] + rotation[r, 2] + translation[r]
-    return math.isfinite(total)
+        for c in range(3):
+            finite = finite and math.isfinite(rotation[r, c])
+        finite = finite and math.isfinite(translation[r])
+    return finite
 
 
 @part
