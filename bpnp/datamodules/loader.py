@@ -175,45 +175,6 @@ class ProblemLoader(DataLoader[Batch]):
         self.resumed = dict(state_dict)
 
 
-def problem_loader(
-    dataset: ProblemDataset,
-    *,
-    batch_size: int,
-    shuffle: bool,
-    seed: int,
-    num_workers: int = 0,
-    max_cells: int | None = None,
-    overfit: bool = False,
-) -> DataLoader[Batch]:
-    """A loader of padded batches for this process of the process group, if there is one.
-
-    See `BucketSampler` for the options; shuffle is True for training. max_cells bounds b * m * n of a padded batch.
-    overfit: the same batches in every epoch, for `Trainer(overfit_batches)`, which brings a sampler of its own.
-    """
-    group = distributed.is_available() and distributed.is_initialized()
-    sampler = BucketSampler(
-        dataset,
-        batch_size=batch_size,
-        shuffle=shuffle,
-        seed=seed,
-        num_replicas=distributed.get_world_size() if group else 1,
-        rank=distributed.get_rank() if group else 0,
-        max_cells=max_cells,
-    )
-    if overfit:
-        batches: list[Any] = list(sampler)  # of the first epoch; Lightning takes them in their order
-        return DataLoader(Subset(dataset, batches), batch_size=None, num_workers=num_workers)
-    return ProblemLoader(
-        dataset,
-        sampler=sampler,
-        batch_size=None,
-        num_workers=num_workers,
-        persistent_workers=num_workers > 0,
-        pin_memory=torch.cuda.is_available(),
-        generator=torch.Generator().manual_seed(seed),  # else every epoch draws from the global generator
-    )
-
-
 PARTS = ("train", "val", "test", "predict")
 STAGES = {"fit": ("train", "val"), "validate": ("val",), "test": ("test",), "predict": ("predict",), None: PARTS}
 
@@ -287,15 +248,28 @@ class ProblemDataModule(LightningDataModule):
     def _loader(self, part: str) -> DataLoader[Batch]:
         if part not in self.datasets:
             raise ValueError(f"expected `setup` before the {part} loader, got no call; try `setup()`")
-        training = part == "train"
-        return problem_loader(
-            self.datasets[part],
+        training, dataset = part == "train", self.datasets[part]
+        group = distributed.is_available() and distributed.is_initialized()
+        sampler = BucketSampler(
+            dataset,
             batch_size=self.batch_size if training else self.eval_batch_size,
             shuffle=training,
             seed=self.seed,
-            num_workers=self.num_workers,
+            num_replicas=distributed.get_world_size() if group else 1,
+            rank=distributed.get_rank() if group else 0,
             max_cells=None if training else self.max_cells,
-            overfit=self.trainer is not None and self.trainer.overfit_batches > 0,  # type: ignore[attr-defined]
+        )
+        if self.trainer is not None and self.trainer.overfit_batches > 0:  # type: ignore[attr-defined]
+            batches: list[Any] = list(sampler)  # the same in every epoch; Lightning takes them in their order
+            return DataLoader(Subset(dataset, batches), batch_size=None, num_workers=self.num_workers)
+        return ProblemLoader(
+            dataset,
+            sampler=sampler,
+            batch_size=None,
+            num_workers=self.num_workers,
+            persistent_workers=self.num_workers > 0,
+            pin_memory=torch.cuda.is_available(),
+            generator=torch.Generator().manual_seed(self.seed),  # else every epoch draws from the global generator
         )
 
 

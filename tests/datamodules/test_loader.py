@@ -7,12 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from lightning import LightningDataModule
 from lightning.pytorch.callbacks import ModelCheckpoint
 from small_data import recorded
-from torch.utils.data import DataLoader
 
-from bpnp.datamodules.loader import BucketSampler, ProblemDataset, problem_loader
+from bpnp.datamodules.loader import BucketSampler, ProblemDataModule, ProblemDataset
 from bpnp.datamodules.problem import Counts, Problem, stacked
 from bpnp.types import Batch
 
@@ -37,8 +35,13 @@ class Numbered:
         return Problem(str(index), points2d, points3d, n, np.eye(3), np.ones(3), 800.0)
 
 
-def dataset(sizes: Sequence[int]) -> ProblemDataset:
-    return ProblemDataset(Numbered(sizes), fresh=True)
+class Problems(ProblemDataModule):
+    """20 problems to train on, and to test on."""
+
+    fresh = True
+
+    def _source(self, split: str, seed: tuple[int, int]) -> Numbered:
+        return Numbered(random_sizes(20))
 
 
 def random_sizes(count: int, *, largest: int = 400) -> list[int]:
@@ -47,7 +50,9 @@ def random_sizes(count: int, *, largest: int = 400) -> list[int]:
 
 
 def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options) -> BucketSampler:
-    return BucketSampler(dataset(sizes), rank=rank, num_replicas=replicas, seed=3, **options)
+    return BucketSampler(
+        ProblemDataset(Numbered(sizes), fresh=True), rank=rank, num_replicas=replicas, seed=3, **options
+    )
 
 
 def test_stacked_pairs_are_padded_and_masked() -> None:
@@ -114,14 +119,15 @@ def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int 
 
 
 def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    source = dataset(random_sizes(20))
-    whole = [batch.ids for batch in problem_loader(source, batch_size=4, shuffle=False, seed=1)]
+    data = Problems(batch_size=4)
+    data.setup("test")
+    whole = [batch.ids for batch in data.test_dataloader()]
     monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
     halves = []
     for rank in (0, 1):
         monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
-        halves.append([batch.ids for batch in problem_loader(source, batch_size=4, shuffle=False, seed=1)])
+        halves.append([batch.ids for batch in data.test_dataloader()])
     assert [a + b for a, b in zip(*halves, strict=True)] == whole
 
 
@@ -137,18 +143,15 @@ def test_errors_name_what_is_wrong() -> None:
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.filterwarnings("ignore")
 def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers: int) -> None:
-    class Problems(LightningDataModule):
-        def train_dataloader(self) -> DataLoader:
-            return problem_loader(dataset(random_sizes(14)), batch_size=4, shuffle=True, seed=3, num_workers=workers)
-
     def fit(*callbacks: ModelCheckpoint, checkpoint: Path | None = None) -> list[tuple[str, ...]]:
         """ "epoch:index" of each problem of each batch."""
         options = {"max_epochs": 2, "enable_checkpointing": bool(callbacks), "callbacks": list(callbacks)}
-        batches = recorded(Problems(), checkpoint=checkpoint, **options)
+        data = Problems(batch_size=6, seed=3, num_workers=workers)
+        batches = recorded(data, checkpoint=checkpoint, limit_val_batches=0, **options)
         return [tuple(f"{int(p[0, 0])}:{i}" for p, i in zip(b.points3d, b.ids, strict=True)) for b in batches]
 
     whole = fit(ModelCheckpoint(tmp_path, filename="{step}", save_top_k=-1, every_n_train_steps=1))
-    expected = sampler(random_sizes(14), batch_size=4, shuffle=True)
+    expected = sampler(random_sizes(20), batch_size=6, shuffle=True)
     planned = list(expected)
     expected.set_epoch(1)
     planned += list(expected)

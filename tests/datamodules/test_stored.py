@@ -11,8 +11,6 @@ from lightning import LightningDataModule
 
 import bpnp.datamodules
 from bpnp.datamodules import Problem, ProblemSource, StoredDataModule, write_problems
-from bpnp.datamodules.augment import Augmentation
-from bpnp.datamodules.loader import ProblemDataset, problem_loader
 from bpnp.datamodules.store import Store, StoreError, open_store
 from bpnp.datamodules.stored import PROBLEMS, StoredProblems, scene_rows, stored_problem
 
@@ -92,18 +90,18 @@ def test_small_pairs_are_left_out(store: Store) -> None:
 
 @pytest.mark.parametrize("num_workers", [0, 2])
 def test_every_pair_is_served_once_and_the_same(store: Store, num_workers: int) -> None:
-    dataset = ProblemDataset(
-        StoredProblems(store, np.arange(12), min_points=4), Augmentation(max_points=20, clutter=0.5)
-    )
-    loader = problem_loader(dataset, batch_size=5, shuffle=False, seed=0, num_workers=num_workers)
+    options = {"test_fraction": 1.0, "eval_max_points": 20, "clutter": 0.5, "batch_size": 5}
+    data = StoredDataModule(str(store.folder), num_workers=num_workers, **options)
+    data.setup("test")
     served, state = {}, torch.get_rng_state()
-    for batch in loader:
+    for batch in data.test_dataloader():
         for row, name in enumerate(batch.ids):
             served[name] = batch.points3d[row, batch.mask3d[row]]
     assert torch.equal(state, torch.get_rng_state())
     assert sorted(served) == sorted(problem.name for _, problem in problems())
     for i, (_, problem) in enumerate(problems()):
-        assert torch.equal(served[problem.name], pickle.loads(pickle.dumps(dataset)).problem(i).points3d[0])
+        alone = pickle.loads(pickle.dumps(data.datasets["test"])).problem(i)
+        assert torch.equal(served[problem.name], alone.points3d[0])
 
 
 def test_a_store_of_anyones_pairs_is_split_by_scene(store: Store) -> None:
