@@ -102,8 +102,8 @@ def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outco
         out.print(_table(records))
         cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
         say(f"camera: {', '.join(f'{source} ({count})' for source, count in cameras.items())}", to=out)
-    if count := len(outcome.kept):
-        say(f"kept {count} of {len(files)} photos, solved before with the same content and options", to=out)
+    if outcome.kept:
+        say(f"kept {len(outcome.kept)} of {len(files)} photos, solved before with the same content and options", to=out)
     for name, change in outcome.again.items():
         say(f"solved again, with {change}: {name}", to=out)
     if others := folder.of_other_maps():

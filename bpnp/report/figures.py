@@ -78,7 +78,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
 
 
 def _line_style(colour: int, dashes: int) -> dict[str, Any]:
-    """Matplotlib's options of a line from the indices of `styles`."""
+    """Matplotlib's options of a line from indices of the palette."""
     lengths = DASHES[dashes % len(DASHES)]
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
 

@@ -8,6 +8,7 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,11 +110,10 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photo:
 
 def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:
     """The rows of the table of quartiles, with the terminal's texts."""
-    rows, lines = run_rows(runs, paper), lines_of(runs)
+    rows = run_rows(runs, paper)
     best = best_texts(RESULT_COLUMNS, rows)
     shown = []
-    for i, row in enumerate(rows):
-        line = lines[i] if i < len(lines) else None
+    for row, line in zip_longest(rows, lines_of(runs)):
         texts = [(cell(column, row.values), row.values.get(column.key), column.key) for column in RESULT_COLUMNS]
         cells = [(text, value, bool(line) and text == best.get((row.problems, key))) for text, value, key in texts]
         shown.append(TableRow(row.name, line, cells))
