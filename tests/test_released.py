@@ -5,12 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from bpnp import Solution
 from bpnp.datamodules.store import StoreError, open_store
 from bpnp.examples import load
-from bpnp.models.weights import TrainedNet
 
 RELEASED = Path(__file__).parent / "released"
 
@@ -35,11 +33,3 @@ def test_a_store_of_the_last_release_is_refused_and_to_be_prepared_anew(tmp_path
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     with pytest.raises(StoreError, match="expected problems in format 4, got problems in format 3 .*try"):
         open_store(tmp_path, "problems")
-
-
-def test_a_checkpoint_of_the_last_release_is_refused_by_its_name(tmp_path: Path) -> None:
-    solver = {"class": "BPnPNet", "settings": {"channels": 128, "blocks": 12, "centre_features": True}}
-    weights = {"solver.features2d.enter.weight": torch.zeros(2)}
-    torch.save({"solver": solver, "state_dict": weights}, tmp_path / "old.ckpt")
-    with pytest.raises(ValueError, match=r"got one of an older form: .*old\.ckpt; try"):
-        TrainedNet.from_checkpoint(tmp_path / "old.ckpt")
