@@ -22,13 +22,8 @@ def data_for(recipe: str, folder: Path) -> list[str]:
             plant_model(folder / "scenes" / f"scene{i}" / "sparse" / "0", seed=i)
         return [*small, f"--data.root={folder / 'scenes'}"]
     if recipe.startswith("synthetic_maps"):
-        return [
-            *small,
-            "--data.num_points=30",
-            "--data.train_problems=4",
-            "--data.val_problems=2",
-            "--data.test_problems=2",
-        ]
+        few = {"num_points": 30, "train_problems": 4, "val_problems": 2, "test_problems": 2}
+        return [*small, *(f"--data.{name}={count}" for name, count in few.items())]
     small += ["--data.num_points=30", "--data.pool_size=64", "--data.train_problems=4", f"--data.cache_dir={folder}"]
     if recipe.startswith("quickstart"):
         return [*small, "--data.train_shapes=4", "--data.val_shapes=2", "--data.test_shapes=2"]

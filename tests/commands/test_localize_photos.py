@@ -101,17 +101,8 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         assert f"expected photos of {size} pixels as the camera has, got plain.jpg of 64 x 48" in error
     pairs = tmp_path / "pairs.txt"
     pairs.write_text("0004.jpg nowhere.jpg\n")
-    error = fails(
-        "localize",
-        str(model),
-        str(photos / "0004.jpg"),
-        "--camera",
-        CAMERA,
-        "--views",
-        str(pairs),
-        "--output",
-        str(tmp_path / "views"),
-    )
+    known = ("--camera", CAMERA, "--views", str(pairs), "--output", str(tmp_path / "views"))
+    error = fails("localize", str(model), str(photos / "0004.jpg"), *known)
     assert "expected names of views of the map, got nowhere.jpg" in error
     assert json.loads((tmp_path / "views/results.json").read_text())["photos"] == {}
 
@@ -171,17 +162,9 @@ def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     solution = bpnp.solve(example.points2d, example.points3d, example.camera)
     monkeypatch.setattr(SceneMap, "localize_photo", lambda *_, **__: solution)
     monkeypatch.setattr(BboxBase, "__array__", interrupted)
+    files = [str(tmp_path / part) for part in ("map", "a.png", "b.png")]
     with pytest.raises(SystemExit) as stop:
-        main(
-            [
-                "localize",
-                *(str(tmp_path / part) for part in ("map", "a.png", "b.png")),
-                "--camera",
-                "SIMPLE_PINHOLE,80,32,24",
-                "--output",
-                str(tmp_path / "out"),
-            ]
-        )
+        main(["localize", *files, "--camera", "SIMPLE_PINHOLE,80,32,24", "--output", str(tmp_path / "out")])
     assert stop.value.code == 130
     assert capsys.readouterr().err.splitlines()[-1] == "bpnp: interrupted; run it again to go on"
     kept = (path.relative_to(tmp_path / "out") for path in (tmp_path / "out").rglob("*.*"))
