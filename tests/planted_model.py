@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 WIDTH, HEIGHT = 800, 600
+PINHOLE = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 OPENCV = ("OPENCV", [520.0, 500.0, 405.0, 290.0, -0.28, 0.09, 0.004, -0.006])
 
 
@@ -67,3 +68,17 @@ def plant_model(
     folder.mkdir(parents=True, exist_ok=True)
     (model.write_text if text else model.write_binary)(folder)
     return truth
+
+
+def plant_keypoints(database: Path, truth: Planted, views: dict[str, int]) -> None:
+    """A database anew: photos by name, each taken where a view of the model was, with noise of 0.3 pixels."""
+    database.unlink(missing_ok=True)
+    rng = np.random.default_rng(0)
+    with pycolmap.Database.open(database) as content:
+        lens = pycolmap.Camera(camera_id=0, model=PINHOLE[0], width=WIDTH, height=HEIGHT, params=PINHOLE[1])
+        camera = content.write_camera(lens)
+        for name, k in views.items():
+            seen = truth.points3d[truth.seen[k]] @ truth.rotations[k].T + truth.translations[k]
+            pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300] + 0.3 * rng.normal(size=(len(seen), 2))
+            number = content.write_image(pycolmap.Image(name=name, camera_id=camera))
+            content.write_keypoints(number, pixels.astype(np.float32))

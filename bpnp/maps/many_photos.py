@@ -41,7 +41,6 @@ class PhotoTask:
     photo: Path
     arguments: Mapping[str, Any]
     made_with: Mapping[str, Any]
-    leave_one_out: bool = False
 
 
 Attempt = tuple[PhotoTask, Solution | str]  # a photo, and its solution or why it could not be tried
@@ -69,7 +68,7 @@ def photo_task(
     photo_content, source = content_of(photo), "--camera"
     if camera is None or isinstance(camera, SceneMap):
         camera, source = (camera or scene).camera_for(photo, exif=camera is None)
-        camera = UNKNOWN if camera is None else camera
+    lens = UNKNOWN if camera is None or isinstance(camera, str) else plain_camera(camera_from(camera))
     shown = None if views is None else list(views.get(name, ()))
     if shown is not None and not shown:
         raise ValueError(f"expected views for {name} in the file of views, got none; try without --views")
@@ -78,7 +77,6 @@ def photo_task(
         keypoints = keypoints.absolute()
         points = photo_keypoints(photo, keypoints, name)
         points_content = fingerprint([points.pixels.tolist(), points.scores.tolist()])
-    lens = UNKNOWN if camera == UNKNOWN else plain_camera(camera_from(camera))
     shared = {"views": shown, **search}
     made_with = {
         "photo": photo_content,
@@ -90,13 +88,13 @@ def photo_task(
         "leave_one_out": leave_one_out,
     }
     arguments = {"camera": lens, "keypoints": keypoints, "name": name, "solver": solver}
-    return PhotoTask(name, photo.absolute(), arguments | shared, made_with | shared, leave_one_out)
+    return PhotoTask(name, photo.absolute(), arguments | shared, made_with | shared)
 
 
 def attempt(scene: SceneMap, task: PhotoTask) -> Solution | str:
     """The solution of a photo, or why it could not be tried."""
     try:
-        place = scene.without([task.name]) if task.leave_one_out else scene
+        place = scene.without([task.name]) if task.made_with["leave_one_out"] else scene
         return place.localize_photo(task.photo, **task.arguments)
     except (ValueError, OSError) as error:
         return str(error)

@@ -5,7 +5,6 @@ import sqlite3
 from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -142,7 +141,10 @@ def read_features(file: Path, photo: str, size: Size | None = None) -> Keypoints
     size: of the photo in pixels, to check them by; by default `<photo>/image_size`, if the file has it.
     Raises ValueError, naming file and photo, if it is not in the file, of another size, or a keypoint lies outside it.
     """
-    h5py = _h5py()
+    try:
+        h5py = importlib.import_module("h5py")  # optional
+    except ImportError as error:
+        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error
     try:
         with h5py.File(file, "r") as content:
             if photo not in content or "keypoints" not in content[photo]:
@@ -169,9 +171,8 @@ def read_database(file: Path, photo: str, size: Size | None = None) -> Keypoints
     if these are damaged or lie outside the photo. (`pycolmap.Database` writes to every file that it opens.)
     """
     try:
-        mode = (
-            "mode=ro" if file.with_name(f"{file.name}-wal").exists() else "immutable=1"
-        )  # which leaves no file beside
+        logged = file.with_name(f"{file.name}-wal").exists()
+        mode = "mode=ro" if logged else "immutable=1"  # which leaves no file beside
         with closing(sqlite3.connect(f"{file.absolute().as_uri()}?{mode}", uri=True)) as content:
             row = content.execute(QUERY, (photo,)).fetchone()
             names = ", ".join(str(name) for (name,) in content.execute("SELECT name FROM images LIMIT 5"))
@@ -208,10 +209,3 @@ def _checked(keypoints: Keypoints, size: Size | None, where: str) -> Keypoints:
             f"outside, such as {keypoints.pixels[outside][0].round(1).tolist()}; try features of this size"
         )
     return keypoints._replace(size=known)
-
-
-def _h5py() -> ModuleType:
-    try:
-        return importlib.import_module("h5py")  # optional
-    except ImportError as error:
-        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error

@@ -296,11 +296,7 @@ class SceneMap:
         *,
         keypoints: str | Path | None = None,
         name: str | None = None,
-        views: Iterable[str] | None = None,
-        prior: PosePrior | None = None,
-        solver: str | Path | nn.Module = "auto",
-        seed: int = 0,
-        time_limit: float | int | None = None,
+        **options: Any,
     ) -> Solution:
         """The pose of a photo from its file, as `bpnp localize` finds it.
 
@@ -309,32 +305,24 @@ class SceneMap:
             size; "unknown" for an unknown focal length whatever EXIF says.
         keypoints: HDF5 file of hloc or COLMAP's database, which has those of the photo under its `name`, by default
             that of the file; None to detect SIFT keypoints.
-        views, prior, solver, seed, time_limit: as for `localize`.
+        options: views, prior, solver, seed and time_limit, as for `localize`.
         Raises ValueError for a photo that cannot be read, or of another size than its camera or keypoints, and as
         `localize`.
         """
         path = Path(photo)
         if camera is None or isinstance(camera, SceneMap):
             camera = (camera or self).camera_for(path, exif=camera is None)[0]
-        lens, size = None if camera in (None, UNKNOWN) else camera_from(camera), photo_size(path)
-        if lens is not None and (known := image_size_of(lens)) not in (None, size):
+        points, size = photo_keypoints(path, keypoints, path.name if name is None else name), photo_size(path)
+        if camera is None or isinstance(camera, str):
+            return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
+        lens = camera_from(camera)
+        if (known := image_size_of(lens)) not in (None, size):
             raise ValueError(
                 f"expected photos of {known[0]} x {known[1]} pixels as the camera has, got {path.name} of {size[0]} x "
                 f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
             )
-        points = photo_keypoints(path, keypoints, path.name if name is None else name)
         pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
-        return self.localize(
-            pixels,
-            lens,
-            image_size=size if lens is None else None,
-            views=views,
-            scores=points.scores,
-            prior=prior,
-            solver=solver,
-            seed=seed,
-            time_limit=time_limit,
-        )
+        return self.localize(pixels, lens, scores=points.scores, **options)
 
     def camera_for(self, photo: Path, *, exif: bool = True) -> tuple[Camera | None, str]:
         """The camera of a photo, and in words where it is from.
@@ -346,30 +334,25 @@ class SceneMap:
         size = width, height = photo_size(photo)
         if exif and (focal := focal_from_exif(photo)) is not None:
             return camera_from(("SIMPLE_PINHOLE", width, height, (focal, width / 2, height / 2))), "EXIF"
-        owners = {id(view.camera): view for view in reversed(self.views)}
+        owners = {id(view.camera): view for view in reversed(self.views)}  # the first view of each camera
         sizes = {key: image_size_of(view.camera) for key, view in owners.items()}
         fitting = [
-            (scaled_camera(owners[key].camera, size), owners[key].name)
+            (scaled_camera(owners[key].camera, size), f"view {owners[key].name} of the map")
             for key, known in sizes.items()
             if known == size or (not exif and known is not None and same_shape(known, size))
         ]
         fitting.sort(key=lambda item: item[0].focal)
-        low, high = (fitting[k][0].focal if fitting else math.inf for k in (0, -1))
-        if exif and not high <= SAME_FOCAL * low < math.inf:
+        if fitting and fitting[-1][0].focal <= SAME_FOCAL * fitting[0][0].focal:
+            return fitting[len(fitting) // 2]
+        if exif:
             return None, "unknown focal length"
-        if not fitting:
+        wanted = f"views of the shape of {photo} of {width} x {height} pixels with one focal length"
+        if fitting:
+            got = f"{len(fitting)} of {fitting[0][0].focal:.0f} to {fitting[-1][0].focal:.0f} pixels"
+        else:
             others = ", ".join(sorted({"{} x {}".format(*known) for known in sizes.values() if known})[:4])
-            raise ValueError(
-                f"expected views of the shape of {photo} of {width} x {height} pixels, got none: the map's are of "
-                f"{others}; try --camera with the camera of the photo, or unknown"
-            )
-        if high > SAME_FOCAL * low:
-            raise ValueError(
-                f"expected views of the shape of {photo} with one focal length, got {len(fitting)} of {low:.0f} to "
-                f"{high:.0f} pixels; try --camera with the camera of the photo, or unknown"
-            )
-        camera, name = fitting[len(fitting) // 2]
-        return camera, f"view {name} of the map"
+            got = f"none: the map's are of {others}"
+        raise ValueError(f"expected {wanted}, got {got}; try --camera with the camera of the photo, or unknown")
 
 
 def _near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownCamera:

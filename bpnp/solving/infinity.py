@@ -30,6 +30,7 @@ from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_to_one
 from bpnp.solving.problem import check_seen, unit_of
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
+from bpnp.solving.sources import Options
 
 FEWEST = 3  # two fix a rotation and are no evidence
 NOMINAL = 1e-3  # of the spread of bearings without a camera: what a pixel is taken to be
@@ -41,10 +42,7 @@ def solve_directions(
     camera: Any,
     unknown: UnknownCamera | None,
     scores2d: Any,
-    *,
-    inlier_threshold: float | None,
-    seed: int,
-    time_limit: float | None,
+    options: Options,
 ) -> Solution:
     """The rotation under which unit directions (n, 3) are seen at image points; arguments as for `bpnp.solve`.
 
@@ -54,7 +52,7 @@ def solve_directions(
     Raises ValueError for wrong shapes, fewer than 3 points, directions that are not unit vectors, pixels without a
     camera or the reverse.
     """
-    begun, deadline = Clock.now(), Deadline.after(time_limit)
+    begun, deadline = Clock.now(), Deadline.after(options.time_limit)
     image, scene = image_points(points2d), scene_points(directions)
     lens = unknown.reference if unknown is not None else None if camera is None else camera_from(camera)
     check_points("points2d", image, (2, 3) if lens is None else (2,), FEWEST)
@@ -64,7 +62,7 @@ def solve_directions(
     scores = checked_scores("scores2d", scores2d, len(image))
 
     def seen_by(lens: Camera | None, settings: InfinitySettings = DEFAULT) -> Solution:
-        solution = _seen_by(lens, image, scene, scores, unknown, inlier_threshold, seed, deadline, settings)
+        solution = _seen_by(lens, image, scene, scores, unknown, options, deadline, settings)
         return replace(solution, seconds=Clock.now() - begun)
 
     if unknown is None:
@@ -113,13 +111,13 @@ def _seen_by(
     scene: Array,
     scores: Array | None,
     unknown: UnknownCamera | None,
-    inlier_threshold: float | None,
-    seed: int,
+    options: Options,
     deadline: Deadline,
     settings: InfinitySettings,
 ) -> Solution:
     """The rotation of a camera, which is one of the `unknown` ones where the focal length is looked for."""
     bearings, plane, pixel = _bearings(image, lens)
+    inlier_threshold = options.inlier_threshold
     usable = np.flatnonzero(np.isfinite(bearings).all(-1) & np.isfinite(pixel))
     check_seen(usable, image, FEWEST)
     bearings, pixel = np.ascontiguousarray(bearings[usable]), np.ascontiguousarray(pixel[usable])
@@ -133,7 +131,7 @@ def _seen_by(
             scores=None if scores is None else scores[usable],
             noise=noise if settings is DEFAULT else None,
             zooms=0.0 if unknown is None else math.log(unknown.largest / unknown.smallest),
-            seed=seed,
+            seed=options.seed,
             deadline=deadline,
             settings=settings,
         )

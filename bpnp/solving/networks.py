@@ -21,9 +21,7 @@ if TYPE_CHECKING:
     from bpnp.models.matcher import Matcher
 
 VIEW_MATCHER, SCENE_MATCHER = "matcher-maps", "matcher-sfm"  # packaged weights of the frames "view" and "any"
-MOST_CELLS = (
-    2**22
-)  # of an assignment, 2D points x 3D points: seconds of a matcher, whose time and memory grow with them
+MOST_CELLS = 2**22  # of an assignment, 2D points x 3D points, with which a matcher's time and memory grow: seconds
 ESTIMATES = ("refined", "ransac", "pnp")  # of a prediction, the one to trust most first
 DRAWN = 80_000  # triples of an assignment; one match in fifty is right, one triple in 10^5, but some nearly are
 NET_SIGMA_DEG, NET_SIGMA_SHIFT = 10.0, 0.1  # of a net's pose; the latter of its distance from the scene

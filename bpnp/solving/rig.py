@@ -6,7 +6,7 @@ cameras together, for each of them proposes poses from its own triples.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -30,6 +30,7 @@ from bpnp.solving.arguments import Array, Labels, about, checked_pose, each_came
 from bpnp.solving.matches import SCALES, one_to_one, without_pose
 from bpnp.solving.problem import Problem, problem_from
 from bpnp.solving.solution import Candidate, Solution, with_pose
+from bpnp.solving.sources import Options
 
 Pose = tuple[Array, Array]
 PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all cameras that are refined
@@ -42,17 +43,11 @@ def solve_rig(
     points3d: Any,
     camera: Any,
     rig: Sequence[Any],
-    *,
-    normals3d: Any,
-    labels2d: Any,
-    labels3d: Any,
-    inlier_threshold: float | None,
-    clutter: float | None,
-    seed: int,
-    time_limit: float | None,
+    known: Mapping[str, Any],
+    options: Options,
 ) -> Solution:
-    """`bpnp.solve` with a `rig`: the pose rig_from_world."""
-    begun, deadline = Clock.now(), Deadline.after(time_limit)
+    """`bpnp.solve` with a `rig`: the pose rig_from_world. known: normals and labels."""
+    begun, labels2d = Clock.now(), known["labels2d"]
     mounts = [_mount(f"rig[{k}]", mount) for k, mount in enumerate(rig)]
     images = each_set("points2d", points2d, None)
     for name, values in (("points2d", images), ("camera", camera), ("labels2d", labels2d)):
@@ -62,14 +57,12 @@ def solve_rig(
     for k, one in enumerate(each_camera(camera, len(mounts))):
         lens = None if one is None else camera_from(one)
         with about(f"camera {k}"):
-            problems.append(
-                problem_from(images[k], points3d, lens, normals3d=normals3d, labels2d=labels[k], labels3d=labels3d)
-            )
+            problems.append(problem_from(images[k], points3d, lens, **{**known, "labels2d": labels[k]}))
     for problem in problems:
         if problem.degenerate is not None:
-            return without_pose(problems[0], problem.degenerate, inlier_threshold)
+            return without_pose(problems[0], problem.degenerate, options.inlier_threshold)
     cameras = Rig(problems, mounts)
-    solution = _finished(cameras, search_rig(cameras, clutter, seed, deadline), inlier_threshold)
+    solution = _finished(cameras, search_rig(cameras, options), options.inlier_threshold)
     return replace(solution, seconds=Clock.now() - begun)
 
 
@@ -155,9 +148,10 @@ class Rig:
         return np.asarray(np.linalg.inv(information), np.float64) if np.linalg.matrix_rank(information) == 6 else None
 
 
-def search_rig(rig: Rig, clutter: float | None, seed: int, deadline: Deadline) -> SearchResult:
+def search_rig(rig: Rig, options: Options) -> SearchResult:
     """Distinct poses of the rig, best first, and the verdict on the first one."""
     rotations, translations, hits, sure, exhaustive = [], [], [], [], True
+    deadline = Deadline.after(options.time_limit)
     for k, sets in enumerate(rig.sets):
         until = Deadline((Deadline.after(0.0).at * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k))
         if is_enumerable(sets):
@@ -167,7 +161,7 @@ def search_rig(rig: Rig, clutter: float | None, seed: int, deadline: Deadline) -
             exhaustive &= poses.ended == "exhausted"
             proposed, starts = (poses.rotation, poses.translation), np.zeros(len(poses.rotation), np.int64)
         else:
-            result = search_poses(sets, clutter=clutter, seed=seed, deadline=until)
+            result = search_poses(sets, clutter=options.clutter, seed=options.seed, deadline=until)
             found, exhaustive = result.candidates, False
             proposed, starts = (found.rotation, found.translation), found.hits
             sure += [rig.rig_of(k, found.rotation[:1], found.translation[:1])] * (result.verdict == "confident")

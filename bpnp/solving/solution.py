@@ -274,14 +274,9 @@ def _plain(value: Any) -> Any:
     return value
 
 
-LATER = {"covariance", "taken2d"}
-
-
 def _read(kind: type, content: dict[str, Any]) -> Any:
-    """A dataclass of this file from its JSON. Files of version 0.1.0 lack fields whose default is None, and `LATER`."""
-    missing = [field for field in fields(kind) if field.name not in content]
-    optional = [field.name for field in missing if field.default is None or field.name in LATER]
-    values = {f.name: content[f.name] for f in fields(kind) if f.name not in optional}
+    """A dataclass of this file from its JSON; files of version 0.1.0 lack fields that have a default."""
+    values = {field.name: content[field.name] for field in fields(kind) if field.name in content}
     return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
 
 

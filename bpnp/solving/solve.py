@@ -118,11 +118,12 @@ def solve(
     """
     normals_and_labels: dict[str, Any] = {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
     scores: dict[str, Any] = {"scores2d": scores2d, "scores3d": scores3d}
-    rules: dict[str, Any] = {
-        "inlier_threshold": positive("inlier_threshold", inlier_threshold, finite=True),
-        "seed": seed,
-        "time_limit": positive("time_limit", SECONDS if time_limit is None else time_limit),
-    }
+    options = Options(
+        inlier_threshold=positive("inlier_threshold", inlier_threshold, finite=True),
+        clutter=clutter,
+        seed=seed,
+        time_limit=positive("time_limit", SECONDS if time_limit is None else time_limit),
+    )
     beside: dict[str, Any] = {
         "solver": None if solver in ("auto", "search") else solver,
         "prior": prior,
@@ -133,11 +134,11 @@ def solve(
         _refuse(normals_and_labels | beside, "at_infinity")
         rough = image_size is not None or focal_error is not None
         unknown = unknown_camera(camera, image_size, focal_error) if rough else None
-        return solve_directions(pixels_from(points2d, camera), points3d, camera, unknown, scores2d, **rules)
+        return solve_directions(pixels_from(points2d, camera), points3d, camera, unknown, scores2d, options)
     if rig is not None:
         lens = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion or None}
         _refuse(scores | beside | lens, "rig")
-        return solve_rig(points2d, points3d, camera, rig, clutter=clutter, **normals_and_labels, **rules)
+        return solve_rig(points2d, points3d, camera, rig, normals_and_labels, options)
     arrays: dict[str, Any] = {name: [values] for name, values in (normals_and_labels | scores).items()}
     return solve_many(
         [points2d],
@@ -148,11 +149,13 @@ def solve(
         distortion=distortion,
         solver=solver,
         prior=prior,
+        inlier_threshold=inlier_threshold,
         clutter=clutter,
+        seed=seed,
+        time_limit=options.time_limit,
         device=device,
         progress=progress,
         **arrays,
-        **rules,
     )[0]
 
 

@@ -75,7 +75,7 @@ def solutions_of(problems: Mapping[int, Problem], options: Options) -> dict[int,
         return solutions | dict(_by_module(evaluation_copy(options.solver, options.device), solvable, options))
     if copies:  # a process would copy the networks
         return solutions | {i: _by_search(i, problem, options) for i, problem in solvable.items()}
-    return solutions | dict(_by_searches(solvable, options))
+    return solutions | (dict(_by_searches(solvable, options)) if solvable else {})
 
 
 def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[tuple[int, Solution]]:
@@ -83,15 +83,12 @@ def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[
 
     The first one is solved here: it compiles what all need, and tells how long one takes.
     """
-    waiting = list(problems)
-    seconds = 0.0
-    for i in waiting[:1]:
-        solution = _by_search(i, problems[i], options)
-        seconds = solution.seconds * (len(waiting) - 1)
-        yield i, solution
-    waiting = waiting[1:]
+    first, *waiting = problems
+    solution = _by_search(first, problems[first], options)
+    yield first, solution
     workers = 1 if multiprocessing.current_process().daemon else torch.get_num_threads()  # which may have no children
-    if workers > 1 and len(waiting) > 1 and seconds > WORTH_FORKING and options.progress is None:
+    pays = len(waiting) > 1 and solution.seconds * len(waiting) > WORTH_FORKING
+    if workers > 1 and pays and options.progress is None:
         yield from in_processes(lambda i: _by_search(i, problems[i], options), waiting, workers)
     else:
         yield from ((i, _by_search(i, problems[i], options)) for i in waiting)

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 import pytest
 from PIL import Image
-from planted_model import HEIGHT, WIDTH, Planted, plant_model
+from planted_model import HEIGHT, PINHOLE, WIDTH, Planted, plant_keypoints, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap, Solution
 from bpnp.cli import main
 from bpnp.maps.many_photos import PhotoTask, SolutionFolder, attempt, photo_task
-
-CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
 
 @dataclass
@@ -47,17 +44,7 @@ class Place:
 
     def write(self, views: dict[str, int]) -> None:
         """The database anew: the photo was taken where this view of the map was."""
-        (self.folder / "database.db").unlink(missing_ok=True)
-        rng = np.random.default_rng(0)
-        with pycolmap.Database.open(self.folder / "database.db") as content:
-            lens = pycolmap.Camera(camera_id=0, model=CAMERA[0], width=WIDTH, height=HEIGHT, params=CAMERA[1])
-            camera = content.write_camera(lens)
-            for name, k in views.items():
-                points = self.truth.points3d[self.truth.seen[k]]
-                seen = points @ self.truth.rotations[k].T + self.truth.translations[k]
-                pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300] + 0.3 * rng.normal(size=(len(seen), 2))
-                number = content.write_image(pycolmap.Image(name=name, camera_id=camera))
-                content.write_keypoints(number, pixels.astype(np.float32))
+        plant_keypoints(self.folder / "database.db", self.truth, views)
 
 
 def shot(path: Path, shade: int) -> None:
@@ -66,7 +53,7 @@ def shot(path: Path, shade: int) -> None:
 
 @pytest.fixture
 def place(tmp_path: Path) -> Place:
-    truth = plant_model(tmp_path / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    truth = plant_model(tmp_path / "map", camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
     made = Place(tmp_path, truth)
     made.write({"a.png": 0, "b.png": 1})
     shot(tmp_path / "a.png", 0)
@@ -114,7 +101,7 @@ def test_a_photo_that_was_overwritten_is_another_one(place: Place, capsys: pytes
 
 def test_a_map_that_was_rebuilt_has_another_frame(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
     place.run("a.png", "b.png")
-    place.truth = plant_model(place.folder / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15, seed=5)
+    place.truth = plant_model(place.folder / "map", camera=PINHOLE, images=3, points=140, seen=90, clutter=15, seed=5)
     place.write({"a.png": 0})
     place.run("a.png")
     shown = capsys.readouterr().out
@@ -141,7 +128,7 @@ def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_chang
     scene = SceneMap.from_colmap(place.folder / "map")
 
     def task(name: str, *views: str) -> PhotoTask:
-        options = {"camera": CAMERA, "keypoints": place.folder / "database.db", "solver": "search", "seed": 0}
+        options = {"camera": PINHOLE, "keypoints": place.folder / "database.db", "solver": "search", "seed": 0}
         lines = {"a.png": views, "b.png": ["photo 1.jpg"]}
         return photo_task(scene, name, place.folder / name, map_content="this", views=lines, **options)
 

@@ -6,19 +6,17 @@ import numpy as np
 import pytest
 import torch
 from planted import degrees_between
-from planted_model import Planted, plant_model
+from planted_model import PINHOLE, Planted, plant_model
 from scipy.spatial.transform import Rotation
 
 from bpnp import PosePrior, SceneMap, Solution
 from bpnp.maps.localize import BRIEF
 
-CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
-
 
 @pytest.fixture(scope="module")
 def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneMap, Planted]:
     folder = tmp_path_factory.mktemp("map")
-    truth = plant_model(folder, camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    truth = plant_model(folder, camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
     return SceneMap.from_colmap(folder), truth
 
 
@@ -44,7 +42,7 @@ def assert_right(solution: Solution, truth: Planted, number: int, ids: np.ndarra
 def test_a_photo_near_a_given_view(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, ids = photo_of(truth, 1)
-    solution = scene.localize(keypoints, CAMERA, views=["photo 1.jpg"])
+    solution = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     assert_right(solution, truth, 1, ids)
     assert solution.view == "photo 1.jpg"
     assert solution.verdict == "confident"
@@ -53,13 +51,15 @@ def test_a_photo_near_a_given_view(planted: tuple[SceneMap, Planted]) -> None:
 def test_a_photo_somewhere_in_the_map(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, ids = photo_of(truth, 2)
-    assert_right(scene.localize(keypoints, CAMERA), truth, 2, ids)
+    assert_right(scene.localize(keypoints, PINHOLE), truth, 2, ids)
 
 
 def test_matches_and_their_places_name_the_same_points(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
-    solution = scene.localize(photo_of(truth, 0)[0], CAMERA, views=["photo 0.jpg"])
+    solution = scene.localize(photo_of(truth, 0)[0], PINHOLE, views=["photo 0.jpg", "photo 2.jpg"])
     assert solution.point_ids is not None
+    of_both = np.union1d(truth.seen[0], truth.seen[2]) + 1
+    np.testing.assert_array_equal(solution.point_ids, np.intersect1d(of_both, scene.point_ids))
     np.testing.assert_array_equal(solution.point_ids[solution.match_places[:, 1]], solution.matches[:, 1])
     again = Solution.from_json(solution.to_json())
     assert again.view == "photo 0.jpg"
@@ -74,7 +74,7 @@ def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     scores = (ids > 0).astype(float)
     monkeypatch.setattr("bpnp.maps.localize.MOST_KEYPOINTS", 90)
     shuffled = np.random.default_rng(0).permutation(len(ids))
-    solution = scene.localize(keypoints[shuffled], CAMERA, views=["photo 1.jpg"], scores=scores[shuffled])
+    solution = scene.localize(keypoints[shuffled], PINHOLE, views=["photo 1.jpg"], scores=scores[shuffled])
     assert_right(solution, truth, 1, ids[shuffled])
     np.testing.assert_allclose(solution.points2d, (keypoints[shuffled] - [400, 300]) / 520)
 
@@ -96,7 +96,7 @@ def test_a_prior_says_on_which_side_the_photo_was_taken(planted: tuple[SceneMap,
     pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
     for rotation, translation in poses:
         prior = PosePrior(rotation, translation, 5.0, 0.3)
-        found = twins.localize(pixels, CAMERA, prior=prior, solver="search", time_limit=20)
+        found = twins.localize(pixels, PINHOLE, prior=prior, solver="search", time_limit=20)
         assert degrees_between(found.rotation, rotation) < 1
 
 
@@ -107,7 +107,7 @@ def test_the_solver_that_is_asked_for_solves(planted: tuple[SceneMap, Planted]) 
 
     scene, truth = planted
     with pytest.raises(RuntimeError, match="was asked"):
-        scene.localize(photo_of(truth, 0)[0], CAMERA, solver=Refuses())
+        scene.localize(photo_of(truth, 0)[0], PINHOLE, solver=Refuses())
 
 
 def test_the_seed_decides_where_nothing_else_does(
@@ -117,7 +117,7 @@ def test_the_seed_decides_where_nothing_else_does(
     monkeypatch.setattr("bpnp.maps.scene_map.LONGER", BRIEF)
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (90, 2))
     guesses = [
-        scene.localize(noise, CAMERA, views=["photo 0.jpg"], solver="search", seed=seed, time_limit=1e5)
+        scene.localize(noise, PINHOLE, views=["photo 0.jpg"], solver="search", seed=seed, time_limit=1e5)
         for seed in (0, 0, 1)
     ]
     np.testing.assert_array_equal(guesses[0].rotation, guesses[1].rotation)
@@ -128,25 +128,27 @@ def test_keypoints_of_another_place_are_never_confident(planted: tuple[SceneMap,
     scene, _ = planted
     for seed in range(3):
         noise = np.random.default_rng(seed).uniform((0, 0), (800, 600), (90, 2))
-        assert scene.localize(noise, CAMERA, time_limit=3).verdict != "confident"
+        assert scene.localize(noise, PINHOLE, time_limit=3).verdict != "confident"
 
 
 def test_a_view_of_too_few_points_is_passed_over(planted: tuple[SceneMap, Planted]) -> None:
     scene, _ = planted
     poor = replace(scene.views[2], points=scene.views[2].points[:3])
     noise = np.random.default_rng(0).uniform((0, 0), (800, 600), (40, 2))
-    solution = replace(scene, views=(scene.views[0], poor)).localize(noise, CAMERA, solver="search", time_limit=2)
+    solution = replace(scene, views=(scene.views[0], poor)).localize(noise, PINHOLE, solver="search", time_limit=2)
     assert solution.verdict == "failed"
     with pytest.raises(ValueError, match="expected a map with views that see 4 or more points, got none"):
-        replace(scene, views=(poor,)).localize(noise, CAMERA)
+        replace(scene, views=(poor,)).localize(noise, PINHOLE)
 
 
 def test_bad_input_is_one_clear_error(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
     keypoints, _ = photo_of(truth, 0)
-    with pytest.raises(ValueError, match="expected names of views of the map, got nowhere"):
-        scene.localize(keypoints, CAMERA, views=["nowhere"])
+    with pytest.raises(ValueError, match=r"expected names of views of the map, got nowhere; try photo 0\.jpg"):
+        scene.localize(keypoints, PINHOLE, views=["nowhere"])
+    with pytest.raises(ValueError, match="got none; try views=None"):
+        scene.localize(keypoints, PINHOLE, views=[])
     with pytest.raises(ValueError, match=r"expected `scores` of shape \(105,\), one a keypoint, got \(3,\)"):
-        scene.localize(keypoints, CAMERA, scores=[1, 2, 3])
+        scene.localize(keypoints, PINHOLE, scores=[1, 2, 3])
     with pytest.raises(ValueError, match="expected a positive `time_limit`, got 0"):
-        scene.localize(keypoints, CAMERA, time_limit=0)
+        scene.localize(keypoints, PINHOLE, time_limit=0)

@@ -4,22 +4,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from planted_model import plant_model
+from planted_model import PINHOLE, plant_model
 
 from bpnp import SceneMap
 from bpnp.maps.localized_picture import BOUND, draw_from_above, draw_matches
-
-CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
 
 def test_matches_have_the_colour_of_their_residual_and_the_camera_stands_where_it_was_planted(tmp_path: Path) -> None:
     from matplotlib.figure import Figure
 
-    truth = plant_model(tmp_path, camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    truth = plant_model(tmp_path, camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
     scene = SceneMap.from_colmap(tmp_path)
     pixels = 520 * truth.points2d[1] + [400, 300] + np.random.default_rng(0).normal(0, 0.5, truth.points2d[1].shape)
     keypoints = np.concatenate([pixels, truth.clutter_px[1]])
-    solution = scene.localize(keypoints, CAMERA, views=["photo 1.jpg"])
+    solution = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     assert solution.verdict == "confident"
 
     image, above = Figure().subplots(1, 2)

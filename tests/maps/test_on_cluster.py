@@ -9,11 +9,10 @@ from typing import Any
 
 import numpy as np
 import psutil
-import pycolmap
 import pytest
 from distributed import Client, LocalCluster
 from PIL import Image
-from planted_model import HEIGHT, WIDTH, plant_model
+from planted_model import HEIGHT, PINHOLE, WIDTH, plant_keypoints, plant_model
 
 from bpnp import SceneMap, Solution
 from bpnp.cli import main
@@ -21,7 +20,6 @@ from bpnp.maps.many_photos import PhotoTask, attempts, photo_task
 from bpnp.maps.on_cluster import attempts_on_cluster
 from bpnp.maps.photos import photo_files
 
-CAMERA = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 PHOTOS = 6
 VIEWS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}
 
@@ -30,19 +28,11 @@ VIEWS = {f"new{k}.png": [f"photo {k % 3}.jpg"] for k in range(PHOTOS)}
 def place(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, Path]:
     """A map, photos without content, and the database with their keypoints; photo k was taken near view k modulo 3."""
     folder = tmp_path_factory.mktemp("place")
-    truth = plant_model(folder / "map", camera=CAMERA, images=3, points=140, seen=90, clutter=15)
+    truth = plant_model(folder / "map", camera=PINHOLE, images=3, points=140, seen=90, clutter=15)
     (folder / "photos").mkdir()
-    rng = np.random.default_rng(0)
-    with pycolmap.Database.open(folder / "database.db") as content:
-        lens = pycolmap.Camera(camera_id=0, model=CAMERA[0], width=WIDTH, height=HEIGHT, params=CAMERA[1])
-        camera = content.write_camera(lens)
-        for k in range(PHOTOS):
-            name = f"new{k}.png"
-            Image.new("L", (WIDTH, HEIGHT)).save(folder / "photos" / name)
-            seen = truth.points3d[truth.seen[k % 3]] @ truth.rotations[k % 3].T + truth.translations[k % 3]
-            pixels = 520 * seen[:, :2] / seen[:, 2:] + [400, 300] + 0.3 * rng.normal(size=(len(seen), 2))
-            number = content.write_image(pycolmap.Image(name=name, camera_id=camera))
-            content.write_keypoints(number, pixels.astype(np.float32))
+    for k in range(PHOTOS):
+        Image.new("L", (WIDTH, HEIGHT)).save(folder / "photos" / f"new{k}.png")
+    plant_keypoints(folder / "database.db", truth, {f"new{k}.png": k % 3 for k in range(PHOTOS)})
     return folder / "map", folder / "photos", folder / "database.db"
 
 
@@ -54,7 +44,7 @@ def cluster() -> Iterator[LocalCluster]:
 
 def tasks(place: tuple[Path, Path, Path], scene: SceneMap, **options: Any) -> list[PhotoTask]:
     _, photos, database = place
-    chosen = {"camera": CAMERA, "keypoints": database, "seed": 0, "time_limit": None, **options}
+    chosen = {"camera": PINHOLE, "keypoints": database, "seed": 0, "time_limit": None, **options}
     return [photo_task(scene, name, photo, **chosen) for name, photo in photo_files([photos]).items()]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pycolmap
 import pytest
 from PIL import Image
-from planted_model import HEIGHT, WIDTH, plant_model
+from planted_model import HEIGHT, PINHOLE, WIDTH, plant_model
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
@@ -23,7 +23,6 @@ TAGS = {
 }
 # 5 mm on a sensor of 4 mm x 3 mm with 1000 pixels a mm: 5,000 pixels of 4,000; the same as 43.27 mm on film.
 TAKEN = {"FocalLength": 5.0, "FocalPlaneXResolution": 25400.0, "PixelXDimension": 4000, "PixelYDimension": 3000}
-PINHOLE = ("PINHOLE", [520.0, 520.0, 400.0, 300.0])
 
 
 def photo_with(path: Path, size: tuple[int, int] = (400, 300), **tags: float) -> Path:

@@ -1,7 +1,5 @@
 """Maps are read with the points, tracks and views that the model has, whichever its form."""
 
-import struct
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +8,6 @@ import pytest
 from planted_model import OPENCV, Planted, plant_model
 
 from bpnp import SceneMap
-from bpnp.cameras import camera_from
 from bpnp.maps.many_photos import read_views
 
 
@@ -52,27 +49,6 @@ def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -
     assert len(scene.views) == 4
 
 
-def test_every_view_is_looked_near_with_its_own_points(planted: tuple[Path, Planted]) -> None:
-    scene = SceneMap.from_colmap(planted[0])
-    places = scene.places(None, np.zeros((4, 2)), camera_from(np.eye(3)))
-    assert sorted(place.view.name for place in places) == [view.name for view in scene.views]
-    for view, points, _ in places:
-        np.testing.assert_array_equal(points, view.points)
-
-
-def test_views_are_found_by_their_names(planted: tuple[Path, Planted]) -> None:
-    scene = SceneMap.from_colmap(planted[0])
-    named = partial(scene.places, keypoints=np.zeros((4, 2)), lens=camera_from(np.eye(3)))
-    places = named(["photo 2.jpg", "photo 0.jpg"])
-    assert [place.view.name for place in places] == ["photo 2.jpg", "photo 0.jpg"]
-    for place in places:
-        np.testing.assert_array_equal(place.points, np.union1d(scene.views[2].points, scene.views[0].points))
-    with pytest.raises(ValueError, match=r"expected names of views of the map, got a\.jpg; try photo 0\.jpg"):
-        named(["photo 0.jpg", "a.jpg"])
-    with pytest.raises(ValueError, match="got none; try views=None"):
-        named([])
-
-
 def test_views_of_a_retrieval(tmp_path: Path) -> None:
     path = tmp_path / "pairs.txt"
     path.write_text("q1.jpg db/a.jpg\nq2.jpg db/b.jpg\n\nq1.jpg db/c.jpg\n")
@@ -85,17 +61,7 @@ def test_views_of_a_retrieval(tmp_path: Path) -> None:
 
 
 def test_a_map_without_views_is_one_clear_error(tmp_path: Path) -> None:
-    plant_model(tmp_path)
-    images = tmp_path / "images.bin"
-    content = bytearray(images.read_bytes())
-    whole, offset = bytes(content), 8
-    for _ in range(struct.unpack_from("<Q", whole)[0]):  # no keypoint has a point
-        offset = whole.index(b"\0", offset + 64) + 1
-        (count,) = struct.unpack_from("<Q", whole, offset)
-        for i in range(count):
-            struct.pack_into("<q", content, offset + 8 + 24 * i + 16, -1)
-        offset += 8 + 24 * count
-    images.write_bytes(content)
+    plant_model(tmp_path, seen=0)
     with pytest.raises(ValueError, match="expected a map with views that see points"):
         SceneMap.from_colmap(tmp_path)
 

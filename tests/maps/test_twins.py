@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from planted import degrees_between
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
@@ -64,10 +65,6 @@ def photo(rng: np.random.Generator, points: Array, normals: Array, rotation: Arr
     return np.concatenate([pixels + rng.normal(0, 0.5, pixels.shape), clutter])
 
 
-def degrees_off(rotation: Array, truth: Array) -> float:
-    return float(np.degrees(Rotation.from_matrix(rotation @ truth.T).magnitude()))
-
-
 OPPOSITE, ADJACENT = (0.0, 180.0), (0.0, 90.0)
 
 
@@ -81,7 +78,7 @@ def test_a_face_that_is_printed_like_another_one_is_never_taken_for_it(turns: tu
     keypoints = photo(rng, points, normals, *pose)
     solution = map_of(points, normals).localize(keypoints, CAMERA, seed=seed)
     assert solution.verdict == "confident"  # the 40 points that differ are enough to tell
-    assert degrees_off(solution.rotation, pose[0]) < 1
+    assert degrees_between(solution.rotation, pose[0]) < 1
 
 
 @pytest.mark.parametrize("turns", [OPPOSITE, ADJACENT])
@@ -99,7 +96,7 @@ def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_can
     assert solution.verdict == "ambiguous"
     assert "elsewhere in the map, explains the image points about as well" in solution.reason
     twin = pose[0] @ about_y(turns[1]).T
-    off = [min(degrees_off(one.rotation, truth) for one in solution.candidates[:2]) for truth in (pose[0], twin)]
+    off = [min(degrees_between(one.rotation, truth) for one in solution.candidates[:2]) for truth in (pose[0], twin)]
     assert max(off) < 1
     np.testing.assert_array_equal(solution.candidates[0].rotation, solution.rotation)
 
@@ -111,7 +108,7 @@ def test_a_box_whose_faces_differ_stays_confident(seed: int) -> None:
     pose = pose_at(90.0 * seed + 5, 4.2, -3.0)
     solution = map_of(points, normals).localize(photo(rng, points, normals, *pose), CAMERA, seed=seed)
     assert solution.verdict == "confident"
-    assert degrees_off(solution.rotation, pose[0]) < 1
+    assert degrees_between(solution.rotation, pose[0]) < 1
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -136,7 +133,7 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     pixels = photo(rng, points, normals, rotation, translation)
     solution = twice.localize(pixels, CAMERA, solver="search", seed=seed, time_limit=60)
     assert solution.verdict == "ambiguous"
-    found = [degrees_off(one.rotation, rotation) for one in solution.candidates[:2]]
-    other = [degrees_off(one.rotation, rotation @ turn.T) for one in solution.candidates[:2]]
+    found = [degrees_between(one.rotation, rotation) for one in solution.candidates[:2]]
+    other = [degrees_between(one.rotation, rotation @ turn.T) for one in solution.candidates[:2]]
     assert min(found) < 1
     assert min(other) < 1

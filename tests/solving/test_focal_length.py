@@ -1,13 +1,13 @@
 """Pose and focal length together, on planted points and cameras."""
 
 import json
-import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from planted import degrees_between
 from planted_model import HEIGHT, WIDTH, plant_model
 from scipy.spatial.transform import Rotation
 
@@ -34,10 +34,6 @@ def planted(
     return pixels[order], scene, rotation
 
 
-def turned(one: Array, other: Array) -> float:
-    return math.degrees(2 * math.asin(min(1.0, float(np.linalg.norm(one - other)) / math.sqrt(8))))
-
-
 @pytest.fixture(scope="module")
 def found() -> tuple[Solution, Array]:
     pixels, scene, rotation = planted(900.0)
@@ -46,7 +42,7 @@ def found() -> tuple[Solution, Array]:
 
 def test_pose_and_focal_length_are_found_together(found: tuple[Solution, Array]) -> None:
     solution, rotation = found
-    assert turned(solution.rotation, rotation) < 0.5
+    assert degrees_between(solution.rotation, rotation) < 0.5
     assert abs(solution.focal_length - 900) < 4 * solution.focal_length_std < 120
     assert solution.verdict == "confident"
     assert solution.covariance.shape == (7, 7)
@@ -67,7 +63,7 @@ def test_the_verdict_pays_for_the_focal_length(found: tuple[Solution, Array]) ->
 def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:
     pixels, scene, rotation = planted(700.0, depth=0.0)
     solution = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
-    assert turned(solution.rotation, rotation) < 10
+    assert degrees_between(solution.rotation, rotation) < 10
     assert solution.verdict == "ambiguous"
     assert not solution.focal_length_std < 0.05 * solution.focal_length
 
@@ -79,7 +75,7 @@ def test_a_rough_focal_length_is_a_prior() -> None:
     stds = []
     for error in (0.02, 0.2):
         solution = solve(pixels, scene, camera, focal_error=error, solver="search", time_limit=LIMIT)
-        assert turned(solution.rotation, rotation) < 3
+        assert degrees_between(solution.rotation, rotation) < 3
         stds.append(solution.focal_length_std / solution.focal_length)
     assert stds[0] < 0.021
     assert stds[1] > stds[0]
@@ -89,7 +85,7 @@ def test_a_radial_coefficient_is_found_where_the_points_support_one() -> None:
     for radial in (-0.3, 0.0):
         pixels, scene, rotation = planted(600.0, points=150, radial=radial, distance=3.0)
         solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
-        assert turned(solution.rotation, rotation) < 1
+        assert degrees_between(solution.rotation, rotation) < 1
         coefficient = json.loads(solution.to_json())["camera"]["params"][3]
         assert coefficient == pytest.approx(radial, abs=0.1)
         assert (coefficient == 0) == (radial == 0)
@@ -121,7 +117,7 @@ def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
     scene, pixels = SceneMap.from_colmap(tmp_path), 520 * truth.points2d[0] + [WIDTH / 2, HEIGHT / 2]
     solution = scene.localize(pixels, image_size=(WIDTH, HEIGHT), views=["photo 0.jpg"], solver="search")
     assert solution.focal_length == pytest.approx(520, rel=0.01)
-    assert turned(solution.rotation, truth.rotations[0]) < 0.1
+    assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
     with pytest.raises(ValueError, match="or `image_size` where the focal length is unknown, got neither"):
         scene.localize(pixels)
 
@@ -133,5 +129,5 @@ def test_the_command_takes_the_size_of_the_image(tmp_path: Path, capsys: pytest.
     files = [str(tmp_path / "image.csv"), str(tmp_path / "scene.csv")]
     main(["solve", *files, "--image_size", "640,480", "--time_limit", str(LIMIT), "--solver", "search", "--json"])
     solution = Solution.from_json(capsys.readouterr().out)
-    assert turned(solution.rotation, rotation) < 0.5
+    assert degrees_between(solution.rotation, rotation) < 0.5
     assert solution.focal_length == pytest.approx(900, rel=0.05)

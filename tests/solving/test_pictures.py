@@ -1,26 +1,32 @@
-"""A solution drawn, as a file that is drawn, and as a COLMAP model that pycolmap reads again."""
+"""A solution drawn, in a notebook, as a file that is drawn, and as a COLMAP model that pycolmap reads again."""
 
+import base64
+import io
 import json
+import pickle
+from dataclasses import replace
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 import pytest
-from report_data import drawn_problem
+from PIL import Image
+from planted import plant
 
 import bpnp
 from bpnp.cameras import camera_from
 from bpnp.cli import main
 from bpnp.examples import load
-from bpnp.report import plot_problem
-from bpnp.solving.pictures import solution_points
+from bpnp.solving.matches import without_pose
 from bpnp.solving.problem import problem_from
-from bpnp.solving.solution import Solution, SolutionStats
-from bpnp.solving.sources import without_pose
 
 EXAMPLE = load("mesh")
 SOLUTION = bpnp.solve(EXAMPLE.points2d, EXAMPLE.points3d, EXAMPLE.camera)
+PLANTED = plant(1, 40, seed=2)
+LENS = ("SIMPLE_RADIAL", 640, 480, (500.0, 320.0, 240.0, -0.05))
+MATRIX = np.array([[500.0, 0.0, 320.0], [0.0, 480.0, 240.0], [0.0, 0.0, 1.0]])
 OPENCV = ("OPENCV", (800.0, 810.0, 640.0, 480.0, -0.1, 0.02, 0.001, -0.001))
 
 
@@ -60,36 +66,11 @@ def test_a_solution_without_a_pose_cannot_be_exported(tmp_path: Path) -> None:
     assert not (tmp_path / "model").exists()
 
 
-def solved(camera: Any = None) -> Solution:
-    """Exact; of 12 points two are matched."""
-    planted = drawn_problem(3, "x", 12)
-    assert planted.pose is not None
-    return Solution(
-        rotation=planted.pose[0], translation=planted.pose[1], matches=np.array([[3, 3], [5, 5]]), inlier_count=2,
-        inlier_ratio=0.5, reprojection_error=0.0, unit="px", verdict="ambiguous", reason="few", camera=camera,
-        stats=SolutionStats(), points2d=planted.points2d.astype(float), points3d=planted.points3d.astype(float),
-    )  # fmt: skip
-
-
-def test_a_solution_is_drawn_with_its_matches_in_pixels_of_its_camera() -> None:
-    camera = camera_from(np.array([[500.0, 0, 320], [0, 500, 240], [0, 0, 1]]))
-    for own, unit in ((None, "normalised coordinates"), (camera, "pixels")):
-        solution = solved(own)
-        figure = plot_problem(solution_points(solution))
-        assert figure.get_suptitle() == "ambiguous: 2 matches (50 %), mean error 0 px\nfew"
-        axes = figure.axes[1]
-        assert axes.get_xlabel() == axes.get_ylabel() == unit
-        (segments,) = axes.collections  # one a match, from the image point to the reprojected 3D point
-        ends = np.stack(segments.get_segments())
-        seen = solution.points2d if own is None else own.project(np.c_[solution.points2d, np.ones(12)])
-        np.testing.assert_allclose(ends, np.repeat(seen[[3, 5], None], 2, 1), atol=1e-3)
-
-
 def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "castle.json"
-    path.write_text(solved().to_json())
+    path.write_text(SOLUTION.to_json())
     main(["view", str(path)])
     assert (tmp_path / "views" / "castle.png").stat().st_size > 5000
     (tmp_path / "pictures").mkdir()
@@ -98,7 +79,7 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
         ("", "expected the JSON of a solution in"),
         ('{"images": []}', "the pictures of `bpnp localize` are in"),
         (json.dumps(content | {"points2d": [[1, 2, 3]]}), "expected the JSON of a solution in"),
-        (json.dumps(content | {"matches": [[0, 99]]}), "expected `matches` of 12 2D and 12 3D points"),
+        (json.dumps(content | {"matches": [[0, 999]]}), "expected `matches` of 200 2D and 200 3D points"),
     ):
         path.write_text(text)
         with pytest.raises(SystemExit):
@@ -106,3 +87,67 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
         shown = " ".join(capsys.readouterr().err.split())
         assert message in shown
         assert "castle.json" in shown
+
+
+def test_a_solution_is_drawn_with_a_cross_on_every_image_point() -> None:
+    solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
+    lines = {line.get_label(): line.get_xydata() for line in solution.plot().axes[0].get_lines()}
+    crosses = np.asarray(lines["3D points, matched"])
+    seen = np.asarray(lines["image points"])
+    distance = np.linalg.norm(seen[:, None] - crosses, axis=-1)
+    assert distance.min(1).max() < 1e-6
+
+
+class Page(HTMLParser):
+    """The text of a page, and the attributes of its images."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.text, self.images = "", list[dict[str, str | None]]()
+        self.feed(page)
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.images += [dict(attrs)] if tag == "img" else []
+
+
+def test_a_notebook_shows_the_text_and_the_picture_of_a_solution() -> None:
+    solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
+    page = Page(solution._repr_html_())
+    assert page.text == repr(solution)
+    (image,) = page.images
+    kind, content = str(image["src"]).split(",")
+    assert kind == "data:image/png;base64"
+    with Image.open(io.BytesIO(base64.b64decode(content))) as picture:
+        assert min(picture.size) > 300
+        assert len(picture.convert("RGB").getcolors(10**6)) > 100
+    unsafe = replace(solution, reason="<b>1 < 2</b>", points2d=np.full((3, 2), np.nan))
+    assert Page(unsafe._repr_html_()).text == repr(unsafe)
+    assert Page(unsafe._repr_html_()).images == []
+
+
+@pytest.mark.parametrize("camera", [LENS, MATRIX], ids=["lens", "matrix"])
+def test_a_solution_of_pixels_is_drawn_in_pixels_also_from_its_file(camera: Any) -> None:
+    pixels = camera_from(camera).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), camera)
+    for own in (solution, bpnp.Solution.from_json(solution.to_json()), pickle.loads(pickle.dumps(solution))):
+        image, close_up = own.plot().axes
+        drawn = {line.get_label(): np.asarray(line.get_xydata()) for line in image.get_lines()}
+        assert np.abs(drawn["image points"] - pixels).max() < 1e-2
+        assert image.get_xlabel() == image.get_ylabel() == "pixels"
+        assert close_up.get_title() == "residuals, pixels"
+        assert np.linalg.norm(np.asarray(close_up.get_lines()[0].get_xydata()), axis=-1).mean() == pytest.approx(
+            own.reprojection_error, abs=1e-3
+        )
+
+
+def test_a_photo_as_it_was_taken_fills_the_picture_and_is_not_faded() -> None:
+    pixels = camera_from(MATRIX).project(np.c_[PLANTED.points2d[0].numpy(), np.ones(40)])
+    solution = bpnp.solve(pixels, PLANTED.points3d[0].numpy(), MATRIX)
+    axes = solution.plot(photo=np.zeros((480, 640, 3), np.uint8)).axes[0]
+    (photo,) = axes.get_images()
+    assert tuple(photo.get_extent()) == (0, 640, 480, 0)
+    assert (axes.get_xlim(), axes.get_ylim()) == ((0, 640), (480, 0))
+    assert photo.get_alpha() is None

@@ -1,4 +1,4 @@
-"""What `solve` does with a user's modules, with its time, and in several threads."""
+"""What `solve` does with a user's modules, and in several threads."""
 
 import math
 import threading
@@ -8,12 +8,8 @@ from dataclasses import replace
 import pytest
 import torch
 from planted import plant
-from small_data import small_net
 
 from bpnp import solve
-from bpnp.loops.parallel import Clock, Deadline
-from bpnp.search.verdict import SearchResult, no_pose
-from bpnp.solving import sources
 from bpnp.types import Pose, Prediction, SolveStats
 
 
@@ -70,27 +66,3 @@ def test_several_threads_find_what_one_does() -> None:
 
     with ThreadPoolExecutor(4) as threads:
         assert list(threads.map(at_once, range(4))) == alone
-
-
-@pytest.mark.parametrize(("limit", "seconds"), [(None, 10.0), (30.0, 30.0), (math.inf, math.inf)])
-def test_the_time_limit_of_a_problem_counts_once(
-    limit: float | None, seconds: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The seconds of a net that is asked for a prior count too."""
-    deadlines: list[Deadline] = []
-
-    def ask(*arguments) -> None:
-        deadlines.append(arguments[-1])
-
-    def search(*_, deadline: Deadline, **__) -> SearchResult:
-        deadlines.append(deadline)
-        return no_pose("none")
-
-    monkeypatch.setattr(sources, "pose_prior", ask)
-    monkeypatch.setattr(sources, "search_poses", search)
-    planted = plant(1, 30)
-    begun = Clock.now()
-    solve(planted.points2d[0], planted.points3d[0], prior=small_net(), time_limit=limit)
-    first, second = deadlines
-    assert first is second
-    assert first.at == pytest.approx(begun + seconds, abs=0.1)
