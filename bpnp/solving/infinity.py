@@ -37,12 +37,7 @@ NOMINAL = 1e-3  # of the spread of bearings without a camera: what a pixel is ta
 
 
 def solve_directions(
-    points2d: Any,
-    directions: Any,
-    camera: Any,
-    unknown: UnknownCamera | None,
-    scores2d: Any,
-    options: Options,
+    points2d: Any, directions: Any, camera: Any, unknown: UnknownCamera | None, scores2d: Any, options: Options
 ) -> Solution:
     """The rotation under which unit directions (n, 3) are seen at image points; arguments as for `bpnp.solve`.
 

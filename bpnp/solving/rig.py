@@ -39,12 +39,7 @@ STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the la
 
 
 def solve_rig(
-    points2d: Any,
-    points3d: Any,
-    camera: Any,
-    rig: Sequence[Any],
-    known: Mapping[str, Any],
-    options: Options,
+    points2d: Any, points3d: Any, camera: Any, rig: Sequence[Any], known: Mapping[str, Any], options: Options
 ) -> Solution:
     """`bpnp.solve` with a `rig`: the pose rig_from_world. known: normals and labels."""
     begun, labels2d = Clock.now(), known["labels2d"]

@@ -198,10 +198,7 @@ def test_a_rotation_survives_its_file_and_is_drawn(tmp_path: Path) -> None:
         ({"points2d": np.ones((2, 2))}, "expected 3 or more points in `points2d`"),
         ({"points2d": np.full((9, 2), 0.1)}, "expected pixels with a `camera`"),
         ({"camera": None}, "expected normalised image coordinates without a `camera`"),
-        (
-            {"prior": PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)},
-            "expected no `prior` with `at_infinity`, got Pose",
-        ),
+        ({"prior": PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)}, "expected no `prior` with `at_infinity`, got Pose"),
         ({"normals3d": np.ones((9, 3))}, "expected no `normals3d` with `at_infinity`"),
         ({"labels2d": [1], "labels3d": [1]}, "expected no `labels2d` with `at_infinity`"),
         ({"clutter": 0.2}, "expected no `clutter` with `at_infinity`"),

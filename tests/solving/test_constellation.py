@@ -148,20 +148,6 @@ def test_one_clear_error_for_bad_annotations(known: dict[str, Any], message: str
         solve(rng.uniform(0, 400, (6, 2)), rng.standard_normal((6, 3)), CAMERA, **known)
 
 
-def test_annotations_of_many_pairs() -> None:
-    rng = np.random.default_rng(6)
-    points, normals = device(rng, 20)
-    frames = [frame(rng, points, normals, background=2) for _ in range(2)]
-    images = [image for image, *_ in frames]
-    together = solve_many(images, points, CAMERA, normals3d=normals)
-    for (image, rotation, _, _), solution in zip(frames, together, strict=True):
-        assert degrees_between(solution.rotation, rotation) < 3
-        alone = solve(image, points, CAMERA, normals3d=normals)
-        np.testing.assert_array_equal(alone.rotation, solution.rotation)
-    with pytest.raises(ValueError, match="expected 2 of `labels2d`, one a problem, got 1"):
-        solve_many(images, points, CAMERA, labels2d=[np.zeros(3, int)], labels3d=np.zeros(20, int))
-
-
 def test_two_devices_in_one_picture_share_no_light() -> None:
     """Two controllers of one make: each pose is found once, and no light belongs to both."""
     rng = np.random.default_rng(8)
