@@ -9,7 +9,7 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import camera_centre
-from bpnp.models.baselines.branch_and_bound import Boxes, best_rotation, count_inliers, maximise_inliers
+from bpnp.models.baselines.branch_and_bound import Boxes, count_inliers, maximise_inliers
 from bpnp.models.baselines.gosma import (
     RayMixture,
     SceneMixture,
@@ -119,20 +119,6 @@ def test_mixtures_find_planted_clusters_in_any_order() -> None:
     fitted = ray_mixture(rays, 0.3)
     assert len(fitted.weights) == 1
     assert float(fitted.concentrations) == pytest.approx(1 / 0.05**2, rel=0.15)
-
-
-def test_no_rotation_of_a_box_has_more_inliers_than_its_bound() -> None:
-    for directions in torch.nn.functional.normalize(normal(30, 12, 3), dim=-1):
-        rays, reach = torch.nn.functional.normalize(normal(10, 3), dim=-1), 0.05 + 0.2 * uniform(12)
-        domain = whole(normal(3), 0.4, torch.zeros(3).double(), 0.0)
-        found = best_rotation(rays, directions, domain.place[0], reach, domain, floor=0, smallest=0.02)
-        turns = domain.turn + 0.4 * (2 * uniform(400, 3) - 1)
-        cosine = (rays @ roma.rotvec_to_rotmat(turns)) @ directions.mT
-        counts = (cosine >= reach.cos()).any(-1).sum(-1)
-        assert int(counts.max()) <= found.bound
-        assert found.value <= found.bound
-        inside = turns.norm(dim=-1) <= math.pi
-        assert int(counts[inside].max()) <= max(found.value, found.bound)
 
 
 def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:

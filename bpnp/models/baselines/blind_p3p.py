@@ -24,10 +24,8 @@ SHORTLIST = 64  # poses that are matched one to one and refined
 REFINE_STEPS = 10  # Gauss-Newton steps on the one-to-one matches of a pose
 
 
-def solutions(
-    problem: SingleProblem, triples2d: Int[Tensor, "h 3"], triples3d: Int[Tensor, "h 3"]
-) -> tuple[Float[Tensor, "s 3 3"], Float[Tensor, "s 3"]]:
-    """All poses under which the triples match, up to four each."""
+def solutions(problem: SingleProblem, triples2d: Tensor, triples3d: Tensor) -> tuple[Tensor, Tensor]:
+    """Rotations (s, 3, 3) and translations (s, 3) under which triples (h, 3) match, up to four each."""
     solution = p3p(bearings(problem.points2d)[triples2d], problem.points3d[triples3d])
     return solution.rotation[solution.valid], solution.translation[solution.valid]
 
@@ -164,7 +162,7 @@ class Constellation(SingleSolver):
         converged = matches >= self.min_matches and tried == len(triples2d) * len(triples3d)
         return Answer((pose[:, :3], pose[:, 3]), tried, (squared / matches) ** 0.5, converged)
 
-    def _refined(self, problem: SingleProblem, pose: Float[Tensor, "3 4"]) -> tuple[Float[Tensor, "3 4"], int, float]:
+    def _refined(self, problem: SingleProblem, pose: Float[Tensor, "3 4"]) -> tuple[Tensor, int, float]:
         """The pose refined on its matches, or as it was if that has fewer; number of matches, sum of their squares."""
         index2d, index3d, squared = self._matches(problem, pose)
         if len(index2d) >= MIN_POINTS:
@@ -176,9 +174,7 @@ class Constellation(SingleSolver):
                 return refined, len(again), float(squared_again)
         return pose, len(index2d), float(squared)
 
-    def _matches(
-        self, problem: SingleProblem, pose: Float[Tensor, "3 4"]
-    ) -> tuple[Int[Tensor, " k"], Int[Tensor, " k"], Float[Tensor, ""]]:
+    def _matches(self, problem: SingleProblem, pose: Float[Tensor, "3 4"]) -> tuple[Tensor, Tensor, Tensor]:
         """One-to-one matches within the radius of least truncated squared distance, and the sum of their squares."""
         camera = transform(pose[:, :3], pose[:, 3], problem.points3d)
         squared = torch.cdist(problem.points2d, project(camera)).square()

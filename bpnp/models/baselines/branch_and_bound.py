@@ -90,7 +90,7 @@ def best_first(
     *,
     at_once: int,
     until: Callable[[int], bool],
-    small: Callable[[Boxes], Bool[Tensor, " b"]] = lambda boxes: torch.zeros_like(boxes.turn_half, dtype=torch.bool),
+    small: Callable[[Boxes], Bool[Tensor, " b"]] | None = None,
 ) -> tuple[float, int]:
     """Expand the `at_once` boxes of highest bound together until no box can hold anything better than was found.
 
@@ -109,9 +109,12 @@ def best_first(
         done += len(upper)
         boxes = Boxes(*(torch.cat(values) for values in zip(boxes.pick(rest), children, strict=True)))
         bounds = torch.cat([bounds[rest], torch.minimum(upper, bounds.max())])
-        promising, final = bounds > least, small(boxes)
-        aside = torch.cat([aside, bounds[promising & final]])
-        boxes, bounds = boxes.pick(promising & ~final), bounds[promising & ~final]
+        promising = bounds > least
+        boxes, bounds = boxes.pick(promising), bounds[promising]
+        if small is not None:
+            final = small(boxes)
+            aside = torch.cat([aside, bounds[final]])
+            boxes, bounds = boxes.pick(~final), bounds[~final]
     return float(torch.cat([aside, bounds]).max()), done
 
 
@@ -189,9 +192,9 @@ class GOPAC(BranchAndBound):
     def search(
         self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
     ) -> tuple[Found, float]:
-        limits = {"angle": self.angle, "max_boxes": self.max_boxes}
-        found = maximise_inliers(bearings(points2d), points3d, domain, deadline=deadline, **limits)
-        return found, 1 - found.value / len(points2d)
+        rays = bearings(points2d)
+        found = maximise_inliers(rays, points3d, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline)
+        return found, 1 - found.value / len(rays)
 
 
 def maximise_inliers(
@@ -205,10 +208,9 @@ def maximise_inliers(
 ) -> Found:
     """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
 
-    Outer search over the camera centre c in the one box of the domain, most promising box first; for each box two inner
-    searches over R: at its centre, for a better pose, and with every angle widened by the box's uncertainty psi_t(p_j),
-    for whether the box can hold one. A better pose is refined by the weighted PnP layer on its inliers. Boxes under
-    SMALLEST are not split: where one might hold more than the best pose, the bound stays above the count.
+    The outer search is over the camera centre c in the one box of the domain; for each box two inner searches over R:
+    at its centre, for a better pose, which is refined, and with every angle widened by the uncertainty psi_t(p_j),
+    for whether the box can hold one. Boxes under SMALLEST are not split: their bound may stay above the count.
     """
     best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
     inner = 1
@@ -243,9 +245,9 @@ def maximise_inliers(
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
     """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
     count = count_inliers(rays, points, rotation, place, angle)
-    weights = within(rays, points, rotation, place, math.cos(angle)).to(rays)
-    start = (rotation, -rotation @ place)
-    turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in (weights, rays, points, *start)))
+    weights = within(rays, points, rotation, place, angle).to(rays)
+    inputs = weights, rays, points, rotation, -rotation @ place
+    turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in inputs))
     if bool(stats.converged[0]):
         moved = -turned[0].mT @ shift[0]
         if (refined := count_inliers(rays, points, turned[0], moved, angle)) >= count:
@@ -267,9 +269,8 @@ def best_rotation(
 ) -> Found:
     """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
 
-    Only rotations with more than `floor` rays are of interest: boxes that cannot have more are dropped. `first`: stop
-    at the first of these. Boxes of half side below `smallest` (radians) are not split; they, and the boxes left at the
-    deadline, keep the bound above the count.
+    Boxes that cannot have more than `floor` rays are dropped. first: stop at the first rotation that has. Boxes of half
+    side below `smallest` (radians) are not split; they, and those left at the deadline, keep the bound above the count.
     """
     directions = torch.nn.functional.normalize(points - place, dim=-1)
     count, rotation = floor, None
@@ -279,7 +280,6 @@ def best_rotation(
         children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
         cosine = (rays @ children.rotation) @ directions.mT  # (b, m, n)
         widened = (reach + rotation_uncertainty(children).unsqueeze(-1)).clamp_max(math.pi)
-        # Rays within reach under the rotation at each box's centre, and a bound for all rotations of the box.
         reached = (cosine >= reach.cos() - ROUNDING).any(-1).sum(-1)
         reachable = (cosine >= (widened.cos() - ROUNDING).unsqueeze(1)).any(-1).sum(-1).to(rays)
         i = int(reached.argmax())
@@ -289,7 +289,7 @@ def best_rotation(
 
     left, boxes = best_first(
         domain,
-        rays.new_full((len(domain.turn),), len(rays)),
+        rays.new_full((1,), len(rays)),
         expand,
         at_once=max(1, CHUNK // (8 * len(rays) * len(directions))),
         small=lambda boxes: boxes.turn_half < smallest,
@@ -300,9 +300,9 @@ def best_rotation(
 
 def count_inliers(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> int:
     """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
-    return int(within(rays, points, rotation, place, math.cos(angle) - ROUNDING).any(-1).sum())
+    return int(within(rays, points, rotation, place, angle).any(-1).sum())
 
 
-def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, cosine: float) -> Bool[Tensor, "m n"]:
-    """[cos angle(f_i, R (p_j - c)) >= cosine]."""
-    return (rays @ rotation) @ torch.nn.functional.normalize(points - place, dim=-1).mT >= cosine
+def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> Bool[Tensor, "m n"]:
+    directions = torch.nn.functional.normalize(points - place, dim=-1)
+    return (rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING

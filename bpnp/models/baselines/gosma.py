@@ -96,9 +96,15 @@ class GOSMA(BranchAndBound):
     ) -> tuple[Found, float]:
         rays = bearings(points2d)
         angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
-        mixtures = scene_mixture(points3d, self.cluster3d), ray_mixture(rays, self.cluster2d * angle)
-        limits = {"batch": self.batch, "max_boxes": self.max_boxes}
-        found = align_mixtures(*mixtures, domain, closest=CLOSEST * away, deadline=deadline, **limits)  # type: ignore[arg-type]
+        found = align_mixtures(
+            scene_mixture(points3d, self.cluster3d),
+            ray_mixture(rays, self.cluster2d * angle),
+            domain,
+            closest=CLOSEST * away,
+            batch=self.batch,
+            max_boxes=self.max_boxes,
+            deadline=deadline,
+        )
         return found, found.value
 
 
@@ -113,14 +119,11 @@ def align_mixtures(
     max_boxes: int | float = math.inf,
     deadline: Deadline = NEVER,
 ) -> Found:
-    """Smallest d(R, c) over a domain (boxes, usually one) with |c| >= `closest`, to within `gap` of the image mixture's
-    squared norm.
+    """Smallest d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
 
-    Best first: the `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the
-    less certain; Adam descends from the best centres, also where they are worse than the best so far, since a better
-    optimum may lie close to them, and L-BFGS polishes a better pose. Ends with the certificate, or with the best pose
-    so far after about `max_boxes` boxes or at the deadline. Value and bound are shares of the image mixture's squared
-    norm.
+    The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the less certain;
+    Adam descends from their best centres, and L-BFGS polishes a better pose. Value and bound are shares of the image
+    mixture's squared norm.
     """
     norm = float(squared_norm(rays))
     best = (math.inf, domain.rotation[0], domain.place[0])
@@ -135,7 +138,10 @@ def align_mixtures(
         values = distance(scene, rays, *poses)
         i = int(values.argmin())
         if float(values[i]) < best[0]:
-            best = polish(scene, rays, poses[0][i], poses[1][i])
+            best = float(values[i]), poses[0][i], poses[1][i]
+            turned, moved = descend(scene, rays, *(x[i : i + 1] for x in poses), finely=True)
+            if (end := float(distance(scene, rays, turned, moved))) < best[0]:
+                best = end, roma.special_procrustes(turned[0]), moved[0]
 
     def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
         moving = translation_uncertainty(parents, scene.means).amax(-1)
@@ -153,25 +159,20 @@ def align_mixtures(
         -lower_bound(scene, rays, domain),
         expand,
         at_once=batch,
-        until=lambda done: deadline.passed() or done + len(domain.turn) >= max_boxes,
+        until=lambda done: deadline.passed() or done + 1 >= max_boxes,
     )
     value, rotation, place = best
     certified = -left >= value - gap * norm
     bound = value - gap * norm if certified else -left
-    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + len(domain.turn), certified)
+    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
 
 
 def descend(
-    scene: SceneMixture,
-    rays: RayMixture,
-    rotation: Float[Tensor, "b 3 3"],
-    place: Float[Tensor, "b 3"],
-    *,
-    finely: bool = False,
-) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"]]:
-    """Adam's steps from several poses, each for itself, from a tenth of a unit down to a thousandth; or L-BFGS.
+    scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor, *, finely: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Adam's steps from poses (b, 3, 3), (b, 3), from a tenth of a unit down to a thousandth; or L-BFGS.
 
-    Units of a step: radians, and the mean distance to the scene's clusters, so that both move the image alike.
+    A unit is a radian, and the mean distance to the scene's clusters.
     """
     away = torch.linalg.vector_norm(scene.means - place.unsqueeze(1), dim=-1).mean(-1, keepdim=True)
     unit = torch.cat([torch.ones_like(place), away.expand_as(place)], -1)
@@ -192,22 +193,9 @@ def descend(
     return retract(unit * step.detach(), rotation, place)
 
 
-def polish(
-    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "3 3"], place: Float[Tensor, "3"]
-) -> tuple[float, Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """L-BFGS from one pose; the pose given where it ends no lower."""
-    start = rotation.unsqueeze(0), place.unsqueeze(0)
-    turned, moved = descend(scene, rays, *start, finely=True)
-    end, before = float(distance(scene, rays, turned, moved)), float(distance(scene, rays, *start))
-    return (end, roma.special_procrustes(turned[0]), moved[0]) if end < before else (before, rotation, place)
-
-
 def ray_mixture(rays: Float[Tensor, "m 3"], angle: float) -> RayMixture:
-    """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF that fits each.
-
-    The concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r, and at most that of a cluster with a
-    standard deviation of a tenth of the angle, which single points would exceed.
-    """
+    """DP-vMF-means: clusters within `angle` (radians) of their mean direction, and the vMF of each, no narrower than a
+    tenth of the angle. Its concentration is r (3 - r^2)/(1 - r^2) of the mean resultant length r."""
     weights, sums = _totals(rays, _means(rays, angle, spherical=True))
     length = torch.linalg.vector_norm(sums, dim=-1) / weights
     concentration = length * (3 - length.square()) / (1 - length.square()).clamp_min(1e-12)
@@ -267,10 +255,8 @@ def squared_norm(rays: RayMixture) -> Float[Tensor, ""]:
     return rays.weights @ terms @ rays.weights
 
 
-def distance(
-    scene: SceneMixture, rays: RayMixture, rotation: Float[Tensor, "b 3 3"], place: Float[Tensor, "b 3"]
-) -> Float[Tensor, " b"]:
-    """d(R, c) without the constant `squared_norm(rays)`."""
+def distance(scene: SceneMixture, rays: RayMixture, rotation: Tensor, place: Tensor) -> Float[Tensor, " b"]:
+    """d(R, c) of rotations (b, 3, 3) and centres (b, 3) without the constant `squared_norm(rays)`."""
     directions, k = scene.seen(place)
     self_terms = overlap(k.unsqueeze(-1), k.unsqueeze(-2), directions @ directions.mT)
     cross_terms = overlap(k.unsqueeze(-1), rays.concentrations, directions @ rotation.mT @ rays.directions.mT)
@@ -278,14 +264,11 @@ def distance(
 
 
 def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Tensor, " b"]:
-    """A number that d(R, c) does not fall below for any pose of a box.
+    """A number that d(R, c) does not fall below for any pose of a box: every term takes its best value on its own.
 
-    Every term takes its best value on its own: angles within the box's uncertainty of those at its centre, and
-    concentrations between those at the least and the largest distance.
-
-    The angle that two means subtend at the camera centre grows by the uncertainty of both directions at most. Its
-    gradient has the length |mu - mu'| / (d d') with the distances d, d' of the means: moving the centre by half a
-    diagonal adds at most that times the largest length.
+    Angles are within the box's uncertainty of those at its centre, concentrations between those at the least and the
+    largest distance. The angle that two means subtend at the camera centre has a gradient of the length
+    |mu - mu'| / (d d'), d and d' their distances, which bounds its change too.
     """
     directions, _ = scene.seen(boxes.place)
     turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, scene.means)
@@ -295,10 +278,10 @@ def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Te
     half_diagonal = boxes.place_half.norm(dim=-1)[:, None, None]
     gradient = torch.cdist(scene.means, scene.means) / (closest.unsqueeze(-1) * closest.unsqueeze(-2)).clamp_min(1e-12)
     parting = torch.minimum(moving.unsqueeze(-1) + moving.unsqueeze(-2), half_diagonal * gradient + 1e-7)
-    wide = (_angle(directions @ directions.mT) + parting).clamp_max(math.pi)
+    wide = (torch.acos((directions @ directions.mT).clamp(-1, 1)) + parting).clamp_max(math.pi)
     wide = wide * (1 - torch.eye(len(scene.means), dtype=wide.dtype, device=wide.device))
     self_terms = _least_overlap(least, largest, wide.cos())
-    angle = _angle(directions @ boxes.rotation.mT @ rays.directions.mT)
+    angle = torch.acos((directions @ boxes.rotation.mT @ rays.directions.mT).clamp(-1, 1))
     narrow = (angle - turning[:, None, None] - moving.unsqueeze(-1)).clamp_min(0)
     cross_terms = _largest_overlap(least.unsqueeze(-1), largest.unsqueeze(-1), rays.concentrations, narrow.cos())
     return _combine(scene, rays, self_terms * (1 - ROUNDING), cross_terms * (1 + ROUNDING))
@@ -306,10 +289,6 @@ def lower_bound(scene: SceneMixture, rays: RayMixture, boxes: Boxes) -> Float[Te
 
 def _combine(scene: SceneMixture, rays: RayMixture, self_terms: Tensor, cross_terms: Tensor) -> Tensor:
     return (self_terms @ scene.weights) @ scene.weights - 2 * (cross_terms @ rays.weights) @ scene.weights
-
-
-def _angle(cosine: Tensor) -> Tensor:
-    return torch.acos(cosine.clamp(-1, 1))
 
 
 def _least_overlap(least: Tensor, largest: Tensor, cosine: Tensor) -> Tensor:

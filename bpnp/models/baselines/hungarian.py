@@ -53,9 +53,8 @@ class Hungarian(nn.Module):
 def hungarian(cost: Float[Tensor, "b m n"], batch: Batch) -> Float[Tensor, "b m n"]:
     """The permutation of least cost between the real points, as a joint probability: equal entries of sum one."""
     assignment = torch.zeros_like(cost)
-    for i, (m, n) in enumerate(zip(batch.count2d.tolist(), batch.count3d.tolist(), strict=True)):
-        real = cost[i][batch.mask2d[i]][:, batch.mask3d[i]].cpu().numpy()
-        rows, columns = (torch.as_tensor(side, device=cost.device) for side in linear_sum_assignment(real))
-        places = batch.mask2d[i].nonzero().squeeze(-1), batch.mask3d[i].nonzero().squeeze(-1)
-        assignment[i, places[0][rows], places[1][columns]] = 1 / min(m, n)
+    for i, (real2d, real3d) in enumerate(zip(batch.mask2d.cpu(), batch.mask3d.cpu(), strict=True)):
+        places2d, places3d = real2d.nonzero()[:, 0], real3d.nonzero()[:, 0]
+        rows, columns = linear_sum_assignment(cost[i].cpu()[real2d][:, real3d].numpy())
+        assignment[i, places2d[rows], places3d[columns]] = 1 / len(rows)
     return assignment

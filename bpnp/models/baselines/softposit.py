@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import (
     Answer,
     SingleProblem,
@@ -27,6 +27,7 @@ ALPHA = 9.21 * NOISE**2 + 1  # squared pixels; 9.21 is the 99 % quantile of chi^
 BETA_START, BETA_FINAL, BETA_RATE = 4e-4, 0.5, 1.05  # weight of squared distances, 1/pixel^2; factor of a step
 STEPS = 1 + int(math.log(BETA_FINAL / BETA_START) / math.log(BETA_RATE))
 ENOUGH_STEPS = 20
+SCALINGS, TOLERANCE = 60, 1e-3  # of a soft assignment: most of them, and the error of the row sums, in total
 WELL_POSED = 1e-10  # smallest eigenvalue of the points' second moments, per trace
 
 
@@ -65,8 +66,9 @@ class SoftPOSIT(SingleSolver):
         points = problem.points2d, problem.points3d
         m, n = map(len, points)
         best, most, finished = Answer(), -1, True
-        for start in zip(*(value.split(max(1, CHUNK // (m * n))) for value in self._starts(problem)), strict=True):
-            found = softposit(*points, *start, max_steps=self.max_steps, deadline=deadline)
+        parts = (values.split(max(1, CHUNK // (m * n))) for values in self._starts(problem))
+        for rotation, translation in zip(*parts, strict=True):
+            found = softposit(*points, rotation, translation, self.max_steps, deadline)
             finished = found.finished
             counts = agreement(*points, found.rotation, found.translation, threshold=THRESHOLD)
             score = counts.sum(0) + found.accepted * (m + n + 1)
@@ -111,20 +113,14 @@ class Annealed(NamedTuple):
 
 
 def softposit(
-    points2d: Float[Tensor, "m 2"],
-    points3d: Float[Tensor, "n 3"],
-    rotation: Float[Tensor, "s 3 3"],
-    translation: Float[Tensor, "s 3"],
-    *,
-    max_steps: int | None = None,
-    deadline: Deadline = NEVER,
+    points2d: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor, max_steps: int | None, deadline: Deadline
 ) -> Annealed:
-    """Anneal every initial pose (R, t) of one problem.
+    """Anneal every initial pose (R, t) (s, 3, 3), (s, 3) of one problem, points2d (m, 2) and points3d (n, 3).
 
     With S_k = (X_k, 1), Q1 = (R1, Tx)/Tz, Q2 = (R2, Ty)/Tz and w_k = 1 + R3 . X_k / Tz, the distance of image point j
     and scene point k is d^2_jk = FOCAL^2 [(Q1 . S_k - w_k x_j)^2 + (Q2 . S_k - w_k y_j)^2]. A step soft-assigns by
     exp(-beta (d^2 - ALPHA)) with slack, fits Q1 and Q2 to the assignment, makes their rows orthonormal, and multiplies
-    beta by BETA_RATE. points2d: normalised image coordinates. points3d: scene units.
+    beta by BETA_RATE.
 
     An initial pose is accepted if its residual is below sqrt(ALPHA)/2 after 20 steps or more. Where the matched points
     span no volume it keeps its last pose and is not accepted.
@@ -144,7 +140,7 @@ def softposit(
         scaled = torch.cat([turned, shift.unsqueeze(-1)], -1) @ scene.mT / shift[:, 2, None, None]
         rows, depth = scaled[:, :2], scaled[:, 2]
         kernel = _kernel(image, rows, depth, beta)
-        u, v = slack_scalings(kernel, slack=1 / (max(len(image), len(scene)) + 1))
+        u, v = slack_scalings(kernel, 1 / (max(len(image), len(scene)) + 1))
         matched = (v.unsqueeze(-1) * (kernel.mT @ (u.unsqueeze(-1) * moments2d))).double()  # (s, n, 4)
         residual = torch.where(broken, torch.inf, _residual(matched, rows, depth))
         moved_r, moved_t, solved = _fit(matched, scene, depth)
@@ -156,15 +152,12 @@ def softposit(
     return Annealed(turned, shift - turned @ centre, residual, accepted, step, step == limit)
 
 
-def slack_scalings(
-    kernel: Float[Tensor, "s m n"], *, slack: float, tolerance: float = 1e-3, max_iterations: int = 60
-) -> tuple[Float[Tensor, "s m"], Float[Tensor, "s n"]]:
+def slack_scalings(kernel: Float[Tensor, "s m n"], slack: float) -> tuple[Tensor, Tensor]:
     """u and v such that u_j K_jk v_k with the slack entries sums to one over every real row and every real column.
 
-    All slack entries start as `slack` and are scaled with their own row or column alone. Where K_jk is the largest of
-    its row and of its column and above the slack, both slacks keep their initial ratio to the entry: a good match is
-    not lost to them. Stops when the row sums of every sample are off by less than `tolerance` in total. The slack row
-    and column have no marginals of their own, so this is not the transport with dustbins of the Sinkhorn layer.
+    All slack entries start as `slack` and are scaled with their own row or column alone, unlike the Sinkhorn layer's
+    dustbins. Where K_jk is the largest of its row and of its column and above the slack, both slacks keep their initial
+    ratio to the entry: a good match is not lost to them. Stops when the row sums are off by less than TOLERANCE.
     """
     best3d, best2d = kernel.max(2), kernel.max(1)
     rows = torch.arange(kernel.shape[1], device=kernel.device)
@@ -173,12 +166,12 @@ def slack_scalings(
     kept3d = (best3d.indices.gather(1, best2d.indices) == columns) & (best2d.values > slack)
     u, v = torch.ones_like(best3d.values), torch.ones_like(best2d.values)
     total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack
-    for _ in range(max_iterations):
+    for _ in range(SCALINGS):
         u = 1 / total
         partner = torch.where(kept3d, u.gather(1, best2d.indices), 1)
         v = 1 / ((kernel.mT @ u.unsqueeze(-1)).squeeze(-1) + slack * partner)
         total = (kernel @ v.unsqueeze(-1)).squeeze(-1) + slack * torch.where(kept2d, v.gather(1, best3d.indices), 1)
-        if bool(((u * total - 1).abs().sum(-1) < tolerance).all()):
+        if bool(((u * total - 1).abs().sum(-1) < TOLERANCE).all()):
             break
     return u, v
 
