@@ -1,6 +1,6 @@
 """RANSAC on the most probable matches: a robust first pose from a soft assignment (paper section 3.3)."""
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -11,39 +11,28 @@ from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.backends import BACKENDS
 from bpnp.robust.consensus import Matches, in_scene, normalised, residuals, take
-from bpnp.types import SolveStats, unpadded
+from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]
 
 
-class MatchList(NamedTuple):
-    """The most probable matches of each sample, most probable first."""
-
-    index2d: Int[Tensor, "b k"]
-    index3d: Int[Tensor, "b k"]
-    mask: Bool[Tensor, "b k"]
-
-
 def top_matches(
     assignment: Float[Tensor, "b m n"],
-    *,
-    mask2d: Bool[Tensor, "b m"] | None = None,
-    mask3d: Bool[Tensor, "b n"] | None = None,
-    matches_factor: float = 1.5,
-) -> MatchList:
-    """The k = matches_factor * min(m, n) matches of highest probability, m and n counting a sample's real points."""
+    mask2d: Bool[Tensor, "b m"] | None,
+    mask3d: Bool[Tensor, "b n"] | None,
+    matches_factor: float,
+) -> tuple[Int[Tensor, "b k"], Int[Tensor, "b k"], Bool[Tensor, "b k"]]:
+    """The k = matches_factor * min(m, n) matches of highest probability, most probable first: indices of their 2D and
+    3D points, and which of them there are; m and n count a sample's real points."""
     b, m, n = assignment.shape
     real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
     real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
     count2d, count3d = real2d.sum(-1), real3d.sum(-1)
     count = torch.minimum((matches_factor * torch.minimum(count2d, count3d)).long(), count2d * count3d)
-    scores = assignment.detach()
-    if not all(mask is None or unpadded(mask) for mask in (mask2d, mask3d)):
-        scores = scores.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
+    scores = assignment.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), -1)
     k = min(max(1, int(matches_factor * min(m, n))), m * n)
     flat = scores.flatten(1).topk(k, dim=-1).indices
-    mask = torch.arange(k, device=flat.device) < count.unsqueeze(-1)
-    return MatchList(flat // n, flat % n, mask)
+    return flat // n, flat % n, torch.arange(k, device=flat.device) < count.unsqueeze(-1)
 
 
 @checked_shapes
@@ -88,8 +77,8 @@ def ransac_pnp(
     check_positive(matches_factor=matches_factor, threshold=threshold, max_iterations=max_iterations)
     if backend == "auto":
         backend = "torch" if assignment.device.type == "cuda" else "poselib"
-    chosen = top_matches(assignment, mask2d=mask2d, mask3d=mask3d, matches_factor=matches_factor)
-    matches = Matches(take(points2d, chosen.index2d).double(), take(points3d, chosen.index3d).double(), chosen.mask)
+    index2d, index3d, real = top_matches(assignment, mask2d, mask3d, matches_factor)
+    matches = Matches(take(points2d, index2d).double(), take(points3d, index3d).double(), real)
     local, centre, scale = normalised(matches)
     poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
     rotation, translation = (values.squeeze(1) for values in in_scene(poses.unsqueeze(1), centre, scale))

@@ -222,10 +222,10 @@ class Refinement(nn.Module):
                 prediction.assignment,
                 batch.points2d,
                 batch.points3d,
+                batch.mask2d,
+                batch.mask3d,
                 count=self.hypotheses,
-                mask2d=batch.mask2d,
-                mask3d=batch.mask3d,
-            )[:2]
+            )
         proposed = proposed[0].to(rotation), proposed[1].to(translation)
         refined = refine(batch, torch.cat([rotation, proposed[0]], 1), torch.cat([translation, proposed[1]], 1))
         doubtful = log_support(prediction, batch, refined) < 0

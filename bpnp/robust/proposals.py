@@ -9,76 +9,63 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.checks import check_positive, checked_shapes
 from bpnp.distinct_poses import distinct
 from bpnp.geometry import bearings
 from bpnp.precision import full_precision
 from bpnp.robust.consensus import Matches, in_scene, normalised, take, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples
-from bpnp.types import SolveStats
 
 TRIPLES = 1024  # solved for each sample
 DRAWN_EACH = 4  # triples drawn for each that is solved: those of the widest triangles
 SCORED = 512  # matches drawn to score the poses on
 APART_DEG = 15.0  # smallest angle between two proposals
+THRESHOLD = 0.2  # of a residual, in root mean square distances of the image points from their mean
 
 
-@checked_shapes
 @full_precision
 @torch.no_grad()
 def pose_hypotheses(
     assignment: Float[Tensor, "b m n"],
     points2d: Float[Tensor, "b m 2"],
     points3d: Float[Tensor, "b n 3"],
+    mask2d: Bool[Tensor, "b m"],
+    mask3d: Bool[Tensor, "b n"],
     *,
     count: int,
-    mask2d: Bool[Tensor, "b m"] | None = None,
-    mask3d: Bool[Tensor, "b n"] | None = None,
-    threshold: float = 0.2,
-    seed: int = 0,
-) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"], SolveStats]:
+) -> tuple[Float[Tensor, "b s 3 3"], Float[Tensor, "b s 3"]]:
     """The s = `count` best poses, any two of them 15 degrees apart, of triples of matches drawn in proportion to P.
 
     Of the triples drawn those with the largest products of their triangles' areas on both sides are solved (`p3p`): a
-    small triangle magnifies the errors of its matches. A pose scores sum_k min(r_k^2, threshold^2) over other matches k
-    drawn from P, r_k the reprojection error and infinite behind the camera, which estimates the expectation under P.
+    small triangle magnifies the errors of its matches. A pose scores sum_k min(r_k^2, t^2) over other matches k drawn
+    from P, r_k the reprojection error, infinite behind the camera, and t = `THRESHOLD`: an estimate of the expectation
+    under P.
 
-    assignment: P, non-negative, of any sum. points2d: normalised image coordinates. points3d: scene units.
-    threshold: in root mean square distances of the sample's image points from their mean. seed: of the draws, the same
-    for each sample: a sample's result depends neither on the other samples nor on padding. Not differentiable.
+    assignment: P, non-negative, of any sum. points2d: normalised image coordinates. points3d: scene units. The draws
+    are the same for each sample: a sample's result depends neither on the other samples nor on padding.
 
-    Returns rotation, translation, best first, NaN in empty slots, and stats (iterations: triples solved; residual: root
-    mean truncated square of the best pose, normalised image units; converged: there is a pose). A sample whose P has no
-    mass or is not finite, or with fewer than 3 points of a side, has none.
-    Raises ValueError for arguments of wrong shape or type and options that are not positive.
+    Returns rotation and translation, best first, NaN in empty slots. A sample whose P has no mass or is not finite, or
+    with fewer than 3 points of a side, has none.
     """
-    check_positive(count=count, threshold=threshold)
-    b, m, n = assignment.shape
-    real2d = assignment.new_ones(b, m, dtype=torch.bool) if mask2d is None else mask2d
-    real3d = assignment.new_ones(b, n, dtype=torch.bool) if mask3d is None else mask3d
-    probability = assignment.masked_fill(~(real2d.unsqueeze(-1) & real3d.unsqueeze(-2)), 0).flatten(1)
+    n = assignment.shape[2]
+    probability = assignment.masked_fill(~(mask2d.unsqueeze(-1) & mask3d.unsqueeze(-2)), 0).flatten(1)
     mass = probability.sum(-1, dtype=torch.float64)
-    usable = mass.isfinite() & (mass > 0) & (torch.minimum(real2d.sum(-1), real3d.sum(-1)) >= 3)
+    usable = mass.isfinite() & (mass > 0) & (torch.minimum(mask2d.sum(-1), mask3d.sum(-1)) >= 3)
 
-    drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN_EACH * TRIPLES, seed)
+    drawn = weighted_draws(torch.where(usable.unsqueeze(-1), probability, 1), SCORED + 3 * DRAWN_EACH * TRIPLES, 0)
     chosen = Matches(take(points2d, drawn // n), take(points3d, drawn % n), usable.unsqueeze(-1).expand_as(drawn))
     matches, centre, scale = normalised(chosen)
     poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in matches[:2]))
     sample = Matches(*(values[:, :SCORED] for values in matches))
-    threshold2 = threshold**2 * _variance(points2d, real2d)
-    score = truncated_scores(poses, sample, threshold2.float()[:, None, None]) / SCORED
+    threshold2 = THRESHOLD**2 * _variance(points2d, mask2d)
+    score = truncated_scores(poses, sample, threshold2.float()[:, None, None])
 
-    best = poses.new_full((b, count, 3, 4), torch.nan)
-    residual = poses.new_full((b,), torch.inf)
+    best = poses.new_full((len(poses), count, 3, 4), torch.nan)
     for i in usable.nonzero().flatten().tolist():
-        r, t, value = (x.float().cpu().numpy() for x in (poses[i, ..., :3], poses[i, ..., 3], -score[i]))
+        r, t, value = (x.float().cpu().numpy() for x in (poses[i, ..., :3], poses[i, ..., 3], -score[i] / SCORED))
         index = torch.as_tensor(distinct(r, t, value, count, APART_DEG, math.inf), device=poses.device)
         best[i, : len(index)] = poses[i, index]
-        if len(index):
-            residual[i] = score[i, index[0]].sqrt()
-    stats = SolveStats(TRIPLES * usable.long(), residual.to(points3d), residual.isfinite())
     rotation, translation = in_scene(best, centre, scale)
-    return rotation.to(points3d), translation.to(points3d), stats
+    return rotation.to(points3d), translation.to(points3d)
 
 
 @full_precision
@@ -94,9 +81,9 @@ def drawn_poses(
 ) -> Float[Tensor, "b s 3 4"]:
     """All poses of the widest quarter of so many triples of matches drawn in proportion to P; NaN in empty slots.
 
-    The arguments are those of `pose_hypotheses`, unpadded; P has mass. aligned: whether the axes of the scene are about
-    those of the camera. Of the wider half of the triples those are solved, an eighth of all, whose triangles are most
-    alike: the cosine between the sides of one and those of the other seen along the third axis.
+    The arguments are those of `pose_hypotheses`, unpadded; P has mass. seed: of the draws. aligned: whether the axes of
+    the scene are about those of the camera. Of the wider half of the triples those are solved, an eighth of all, whose
+    triangles are most alike: the cosine between the sides of one and those of the other seen along the third axis.
     """
     drawn = weighted_draws(assignment.flatten(1), 3 * triples, seed)
     n = assignment.shape[2]
