@@ -110,5 +110,5 @@ class _PairwiseDistance(torch.autograd.Function):
     @first_derivative
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor]:
         a, b, distance = ctx.saved_tensors
-        weight = torch.where(distance > 0, -gradient / distance, 0)
-        return weight @ b, weight.mT @ a
+        weight = torch.ops.aten.threshold_backward(gradient / distance, distance, 0)  # zero where the distance is
+        return weight @ -b, weight.mT @ -a

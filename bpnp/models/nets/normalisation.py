@@ -63,12 +63,14 @@ class _LinearContextNorm(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         x, weight, y, scale, count, mask = ctx.saved_tensors
+        g = gradient.to(y.dtype)
+        g = _hidden(torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g, mask)
         wide = y.to(scale.dtype)
-        g = torch.where(wide > 0, gradient, 0) if ctx.rectified else gradient.to(y.dtype)
-        g = _hidden(g, mask)
-        along = (g * wide).sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        dz = g * wide
+        along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
         mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
-        dz = _hidden((wide * along).add_(mean).sub_(g).mul_(-scale), mask).to(x.dtype)
+        torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
+        dz = _hidden(dz, mask).to(x.dtype)
         to_x, to_weight = ctx.needs_input_grad[:2]
         dx = dz @ weight if to_x else None
         dw = dz.flatten(0, 1).mT @ x.flatten(0, 1) if to_weight else None
@@ -141,7 +143,9 @@ def highest_normed(
         x = x.to(weight.dtype)
         with torch.no_grad():
             z = linear(x, torch.where(norm.weight < 0, -1, 1).unsqueeze(-1) * weight)
-            place = (z if mask is None else z.masked_fill(~mask.unsqueeze(-1), -torch.inf)).argmax(1)
+            z = z if mask is None else z.masked_fill(~mask.unsqueeze(-1), -torch.inf)
+            # The same as z.argmax(1), which takes twenty times as long on a CPU.
+            place = nn.functional.adaptive_max_pool2d_with_indices(z.mT.unsqueeze(2), 1)[1].flatten(1)
         first = x.shape[1] * torch.arange(len(x), device=x.device).unsqueeze(-1)
         highest = (nn.functional.embedding(place + first, x.flatten(0, 1)) * weight).sum(2) + bias
         real = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
