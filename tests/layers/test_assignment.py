@@ -68,7 +68,9 @@ def test_padding_and_neighbours_change_nothing(dtype: torch.dtype) -> None:
     together, stats = sinkhorn(padded, mu=0.02, mask2d=mask2d, mask3d=mask3d)
     for i, (m, n) in enumerate(sizes):
         alone, alone_stats = sinkhorn(costs[i], mu=0.02)
-        assert (together[i, :m, :n] - alone[0]).abs().max() < 4 * torch.finfo(dtype).eps
+        assert (together[i, :m, :n] - alone[0]).abs().max() < 16 * torch.finfo(
+            dtype
+        ).eps  # a padded sum has another order
         assert not together[i].masked_select(~(mask2d[i, :, None] & mask3d[i])).any()
         assert stats.iterations[i] == alone_stats.iterations[0]
 

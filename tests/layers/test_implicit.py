@@ -115,7 +115,7 @@ def clusters(seed: int, n: int, *, groups: int = 4) -> Tensor:
 
 
 @pytest.mark.parametrize("mu", [0.1, 0.05, 0.02, 0.01, 0.005])
-@pytest.mark.parametrize(("dtype", "digits"), [(torch.float32, 4e-6), (torch.float64, 1e-10)])
+@pytest.mark.parametrize(("dtype", "digits"), [(torch.float32, 1e-5), (torch.float64, 1e-10)])
 def test_weak_links_between_groups_spoil_no_gradient(mu: float, dtype: torch.dtype, digits: float) -> None:
     for seed in range(4):
         cost, weights = clusters(seed, 10).to(dtype), uniform(1, 10, 10, seed=seed, low=-1).to(dtype)

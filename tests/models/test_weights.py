@@ -111,25 +111,38 @@ def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     assert list(differences(described(Flat(2)), described(Flat(3)))) == ["coordinates=2"]
 
 
-def test_a_checkpoint_of_an_older_form_is_refused_as_such(tmp_path: Path) -> None:
-    older = {"solver": {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "mu": 0.2}}, "state_dict": {}}
-    torch.save(older, tmp_path / "old.ckpt")
-    with pytest.raises(ValueError, match=r"got one of an older form: .*old.ckpt; try"):
-        TrainedNet.from_checkpoint(tmp_path / "old.ckpt")
+OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "mu": 0.2}}
 
 
-@pytest.mark.parametrize("content", [{"solver": {"class": "Hungarian"}, "state_dict": {}}, {"state_dict": {}}, [1]])
-def test_says_that_a_checkpoint_holds_another_solver(tmp_path: Path, content: Any) -> None:
-    torch.save(content, tmp_path / "other.ckpt")
-    with pytest.raises(ValueError, match=r"expected a checkpoint.*other\.ckpt"):
-        BPnPNet.from_checkpoint(tmp_path / "other.ckpt")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ({"solver": OLD_FORM, "state_dict": {}}, r"got one of an older form: .*x\.ckpt; try"),
+        ({"solver": {"class": "Hungarian"}, "state_dict": {}}, r"of BPnPNet, got Hungarian in .*x\.ckpt"),
+        ({"state_dict": {}}, r"of BPnPNet, got another file in .*x\.ckpt"),
+        ([1], r"got a file without a `state_dict`: .*x\.ckpt"),
+        ({"state_dict": {}, "solver": Path()}, r"that cannot be read: .*x\.ckpt"),
+        ("epoch,loss\n1,0.5\n", r"that cannot be read: .*x\.ckpt"),
+    ],
+)
+def test_says_what_a_file_is_instead_of_a_checkpoint_and_runs_no_code(
+    tmp_path: Path, content: Any, message: str
+) -> None:
+    file = tmp_path / "x.ckpt"
+    with pytest.raises(FileNotFoundError, match=r"expected a checkpoint, got no file at .*x\.ckpt"):
+        BPnPNet.from_checkpoint(file)
+    file.write_text(content) if isinstance(content, str) else torch.save(content, file)
+    with pytest.raises(ValueError, match=message):
+        BPnPNet.from_checkpoint(file)
 
 
-def test_says_that_a_file_is_no_checkpoint_and_runs_no_code(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"expected a checkpoint, got no file at .*none\.ckpt"):
-        BPnPNet.from_checkpoint(tmp_path / "none.ckpt")
-    (tmp_path / "text.ckpt").write_text("epoch,loss\n1,0.5\n")
-    torch.save({"state_dict": {}, "solver": Path()}, tmp_path / "code.ckpt")
-    for name in ("text.ckpt", "code.ckpt"):
-        with pytest.raises(ValueError, match=f"expected a checkpoint.*{name}"):
-            BPnPNet.from_checkpoint(tmp_path / name)
+@pytest.mark.parametrize(("setting", "loads"), [(False, True), (True, False)])
+def test_a_setting_that_went_is_forgotten_where_it_had_no_effect(tmp_path: Path, setting: bool, loads: bool) -> None:
+    older = content(small_net())
+    older["solver"]["settings"]["features2d"]["settings"]["batch_norm"] = setting
+    torch.save(older, tmp_path / "older.ckpt")
+    if loads:
+        assert BPnPNet.from_checkpoint(tmp_path / "older.ckpt").features2d.channels == 16
+    else:
+        with pytest.raises(ValueError, match=r"older.ckpt: expected settings of ImageFeatures, got .*batch_norm"):
+            BPnPNet.from_checkpoint(tmp_path / "older.ckpt")
