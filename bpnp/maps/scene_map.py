@@ -312,15 +312,15 @@ class SceneMap:
         path = Path(photo)
         if camera is None or isinstance(camera, SceneMap):
             camera = (camera or self).camera_for(path, exif=camera is None)[0]
-        points, size = photo_keypoints(path, keypoints, path.name if name is None else name), photo_size(path)
-        if camera is None or isinstance(camera, str):
-            return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
-        lens = camera_from(camera)
-        if (known := image_size_of(lens)) not in (None, size):
+        size, lens = photo_size(path), None if camera is None or isinstance(camera, str) else camera_from(camera)
+        if lens is not None and (known := image_size_of(lens)) not in (None, size):
             raise ValueError(
                 f"expected photos of {known[0]} x {known[1]} pixels as the camera has, got {path.name} of {size[0]} x "
                 f"{size[1]}; try a camera with the focal length and the centre of this size, or that of the map"
             )
+        points = photo_keypoints(path, keypoints, path.name if name is None else name)
+        if lens is None:
+            return self.localize(points.pixels, image_size=size, scores=points.scores, **options)
         pixels = points.pixels - (CENTRE if is_opencv(camera) else 0.0)
         return self.localize(pixels, lens, scores=points.scores, **options)
 
