@@ -275,8 +275,10 @@ def _plain(value: Any) -> Any:
 
 
 def _read(kind: type, content: dict[str, Any]) -> Any:
-    """A dataclass of this file from its JSON; files of version 0.1.0 lack fields that have a default."""
-    values = {field.name: content[field.name] for field in fields(kind) if field.name in content}
+    """A dataclass of this file from its JSON. Files of version 0.1.0 lack fields whose default is None, and `LATER`."""
+    missing = [field for field in fields(kind) if field.name not in content]
+    optional = [field.name for field in missing if field.default is None or field.name in LATER]
+    values = {field.name: content[field.name] for field in fields(kind) if field.name not in optional}
     return kind(**{name: READERS[name](value) if name in READERS else value for name, value in values.items()})
 
 
@@ -288,6 +290,7 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
+LATER = {"covariance", "taken2d"}  # than version 0.1.0
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in another form
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),
