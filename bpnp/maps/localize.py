@@ -24,7 +24,7 @@ VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which 
 VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
 BRIEF = DEFAULT.limited(1)  # one raster search
-LONGER = DEFAULT.limited(8)
+LONGER = DEFAULT.limited(16)
 PROMISING = 3  # views that are tried longer if none is confident
 LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}
