@@ -96,7 +96,7 @@ class SceneMap:
 
     @cached_property
     def pictures(self) -> Pictures:
-        """(views, cells^2) what the views' ranks are told from."""
+        """What the views' ranks are told from."""
         return pictures_of_views(self.points3d, self.views)
 
     @cached_property
@@ -155,7 +155,7 @@ class SceneMap:
             points = np.unique(np.concatenate([view.points for view in named]))
             return [Place(view, points, lens) for view in named if len(view.points) and len(points) >= MIN_POINTS]
         cameras: list[Camera] = lens.ladder(STEP) if isinstance(lens, UnknownCamera) else [lens]
-        scores = scores_of_views(cameras[0].normalise(np.asarray(keypoints, np.float64)), self.pictures)
+        scores = self._scores(cameras[0], keypoints, known_focal=isinstance(lens, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
         turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
         tried = [lens.near(one)._replace(alone=True) if isinstance(lens, UnknownCamera) else lens for one in cameras]
@@ -164,6 +164,10 @@ class SceneMap:
             for _, rung, k in sorted(turns)
             if len((view := self.views[k]).points) >= MIN_POINTS
         ]
+
+    def _scores(self, camera: Camera, keypoints: Any, *, known_focal: bool = True) -> NDArray[np.float32]:
+        points2d = camera.normalise(np.asarray(keypoints, np.float64))
+        return scores_of_views(points2d, self.pictures, known_focal=known_focal)
 
     def _region(self, view: View, points: NDArray[np.integer]) -> Region:
         in_camera = self.points3d[view.points] @ view.rotation.T + view.translation
@@ -177,7 +181,7 @@ class SceneMap:
         if views is not None:
             order = self.named(views)
         else:
-            scores = scores_of_views(camera_from(camera).normalise(keypoints), self.pictures)
+            scores = self._scores(camera_from(camera), keypoints)
             order = [self.views[k] for k in np.argsort(-scores, kind="stable")]
         yield from (self._region(view, view.points) for view in order if len(view.points) >= MIN_POINTS)
 

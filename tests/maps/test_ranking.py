@@ -82,6 +82,17 @@ def test_views_of_one_place_come_after_all_other_places() -> None:
 
 
 def test_contrast_is_of_length_one_and_empty_for_no_points() -> None:
-    assert np.linalg.norm(contrast(np.random.default_rng(0).normal(0, 0.2, (50, 2)))) == pytest.approx(1, abs=1e-5)
-    assert not contrast(np.empty((0, 2))).any()
-    assert pictures_of_views(np.zeros((3, 3)), []).shape[0] == 0
+    points2d = np.random.default_rng(0).normal(0, 0.2, (50, 2))
+    assert np.linalg.norm(contrast(points2d, 0.4)) == pytest.approx(1, abs=1e-5)
+    assert not contrast(np.empty((0, 2)), 1.0).any()
+    assert pictures_of_views(np.zeros((3, 3)), []).contrasts.shape[0] == 0
+
+
+def test_views_of_much_wider_points_come_last_where_the_focal_length_is_known() -> None:
+    scene = city(0)
+    narrow = 0.3 * photo(scene, 10, 1)  # three times the focal length
+    known, unknown = (scores_of_views(narrow, scene.pictures, known_focal=known) for known in (True, False))
+    assert known == pytest.approx(unknown - 2)  # all views are as wide as the photo was
+    alike = scores_of_views(photo(scene, 10, 1), scene.pictures)
+    assert (alike > 0).mean() > 0.5
+    assert int((alike > alike[10]).sum()) == int((unknown > unknown[10]).sum())
