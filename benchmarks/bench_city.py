@@ -3,35 +3,178 @@
     python -m benchmarks city --views 477 1000 3000 10000 --limit 12
     python -m benchmarks city --twice 0.1
 
-The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views
-(`cities.py`). Photos of the scenes of --photos are left out with all points that then fewer than two views see. Right
-is within 5 degrees, the centre within a tenth of the distance. --twice: every place is there twice, this share of the
-points of the second one gone; a confident pose in it is wrong, and no pose there is right. A row begins with the rank
-of the views (`bpnp.maps.ranking`): of how many photos one of the first 1, 10 and 50 views is turned by less than 30
-degrees and lies within half the distance.
+The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views:
+other places with the statistics of real ones, mirrored or not, the points moved along a smooth field by a tenth of the
+distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos are left out with all
+points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
+--twice: every place is there twice, this share of the points of the second one gone; a confident pose in it is wrong,
+and no pose there is right. A row begins with the rank of the views (`bpnp.maps.ranking`): of how many photos one of the
+first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
 """
 
 import argparse
 import resource
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 
 import numpy as np
-from bench_views import REPORTED
-from cities import CityPhoto, city
-from record import TIME_LIMIT, Outcome, Rows, degrees, measured, parser, solved
+from numpy.typing import NDArray
+from record import TIME_LIMIT, Array, Outcome, Pose, Problem, Rows, degrees, measured, outcomes, parser
+from scipy.spatial.transform import Rotation
+from view_problems import REPORTED, median_distance, model_of
 
 from bpnp import SceneMap, warm_up
 from bpnp.cameras import camera_from
-from bpnp.datamodules.colmap.reconstruction import read_reconstruction
+from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction
 from bpnp.maps.views import View
 
 RIGHT_DEG, RIGHT_SHIFT = 5.0, 0.1
 NEAR_DEG, NEAR_SHIFT = 30.0, 0.5  # of a view that shows about what a photo shows
 FIRST = (1, 10, 50)
 VIEWS = (477, 1000, 3000, 10_000)
+MOVED, WAVES = 0.1, 6  # root mean square of the field, in distances of the view; sine waves in it
+DROPPED = 0.3  # share of a copy's points
+APART = 40.0  # side of the cube in which places lie, in distances of a view, for 10 of them
+CAMERA = camera_from(np.eye(3))  # views are looked near by pose alone
+NONE = np.empty(0, np.int32)  # track lengths: nothing here asks for them
+
+
+@dataclass(frozen=True, eq=False)
+class CityPhoto:
+    """A photo that was left out: all its keypoints (m, 2), normalised; poses: the true one, and of a repeated place the
+    one there. distance: of the median point that it sees."""
+
+    name: str
+    points2d: Array
+    focal: float
+    poses: tuple[Pose, ...]
+    distance: float
+
+    @property
+    def camera(self) -> Array:
+        return np.diag([self.focal, self.focal, 1.0])
+
+
+def place_of(scene: Reconstruction, left_out: Sequence[ImagePoints] = ()) -> SceneMap:
+    """A model without some views, and without the points that then fewer than two see."""
+    names = {image.name for image in left_out}
+    views = tuple(
+        View(f"{scene.name}/{image.name}", CAMERA, image.rotation, image.translation, image.observed.astype(np.int32))
+        for image in scene.images
+        if image.name not in names
+    )
+    return SceneMap(scene.points3d, scene.point_ids, NONE, views).seen_by(2)
+
+
+def moved(place: SceneMap, scale: float, turn: Array, shift: Array) -> SceneMap:
+    """The place with every point p at scale * turn p + shift."""
+    views = []
+    for view in place.views:
+        rotation = view.rotation @ turn.T
+        views.append(replace(view, rotation=rotation, translation=scale * view.translation - rotation @ shift))
+    return replace(place, points3d=scale * place.points3d @ turn.T + shift, views=tuple(views))
+
+
+def part_of(place: SceneMap, chosen: NDArray[np.bool_], name: str = "") -> SceneMap:
+    """Some points, and all views with those of them that they see; `name` begins the names of the views."""
+    number = np.cumsum(chosen, dtype=np.int32) - 1
+    views = tuple(
+        replace(view, name=name + view.name, points=number[view.points[chosen[view.points]]]) for view in place.views
+    )
+    return SceneMap(place.points3d[chosen], place.point_ids[chosen], NONE, views)
+
+
+def distance_of(place: SceneMap) -> float:
+    """From a view to the points that it sees: the median of the views' medians."""
+    seen = [(place.points3d[view.points], (view.rotation, view.translation)) for view in place.views]
+    return float(np.median([median_distance(*one) for one in seen if len(one[0])]))
+
+
+def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
+    """Another place of the same kind: points moved and dropped, or mirrored with all views."""
+    unit, points = distance_of(place), place.points3d
+    field = np.zeros_like(points)
+    for _ in range(WAVES):
+        along = rng.standard_normal(3)
+        along *= 2 * np.pi / (unit * rng.uniform(0.7, 2.5) * np.linalg.norm(along))
+        field += np.sin(points @ along + rng.uniform(0, 2 * np.pi))[:, None] * rng.standard_normal(3)
+    field *= MOVED * unit / np.sqrt(WAVES * 3 / 2)
+    mirror = np.diag([rng.choice([-1.0, 1.0]), 1.0, 1.0])  # of the scene and, so that views stay views, of the image
+    views = tuple(
+        replace(view, rotation=mirror @ view.rotation @ mirror, translation=mirror @ view.translation)
+        for view in place.views
+    )
+    turned = replace(place, points3d=(points + field) @ mirror, views=views)
+    return part_of(turned, rng.random(len(points)) > DROPPED, name)
+
+
+def anywhere(rng: np.random.Generator, places: int, unit: float) -> tuple[float, Array, Array]:
+    """A similarity: to scene units of 0.5 to 2 distances of a view, any rotation, a place in the city."""
+    scale = float(np.exp(rng.uniform(-1, 1) * np.log(2))) / unit
+    side = APART * (places / 10) ** (1 / 3)
+    return scale, Rotation.random(rng=rng).as_matrix(), rng.uniform(0, side, 3)
+
+
+def photos_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
+    """At most `limit` photos and a fourth of all, spread evenly over those that see enough of what others see."""
+    tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
+    usable = [image for image in scene.images if (tracks[image.observed] >= 3).sum() >= 50]
+    count = min(limit, len(scene.images) // 4)
+    return [usable[k] for k in sorted({int((k + 0.5) * len(usable) / count) for k in range(count)})]
+
+
+def city(
+    scenes: Sequence[Reconstruction], photos: dict[str, int], views: int, seed: int, *, twice: float | None = None
+) -> tuple[SceneMap, list[CityPhoto]]:
+    """The map of all scenes, with changed copies up to a number of views, and the photos that were left out of it.
+
+    photos: of each scene at most so many; points that then fewer than two views see are not in the map. twice: every
+    place is there twice instead, of the second one this share of the points gone.
+    """
+    rng = np.random.default_rng(seed)
+    left_out = {scene.name: photos_of(scene, photos.get(scene.name, 0)) for scene in scenes}
+    first = [place_of(scene, left_out[scene.name]) for scene in scenes]
+    places, found = [], []
+    for place, scene in zip(first, scenes, strict=True):
+        unit = distance_of(place)
+        moves = [anywhere(rng, len(scenes), unit) for _ in range(1 if twice is None else 2)]
+        places.append(moved(place, *moves[0]))
+        if twice is not None:
+            again = part_of(place, rng.random(len(place.points3d)) >= twice, "again/")
+            places.append(moved(again, *moves[1]))
+        for image in left_out[scene.name]:
+            poses = tuple((image.rotation @ q.T, s * image.translation - image.rotation @ q.T @ c) for s, q, c in moves)
+            keypoints = np.concatenate([image.points2d, image.clutter2d]).astype(np.float64)
+            far = median_distance(scene.points3d[image.seen], (image.rotation, image.translation))
+            name, keypoints = f"{scene.name}/{image.name}", rng.permutation(keypoints)
+            found.append(CityPhoto(name, keypoints, image.camera.focal, poses, moves[0][0] * far))
+    if twice is None:
+        places += copies(first, views - sum(len(place.views) for place in places), views, rng)
+    return merged(places), found
+
+
+def copies(first: Sequence[SceneMap], more: int, views: int, rng: np.random.Generator) -> Iterator[SceneMap]:
+    """Changed copies of the places, one after the other, up to so many more views."""
+    number = 0
+    while more > 0:
+        place = changed(first[number % len(first)], rng, f"copy {number // len(first) + 1}/")
+        place = replace(place, views=place.views[:more])
+        yield moved(place, *anywhere(rng, len(first) * max(views // 500, 1), distance_of(place)))
+        more, number = more - len(place.views), number + 1
+
+
+def merged(places: Sequence[SceneMap]) -> SceneMap:
+    """One map of all places, its ids in their order."""
+    starts = np.cumsum([0] + [len(place.points3d) for place in places])
+    views = tuple(
+        replace(view, points=view.points + np.int32(start))
+        for place, start in zip(places, starts, strict=False)
+        for view in place.views
+    )
+    points = np.concatenate([place.points3d for place in places])
+    return SceneMap(points, np.arange(len(points)), NONE, views).seen_by(1)
 
 
 def opened(scene: SceneMap) -> float:
@@ -45,7 +188,7 @@ def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
     """Shares of the photos that have a view near by among the first of the rank, and its milliseconds a view."""
     places, start = [], time.process_time()
     for photo in photos:
-        places.append(scene.places(None, photo.points2d, camera_from(np.eye(3))))
+        places.append(scene.places(None, photo.points2d, CAMERA))
     seconds = (time.process_time() - start) / len(photos) / len(scene.views)
     first = [
         min((k for k, place in enumerate(order) if is_near(place.view, photo)), default=len(order))
@@ -63,30 +206,30 @@ def is_near(view: View, photo: CityPhoto) -> bool:
     )
 
 
-def outcomes(scene: SceneMap, photos: Sequence[CityPhoto], seed: int, limit: float) -> list[Outcome]:
-    seconds, rank, found = opened(scene), ranked(scene, photos), []
-    for photo in photos:
-        camera = np.diag([photo.focal, photo.focal, 1.0])
-        search = partial(scene.localize, photo.focal * photo.points2d, camera, seed=seed, time_limit=limit)
-        found.append(solved(photo.name, *photo.poses[0], search, distance=photo.distance))
+def localized(scene: SceneMap, photos: Sequence[CityPhoto], seed: int, limit: float) -> list[Outcome]:
+    seconds, rank = opened(scene), ranked(scene, photos)
+    found = outcomes(
+        Problem(
+            photo.name,
+            partial(scene.localize, photo.focal * photo.points2d, photo.camera, seed=seed, time_limit=limit),
+            photo.poses,
+            distance=photo.distance,
+        )
+        for photo in photos
+    )
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"opened in {seconds:.2g} CPU s, {memory:.2g} GB, {rank}", end="; ")
     return found
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    scenes = [read_reconstruction(folder, name=folder.parents[1].name) for folder in folders(options)]
+    names = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
+    scenes = [model_of(options.data, name) for name in names]
     wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
     for views in options.views if options.twice is None else [0]:
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
         name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
-        yield name, partial(outcomes, scene, photos[: options.limit], options.seed, options.time_limit)
-
-
-def folders(options: argparse.Namespace) -> list[Path]:
-    """Those of the models: given ones, or all in the folder of the data."""
-    models = options.data / "colmap"
-    return [models / name / "sparse/0" for name in options.scenes or sorted(path.name for path in models.iterdir())]
+        yield name, partial(localized, scene, photos[: options.limit], options.seed, options.time_limit)
 
 
 def main() -> None:

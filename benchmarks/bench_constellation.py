@@ -2,22 +2,75 @@
 
     python -m benchmarks constellation --limit 200 --only "ring, 3 lights" drone
 
-Every frame has a new pose, every fifth a new device. Right is a rotation within 3 degrees.
+Devices are made from a kind and a seed: LEDs with outward normals at random places on a ring, a headset's shell, a
+drone's frame, or a marker's arms; metres and pixels. Every frame has a new pose, every fifth a new device. Right is a
+rotation within 3 degrees.
 """
 
 import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
-from constellations import Camera, Frame, Kind, device, frame
-from record import Outcome, measured, parser, solved
+from numpy.typing import NDArray
+from record import Array, Problem, measured, parser
 from scipy.spatial.transform import Rotation
 
 import bpnp
 
 RIGHT_DEG = 3.0
-FISHEYE = Camera(focal=330.0, size=900, fisheye=True)
+Kind = Literal["ring", "headset", "drone", "marker"]
+MOST_POSES = 2000  # that are drawn for one picture
+FACING_DEG = 78.0  # largest angle between a normal and the line of sight to a LED that is seen
+DISTANCE, OFF_AXIS = (0.25, 0.8), 0.5  # metres; of the device from the optical axis, share of half the picture
+SIZES = {"ring": 17, "headset": 34, "drone": 8, "marker": 5}
+
+
+@dataclass(frozen=True)
+class Device:
+    """LEDs (n, 3), metres, and their outward unit normals (n, 3)."""
+
+    points3d: Array
+    normals3d: Array
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole or an equidistant fisheye camera: image radius f tan(theta) or f theta, square image."""
+
+    focal: float = 480.0
+    size: int = 800
+    fisheye: bool = False
+
+    def project(self, camera: Array) -> Array:
+        """Pixels (n, 2) of points (n, 3) in the camera frame, NaN where they cannot be seen."""
+        radius, depth = np.linalg.norm(camera[:, :2], axis=-1), camera[:, 2]
+        if self.fisheye:
+            scale = self.focal * np.arctan2(radius, depth) / np.maximum(radius, 1e-12)
+        else:
+            scale = self.focal / np.where(depth > 0, depth, np.nan)
+        pixels = camera[:, :2] * scale[:, None] + self.size / 2
+        inside = ((pixels >= 0) & (pixels < self.size)).all(-1, keepdims=True)
+        return np.where(inside, pixels, np.nan)
+
+    def bearings(self, pixels: Array) -> Array:
+        """Unit rays (n, 3) of pixels (n, 2)."""
+        centred = (pixels - self.size / 2) / self.focal
+        if not self.fisheye:
+            rays = np.column_stack([centred, np.ones(len(centred))])
+            return rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        theta = np.linalg.norm(centred, axis=-1, keepdims=True)
+        return np.column_stack([centred * np.sinc(theta / np.pi), np.cos(theta)])
+
+    @property
+    def model(self) -> tuple[str, list[float]]:
+        """As `bpnp.solve` takes it."""
+        middle = self.size / 2
+        if self.fisheye:
+            return "OPENCV_FISHEYE", [self.focal, self.focal, middle, middle, 0.0, 0.0, 0.0, 0.0]
+        return "PINHOLE", [self.focal, self.focal, middle, middle]
 
 
 class Setting(NamedTuple):
@@ -36,6 +89,108 @@ class Setting(NamedTuple):
     most: int | None = None
 
 
+@dataclass(frozen=True)
+class Frame:
+    """One picture: pixels (m, 2) in random order, the device, camera = R p + t, and which LED each pixel is (-1)."""
+
+    pixels: Array
+    camera: Camera
+    device: Device
+    rotation: Array
+    translation: Array
+    led: NDArray[np.int64]
+
+    @property
+    def gravity(self) -> tuple[Array, Array]:
+        """The direction up in the camera and in the device's frame, without noise: the device's z axis."""
+        return self.rotation[:, 2], np.array([0.0, 0.0, 1.0])
+
+
+def device(kind: Kind, seed: int) -> Device:
+    """A random layout of a kind."""
+    rng = np.random.default_rng([seed, list(SIZES).index(kind)])
+    count = SIZES[kind]
+    if kind == "ring":
+        angle = 2 * np.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+        tilt = np.radians(rng.uniform(-35, 35, count))
+        outward = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], -1)
+        up = np.array([0.0, 0.0, 1.0])
+        points = 0.045 * outward + rng.uniform(-0.012, 0.012, count)[:, None] * up
+        normals = np.cos(tilt)[:, None] * outward + np.sin(tilt)[:, None] * up
+    elif kind == "headset":
+        normals = _spread_directions(count, rng)
+        points = normals / np.linalg.norm(normals / np.array([0.09, 0.05, 0.06]), axis=-1, keepdims=True)
+        points += rng.normal(0, 0.002, points.shape)
+    elif kind == "drone":
+        arm = np.arange(count) % 4
+        angle = np.pi / 4 + np.pi / 2 * arm + rng.uniform(-0.25, 0.25, count)
+        radius = rng.uniform(0.06, 0.18, count)
+        points = np.stack([radius * np.cos(angle), radius * np.sin(angle), rng.uniform(-0.03, 0.03, count)], -1)
+        normals = np.stack([0.5 * np.cos(angle), 0.5 * np.sin(angle), rng.uniform(-1, 1, count)], -1)
+    else:
+        points = rng.uniform(-0.06, 0.06, (count, 3)) * np.array([1, 1, 0.6])
+        normals = np.tile([0.0, 0.0, 1.0], (count, 1)) + rng.normal(0, 0.25, (count, 3))
+    return Device(points, normals / np.linalg.norm(normals, axis=-1, keepdims=True))
+
+
+def frame(device: Device, setting: Setting, rng: np.random.Generator) -> Frame:
+    """A picture of a device in a random pose; half of the lights that are not its own are around it.
+
+    Raises ValueError for a device of which so many LEDs as the setting asks for are never seen.
+    """
+    camera, background, most = setting.camera, setting.background, setting.most
+    for _ in range(MOST_POSES):
+        rotation = Rotation.random(random_state=rng.integers(2**31)).as_matrix()
+        middle = camera.bearings(camera.size / 2 * (1 + OFF_AXIS * rng.uniform(-1, 1, (1, 2))))[0]
+        translation = rng.uniform(*DISTANCE) * middle
+        led, pixels = seen(device, setting, rotation, translation, rng)
+        if len(led) < setting.least:
+            continue
+        if most is not None and len(led) > most:
+            chosen = rng.choice(len(led), most, replace=False)
+            led, pixels = led[chosen], pixels[chosen]
+        lights = camera.size * rng.random((background, 2))
+        near = rng.random(background) < 0.5
+        spread = 1.5 * np.ptp(pixels, axis=0).max()
+        lights[near] = (pixels.mean(0) + spread * rng.uniform(-1, 1, (background, 2)))[near]
+        lights = np.clip(lights, 0, camera.size - 1)
+        order = rng.permutation(len(led) + background)
+        every = np.concatenate([pixels, lights])[order]
+        return Frame(
+            every, camera, device, rotation, translation, np.concatenate([led, np.full(background, -1)])[order]
+        )
+    raise ValueError(
+        f"expected a device of which {setting.least} LEDs can be seen at once, got none of {MOST_POSES} poses"
+    )
+
+
+def seen(
+    device: Device, setting: Setting, rotation: Array, translation: Array, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], Array]:
+    """The LEDs that are detected and their noisy pixels."""
+    points = device.points3d @ rotation.T + translation
+    sight = -points / np.linalg.norm(points, axis=-1, keepdims=True)
+    facing = (sight * (device.normals3d @ rotation.T)).sum(-1) > np.cos(np.radians(FACING_DEG))
+    pixels = setting.camera.project(points)
+    detected = facing & np.isfinite(pixels).all(-1) & (rng.random(len(points)) >= setting.missing)
+    led = np.flatnonzero(detected)
+    return led, pixels[led] + setting.noise * rng.standard_normal((len(led), 2))
+
+
+def _spread_directions(count: int, rng: np.random.Generator) -> Array:
+    """Directions of the front three quarters of the sphere, no two very close."""
+    chosen: list[Array] = []
+    while len(chosen) < count:
+        trial = rng.standard_normal((64, 3))
+        trial /= np.linalg.norm(trial, axis=-1, keepdims=True)
+        trial = trial[trial[:, 2] > -0.5]
+        if chosen:
+            trial = trial[np.argsort((trial @ np.array(chosen).T).max(-1))]
+        chosen.append(trial[0])
+    return np.array(chosen)
+
+
+FISHEYE = Camera(focal=330.0, size=900, fisheye=True)
 SETTINGS = {
     setting.name: setting
     for kind in ("ring", "headset")
@@ -55,29 +210,25 @@ SETTINGS = {
 }
 
 
-def outcomes(name: str, limit: int, seed: int) -> list[Outcome]:
+def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
     """Frames of a setting; every fifth has a new device."""
     setting = SETTINGS[name]
     rng = np.random.default_rng([seed, list(SETTINGS).index(name)])
-    frames = [picture(setting, 1000 * seed + i // 5, rng) for i in range(limit)]
-    return [
-        solved(f"{name} {i}", shown.rotation, shown.translation, partial(search, shown, setting, rng))
-        for i, shown in enumerate(frames)
-    ]
+    for i in range(limit):
+        shown = picture(setting, 1000 * seed + i // 5, rng)
+        search = partial(solution, shown, setting, rng)
+        yield Problem(f"{name}/{i}", search, [(shown.rotation, shown.translation)], shown.device.points3d)
 
 
 def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
     """A frame of the device with this seed, or of the next one whose LEDs can be seen."""
     for number in range(100):
         with contextlib.suppress(ValueError):
-            return frame(
-                device(setting.kind, seed + 10**6 * number), rng, camera=setting.camera, noise=setting.noise,
-                background=setting.background, missing=setting.missing, least=setting.least, most=setting.most,
-            )  # fmt: skip
+            return frame(device(setting.kind, seed + 10**6 * number), setting, rng)
     raise ValueError(f"expected a device of {setting.name} whose LEDs can be seen, got none of 100")
 
 
-def search(shown: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Solution:
+def solution(shown: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Solution:
     prior, normals = None, shown.device.normals3d if setting.normals else None
     if setting.gravity:
         up, up_device = shown.gravity
@@ -89,7 +240,7 @@ def search(shown: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Sol
 def main() -> None:
     chosen = parser(__doc__).parse_args()
     bpnp.warm_up()
-    rows = ((name, partial(outcomes, name, chosen.limit, chosen.seed)) for name in SETTINGS)
+    rows = ((name, partial(problems, name, chosen.limit, chosen.seed)) for name in SETTINGS)
     measured(rows, chosen, RIGHT_DEG)
 
 

@@ -3,19 +3,21 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Methods: views (the three views that share most points are named), map (none is); views-sift and map-sift, the same
-with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words retrieves.
+with SIFT descriptors, a ratio test and PoseLib.
 pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of all
 photos, aligned by the views that both models have.
 """
 
 import argparse
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from descriptor_poses import DescribedMap
 from rebuilt_maps import PhotoScene, aligned
-from record import TIME_LIMIT, Outcome, Rows, measured, parser, solved
+from record import TIME_LIMIT, Problem, Rows, measured, parser
+from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
 from bpnp.maps.photos import detected_keypoints
@@ -23,47 +25,34 @@ from bpnp.maps.photos import detected_keypoints
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 FEATURES = 2048  # of a photo in the maps, the largest
 VIEWS = 3
-METHODS = ("views", "map", "views-sift", "map-sift", "words-sift")
+METHODS = ("views", "map", "views-sift", "map-sift")
 RIGHT_DEG = 1.0
 
 
-def searches(
-    scene: PhotoScene, photo: str, place: SceneMap, views: list[str], methods: Sequence[str], seed: int
-) -> dict[str, Callable[[], Solution]]:  # fmt: skip
-    """What finds the photo, by method; reading and detecting is done before."""
-    found = detected_keypoints(scene.photos / photo)
+def problems_of(
+    scene: PhotoScene, photo: str, full: SceneMap, methods: Sequence[str], seed: int
+) -> dict[str, Problem]:  # fmt: skip
+    """By method, of one photo that is left out of its map; reading and detecting is done before."""
+    place, found = SceneMap.from_colmap(scene.without(photo)), detected_keypoints(scene.photos / photo)
+    (true,) = full.named([photo])
+    shared = np.array([np.isin(view.points, true.points).sum() for view in full.views])
+    likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
+    views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
+    far = median_distance(full.points3d[true.points], (true.rotation, true.translation))
+    alignment = aligned(full, place)
+    rotation, centre = alignment.pose(true.rotation, true.translation)
     described = DescribedMap(scene.without(photo), scene.database) if any("sift" in m for m in methods) else None
 
-    def one(method: str) -> Callable[[], Solution]:
+    def search(method: str) -> Callable[[], Solution]:
         named = views if method.startswith("views") else None
         if described is not None and method.endswith("-sift"):
-            if method == "words-sift":
-                described.open()
-                return lambda: described.localize(photo, scene.camera, described.retrieved(photo))
             return lambda: described.localize(photo, scene.camera, named)
         return lambda: place.localize(
             found.pixels, ("PINHOLE", scene.camera), views=named, scores=found.scores, seed=seed, time_limit=TIME_LIMIT
         )
 
-    return {method: one(method) for method in methods}
-
-
-def photo_outcomes(
-    scene: PhotoScene, photo: str, full: SceneMap, methods: Sequence[str], seed: int
-) -> dict[str, Outcome]:  # fmt: skip
-    """By method, of one photo that is left out of its map."""
-    place = SceneMap.from_colmap(scene.without(photo))
-    (true,) = full.named([photo])
-    shared = np.array([np.isin(view.points, true.points).sum() for view in full.views])
-    likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
-    views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
-    distance = float(np.median(np.linalg.norm(full.points3d[true.points] - true.centre, axis=1)))
-    rotation, centre = aligned(full, place).pose(true.rotation, true.translation)
-    unit = distance * aligned(full, place).scale
-    return {
-        method: solved(f"{scene.photos.name}/{photo}", rotation, -rotation @ centre, search, distance=unit)
-        for method, search in searches(scene, photo, place, views, methods, seed).items()
-    }
+    name, pose = f"{scene.photos.name}/{photo}", (rotation, -rotation @ centre)
+    return {method: Problem(name, search(method), [pose], distance=far * alignment.scale) for method in methods}
 
 
 def rows(options: argparse.Namespace) -> Rows:
@@ -73,9 +62,9 @@ def rows(options: argparse.Namespace) -> Rows:
         full = SceneMap.from_colmap(scene.full())
         photos = [photo for photo in scene.names() if photo in full.view_numbers]
         chosen = [photos[i] for i in sorted({int(k * len(photos) / options.limit) for k in range(options.limit)})]
-        found = [photo_outcomes(scene, photo, full, options.methods, options.seed) for photo in chosen]
+        drawn = [problems_of(scene, photo, full, options.methods, options.seed) for photo in chosen]
         for method in options.methods:
-            yield f"{name}, {method}", lambda method=method: [one[method] for one in found]  # type: ignore[misc] # noqa: B023
+            yield f"{name}, {method}", partial(list, [one[method] for one in drawn])
 
 
 def main() -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from record import TIME_LIMIT, Array, Outcome, measured, parser, solved
+from record import TIME_LIMIT, Array, Problem, measured, parser
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
@@ -22,13 +22,13 @@ from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.shapes import procedural_shape
 from bpnp.datamodules.surfaces import normalise, sample_surface
 
-Problem = tuple[str, Array, Array, Array, Array]  # name, points2d, points3d, rotation, translation
+Points = tuple[str, Array, Array, Array, Array]  # name, points2d, points3d, rotation, translation
 POINTS, NOISE = 400, 2 / 800
 RIGHT_DEG = 2.0
 SETS = ("shapes", "shapes-0.25", "shapes-0.50", "psb", "psb-so3", "psb-0.50", "fountain-P11", "fountain-P11-0.50")
 
 
-def shapes(ratio: float, limit: int, seed: int) -> Iterator[Problem]:
+def shapes(ratio: float, limit: int, seed: int) -> Iterator[Points]:
     """400 points of a shape in the unit sphere, seen from 4 to 5 units with noise of 2 pixels at a focal length of
     800, and `ratio` times as many random points in the boxes of both sides."""
     for k in range(limit):
@@ -43,7 +43,7 @@ def shapes(ratio: float, limit: int, seed: int) -> Iterator[Problem]:
         yield f"shape {k}", points2d, points3d, rotation, translation
 
 
-def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Iterator[Problem]:
+def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Iterator[Points]:
     """Meshes or photos, spread evenly over those that there are."""
     if name.startswith("psb"):
         rotation: Literal["so3", "euler"] = "so3" if name == "psb-so3" else "euler"
@@ -61,23 +61,24 @@ def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Itera
         yield f"{name}/{batch.ids[0]}", *(x[0].double().numpy() for x in values if x is not None)  # type: ignore[misc]
 
 
-def outcomes(chosen: str, data: Path, limit: int, seed: int) -> list[Outcome]:
-    """What `solve` finds of a set."""
+def problems(
+    chosen: str, data: Path, limit: int, seed: int, time_limit: float = TIME_LIMIT
+) -> Iterator[Problem]:  # fmt: skip
+    """Those of a set."""
     match = re.fullmatch(r"(.+?)(?:-(\d+\.\d+))?", chosen)
     assert match is not None
     kind, ratio = match[1], float(match[2] or 0)
-    problems = shapes(ratio, limit, seed) if kind == "shapes" else of_data(kind, ratio, data, limit, seed)
-    return [
-        solved(name, rotation, translation, partial(solve, points2d, points3d, seed=seed, time_limit=TIME_LIMIT))
-        for name, points2d, points3d, rotation, translation in problems
-    ]
+    drawn = shapes(ratio, limit, seed) if kind == "shapes" else of_data(kind, ratio, data, limit, seed)
+    for name, points2d, points3d, rotation, translation in drawn:
+        search = partial(solve, points2d, points3d, seed=seed, time_limit=time_limit)
+        yield Problem(name, search, [(rotation, translation)], points3d)
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("sets", nargs="*", default=SETS, metavar="SET")
     chosen = options.parse_args()
-    rows = ((name, partial(outcomes, name, chosen.data, chosen.limit, chosen.seed)) for name in chosen.sets)
+    rows = ((name, partial(problems, name, chosen.data, chosen.limit, chosen.seed)) for name in chosen.sets)
     measured(rows, chosen, RIGHT_DEG)
 
 

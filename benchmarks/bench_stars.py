@@ -11,52 +11,39 @@ import importlib
 import struct
 import tempfile
 import time
+from collections.abc import Iterator
 from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from record import Array, Outcome, Rows, degrees, measured, parser, solved
+from bench_constellation import Camera
+from record import TIME_LIMIT, Array, Outcome, Problem, Rows, degrees, measured, parser
 from scipy.spatial.transform import Rotation
 
 import bpnp
 
 RIGHT_DEG = 0.2
-SIZE = 2000.0  # pixels of a side
+SIZE = 2000  # pixels of a side
 FALSE, MISSING, NOISE_PX, LEAST = 0.3, 0.2, 0.3, 8
 CATALOGUES, FIELDS = (2000, 5000, 10_000), (5.0, 20.0, 60.0, 180.0)
 WIDE = 100.0  # degrees from which the camera is a fisheye
 NARROW, IN_VIEW = 5.0, 15.0  # up to these degrees a catalogue is a belt of the sky, in which a field has so many stars
 FOCAL = (0.8, 0.95, 0.98, 1.003, 1.02, 1.05, 1.2)
 FOCAL_ERROR = 0.1
+NOWHERE = np.full((3, 3), np.nan)
 
 
 class Frame(NamedTuple):
-    """Pixels (m, 2) of stars and others, directions (n, 3), rotation, field of view in degrees."""
+    """Pixels (m, 2) of stars and others, directions (n, 3), rotation."""
 
     pixels: Array
     directions: Array
     rotation: Array
-    field: float
 
 
-def focal(field: float) -> float:
+def lens(field: float, factor: float = 1.0) -> Camera:
     half = np.radians(field / 2)
-    return float(SIZE / 2 / (half if field > WIDE else np.tan(half)))
-
-
-def camera(field: float, factor: float = 1.0) -> tuple[str, tuple[float, ...]]:
-    f, c = factor * focal(field), SIZE / 2
-    return ("OPENCV_FISHEYE", (f, f, c, c, 0, 0, 0, 0)) if field > WIDE else ("SIMPLE_PINHOLE", (f, c, c))
-
-
-def project(seen: Array, field: float) -> Array:
-    """Pixels (k, 2) of directions in the camera, NaN outside the image."""
-    angle = np.arctan2(np.linalg.norm(seen[:, :2], axis=-1), seen[:, 2])
-    radius = focal(field) * (angle if field > WIDE else np.tan(np.minimum(angle, 1.5)))
-    pixels = radius[:, None] * seen[:, :2] / np.sin(np.maximum(angle, 1e-12))[:, None] + SIZE / 2
-    widest = np.radians(field / 2 if field > WIDE else 80.0)
-    inside = (np.abs(pixels - SIZE / 2) < SIZE / 2).all(-1) & (angle < widest)
-    return np.where(inside[:, None], pixels, np.nan)
+    return Camera(float(factor * SIZE / 2 / (half if field > WIDE else np.tan(half))), SIZE, field > WIDE)
 
 
 def anywhere(rng: np.random.Generator, count: int, field: float) -> Array:
@@ -85,39 +72,34 @@ def frame(count: int, field: float, seed: int, i: int) -> Frame:
     while True:
         to_middle, _ = Rotation.align_vectors([[0.0, 0.0, 1.0]], directions[rng.integers(count)][None])
         rotation = (Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]) * to_middle).as_matrix()
-        pixels = project(directions @ rotation.T, field)
-        found = pixels[np.isfinite(pixels[:, 0]) & (rng.random(count) > MISSING)]
+        pixels = lens(field).project(directions @ rotation.T)
+        shown = np.isfinite(pixels[:, 0]) & (np.linalg.norm(pixels - SIZE / 2, axis=-1) < SIZE / (2 - (field < WIDE)))
+        found = pixels[shown & (rng.random(count) > MISSING)]
         if len(found) >= LEAST:
             break
     others = anywhere(rng, round(len(found) * FALSE / (1 - FALSE)), field)
     found = found + NOISE_PX * rng.standard_normal(found.shape)
-    return Frame(rng.permutation(np.concatenate([found, others])), directions, rotation, field)
+    return Frame(rng.permutation(np.concatenate([found, others])), directions, rotation)
 
 
-def by_search(shown: Frame, seed: int, factor: float = 1.0, focal_error: float | None = None) -> bpnp.Solution:
-    about = camera(shown.field, factor)
-    return bpnp.solve(
-        shown.pixels, shown.directions, about, at_infinity=True, focal_error=focal_error, seed=seed, time_limit=60
-    )
-
-
-def outcomes(count: int, field: float, limit: int, seed: int, kind: str = "") -> list[Outcome]:
-    """Of true fields, or of what a confident answer to is wrong: nothing is right there."""
-    rows = []
+def problems(count: int, field: float, limit: int, seed: int, kind: str = "") -> Iterator[Problem]:
+    """True fields, or those of which a confident answer is wrong: nothing is right there."""
     for i in range(limit):
         shown, factor, error = frame(count, field, seed, i), 1.0, None
         if kind == "noise":
             places = anywhere(np.random.default_rng([seed, i]), len(shown.pixels), field)
-            shown = shown._replace(pixels=places, rotation=np.full((3, 3), np.nan))
+            shown = shown._replace(pixels=places, rotation=NOWHERE)
         elif kind == "mirror":
-            mirrored = [SIZE, 0] + shown.pixels * [-1, 1]
-            shown = shown._replace(pixels=mirrored, rotation=np.full((3, 3), np.nan))
+            shown = shown._replace(pixels=[SIZE, 0] + shown.pixels * [-1, 1], rotation=NOWHERE)
         elif kind == "wrong focal":
             factor = FOCAL[i % len(FOCAL)]
         elif kind == "unknown focal":
             factor, error = np.exp(FOCAL_ERROR * np.random.default_rng([seed, i]).standard_normal()), FOCAL_ERROR
-        rows.append(solved(f"{i}", shown.rotation, np.zeros(3), partial(by_search, shown, i, factor, error)))
-    return rows
+        search = partial(
+            bpnp.solve, shown.pixels, shown.directions, lens(field, factor).model, at_infinity=True, focal_error=error,
+            seed=i, time_limit=TIME_LIMIT,
+        )  # fmt: skip
+        yield Problem(f"{i}", search, [(shown.rotation, np.zeros(3))])
 
 
 @lru_cache(2)
@@ -136,32 +118,29 @@ def tetra_database(count: int, field: float, seed: int) -> Any:
         )
 
 
-def by_tetra(count: int, field: float, limit: int, seed: int) -> list[Outcome]:
+def by_tetra(count: int, field: float, limit: int, seed: int) -> Iterator[Outcome]:
     """tetra3rs on the same frames; it believes what it returns."""
-    rows = []
     for i in range(limit):
         shown = frame(count, field, seed, i)
         database = tetra_database(count, field, 1000 * seed + i // 10)
         start = time.process_time()
         found = database.solve_from_centroids(
-            shown.pixels - SIZE / 2, fov_estimate_deg=field, image_width=int(SIZE), image_height=int(SIZE),
-            match_radius=0.002,
-        )  # fmt: skip
+            shown.pixels - SIZE / 2, fov_estimate_deg=field, image_width=SIZE, image_height=SIZE, match_radius=0.002
+        )
         seconds = time.process_time() - start
-        turned = np.asarray(found.rotation_matrix_icrs_to_camera) if found else np.full((3, 3), np.nan)
-        rows.append(Outcome("", degrees(turned, shown.rotation), 0.0, "confident" if found else "failed", seconds))
-    return rows
+        turned = np.asarray(found.rotation_matrix_icrs_to_camera) if found else NOWHERE
+        yield Outcome("", degrees(turned, shown.rotation), 0.0, "confident" if found else "failed", seconds)
 
 
 def rows(limit: int, seed: int, *, peers: bool) -> Rows:
     for count in CATALOGUES:
         for field in FIELDS:
-            yield f"{count}, {field:.0f} deg", partial(outcomes, count, field, limit, seed)
+            yield f"{count}, {field:.0f} deg", partial(problems, count, field, limit, seed)
             if peers and field < WIDE:
                 yield f"tetra3rs: {count}, {field:.0f} deg", partial(by_tetra, count, field, limit, seed)
     for kind in ("noise", "mirror", "wrong focal", "unknown focal"):
         for field in FIELDS:
-            yield f"{kind}, {field:.0f} deg", partial(outcomes, CATALOGUES[0], field, limit, seed, kind)
+            yield f"{kind}, {field:.0f} deg", partial(problems, CATALOGUES[0], field, limit, seed, kind)
 
 
 def main() -> None:

@@ -1,110 +1,75 @@
 """Photos left out of their COLMAP map, against the points of one view, of several, or of the whole map.
 
-    python -m benchmarks views --methods solve view-prior localize --outliers 0.5 0.75 1 fountain-P11 walkthrough
+    python -m benchmarks views --methods solve localize --outliers 0.5 0.75 1 fountain-P11 walkthrough
     python -m benchmarks views --methods localize --views 0 --all-points --outliers 1 fountain-P11 walkthrough
 
-The protocol of GoMatch (Zhou et al., ECCV 2022). Methods: solve (no prior); view-prior (the pose of the first view as
-`PosePrior`); localize (a map's `localize`, told the names of the views, or none with --views 0); the names of packaged
-weights. --elsewhere: each photo against the views of another place, where none may be confident.
+The protocol of GoMatch (Zhou et al., ECCV 2022). Methods: solve (no prior); localize (a map's `localize`, told the
+names of the views, or none with --views 0). --elsewhere: each photo against the views of another place, where none may
+be confident.
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from record import DATA, TIME_LIMIT, Outcome, Rows, measured, parser, solved
-from view_problems import MOST_POINTS, ViewProblem, scene_problems
+from record import DATA, TIME_LIMIT, Problem, Rows, measured, parser
+from view_problems import MOST_POINTS, REPORTED, ViewProblem, scene_problems
 
-from bpnp import PosePrior, Solution, solve
-from bpnp.maps.localize import VIEW_DEGREES, VIEW_SHARE
-from bpnp.models import TrainedNet
-from bpnp.models.weights import pretrained_names
+from bpnp import Solution, solve
 
-REPORTED = ("fountain-P11", "south_building", "tabletop", "walk_4", "walkthrough")  # no constant was chosen on them
 RIGHT_DEG = 1.0
 
 
-def by_search(problem: ViewProblem, seed: int, **options: Any) -> Solution:
-    pixels, camera = problem.pixels
-    return solve(pixels, problem.points3d, camera, seed=seed, time_limit=TIME_LIMIT, **options)
+def by_search(photo: ViewProblem, **options: float) -> Solution:
+    pixels, camera = photo.pixels
+    return solve(pixels, photo.points3d, camera, **options)  # type: ignore[arg-type]
 
 
-def by_view(problem: ViewProblem, seed: int, **options: Any) -> Solution:
-    return by_search(problem, seed, prior=prior_of_view(problem), **options)
+def in_map(photo: ViewProblem, **options: float) -> Solution:
+    return photo.scene.localize(*photo.pixels, views=photo.views or None, **options)  # type: ignore[arg-type]
 
 
-def in_map(problem: ViewProblem, seed: int) -> Solution:
-    views = problem.views or None
-    return problem.scene.localize(*problem.pixels, views=views, seed=seed, time_limit=TIME_LIMIT)
+METHODS = {"solve": by_search, "localize": in_map}
 
 
-def prior_of_view(problem: ViewProblem) -> PosePrior:
-    """The first view's pose, with the uncertainty that a map assumes of a photo beside a view."""
-    (view,) = problem.scene.named(problem.views[:1])
-    distance = np.median(np.linalg.norm(problem.points3d @ view.rotation.T + view.translation, axis=-1))
-    return PosePrior(view.rotation, view.translation, VIEW_DEGREES, VIEW_SHARE * float(distance))
+def problems(photos: Sequence[ViewProblem], method: str, seed: int) -> Iterator[Problem]:
+    """Of photos by a method; the error of a centre in distances of the median point."""
+    for photo in photos:
+        search = partial(METHODS[method], photo, seed=seed, time_limit=TIME_LIMIT)
+        yield Problem(photo.name, search, [photo.pose], photo.points3d, photo.distance)
 
 
-def by_network(weights: str) -> Callable[[ViewProblem, int], Solution]:
-    @cache
-    def net() -> TrainedNet:
-        return TrainedNet.from_pretrained(weights).eval()
-
-    def solve_with(problem: ViewProblem, seed: int) -> Solution:
-        search = by_view if getattr(net(), "frame", "any") == "view" else by_search
-        return search(problem, seed, solver=net())
-
-    return solve_with
-
-
-METHODS: dict[str, Callable[[ViewProblem, int], Solution]] = {
-    "solve": by_search, "view-prior": by_view, "localize": in_map,
-    **{name: by_network(name) for name in pretrained_names()},
-}  # fmt: skip
-
-
-def outcomes(problems: Sequence[ViewProblem], method: str, seed: int) -> list[Outcome]:
-    """What a method finds of the photos; the error of a centre in distances of the median point."""
-    return [
-        solved(
-            one.name, one.rotation, one.translation, partial(METHODS[method], one, seed), distance=one.distance
-        )
-        for one in problems
-    ]  # fmt: skip
-
-
-def elsewhere(problems: Sequence[ViewProblem]) -> list[ViewProblem]:
+def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:
     """The views of each problem with the photo of the problem that comes half of them later."""
-    others = [*problems[len(problems) // 2 :], *problems[: len(problems) // 2]]
+    others = [*photos[len(photos) // 2 :], *photos[: len(photos) // 2]]
     return [
-        replace(problem, points2d=other.points2d, focal=other.focal, match3d=np.full_like(problem.match3d, -1))
-        for problem, other in zip(problems, others, strict=True)
+        replace(photo, points2d=other.points2d, focal=other.focal, match3d=np.full_like(photo.match3d, -1))
+        for photo, other in zip(photos, others, strict=True)
     ]
 
 
 def photos(
-    limit: int, seed: int, *, scenes: Sequence[str] = REPORTED, data: Path = DATA, apart: bool = False, **chosen: Any
-) -> list[ViewProblem]:
-    """At most `limit` photos of the scenes together. chosen: options of `view_problem`."""
+    limit: int, seed: int, *, scenes: Sequence[str] = REPORTED, data: Path = DATA, apart: bool = False,
+    views: int = 1, outliers: float = 1.0, best: bool = False, most: int | None = MOST_POINTS,
+) -> list[ViewProblem]:  # fmt: skip
+    """At most `limit` photos of the scenes together. apart: of other places. The rest: as `view_problem` has it."""
+    chosen = {"views": views, "outliers": outliers, "best": best, "most": most, "seed": seed}
     each = -(-limit // len(scenes))
-    problems = [problem for name in scenes for problem in scene_problems(data, name, limit=each, seed=seed, **chosen)]
-    return (elsewhere(problems) if apart else problems)[:limit]
+    drawn = [photo for name in scenes for photo in scene_problems(data, name, limit=each, **chosen)]
+    return (elsewhere(drawn) if apart else drawn)[:limit]
 
 
 def rows(options: argparse.Namespace) -> Rows:
+    chosen = {"scenes": options.scenes, "data": options.data, "apart": options.elsewhere, "views": options.views}
+    chosen |= {"best": options.best, "most": None if options.all_points else MOST_POINTS}
     for outliers in options.outliers:
-        problems = photos(
-            options.limit * len(options.scenes), options.seed, scenes=options.scenes, data=options.data,
-            apart=options.elsewhere, views=options.views, outliers=outliers, best=options.best,
-            most=None if options.all_points else MOST_POINTS,
-        )  # fmt: skip
+        drawn = photos(options.limit * len(options.scenes), options.seed, outliers=outliers, **chosen)
         for method in options.methods:
             name = f"{method}, {options.views} views, outliers {outliers:.0%}"
-            yield name, partial(outcomes, problems, method, options.seed)
+            yield name, partial(problems, drawn, method, options.seed)
 
 
 def main() -> None:

@@ -1,8 +1,6 @@
-"""The yardstick of localisation with descriptors: nearest SIFT descriptors, ratio test, RANSAC of PoseLib; and the
-views by a bag of visual words (Sivic and Zisserman, ICCV 2003)."""
+"""The yardstick of localisation with descriptors: nearest SIFT descriptors, ratio test, RANSAC of PoseLib."""
 
 from collections.abc import Iterable
-from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,15 +9,13 @@ import numpy as np
 import poselib
 import pycolmap
 from numpy.typing import NDArray
+from record import Array
 
 from bpnp.datamodules.colmap.model_files import read_records
 
-Array = NDArray[np.float64]
 RATIO = 0.8  # largest ratio of the distances to the nearest descriptor and to that of another point (Lowe 2004)
 THRESHOLD_PX = 8.0  # of an inlier
 LEAST_INLIERS = 12  # of a pose that counts as confident, the limit of hloc
-WORDS, ROUNDS, EVERY = 512, 5, 4  # of the vocabulary; rounds of k-means; one descriptor of so many makes it
-RETRIEVED = 10  # views
 AT_ONCE = 256  # descriptors of the photo in one product
 
 
@@ -35,39 +31,6 @@ class DescribedMap:
             _, descriptors = self._features(image.name)
             seen = image.point_ids >= 0
             self._views[image.name] = descriptors[seen], image.point_ids[seen]
-
-    @cached_property
-    def _vocabulary(self) -> NDArray[np.float32]:
-        """Unit vectors (WORDS or fewer, 128): k-means of the descriptors of the map."""
-        rows = np.concatenate([descriptors for descriptors, _ in self._views.values()])[::EVERY]
-        words = np.random.default_rng(0).choice(rows, min(WORDS, len(rows)), replace=False)
-        for _ in range(ROUNDS):
-            order = np.argsort(nearest := (rows @ words.T).argmax(1), kind="stable")
-            used, starts = np.unique(nearest[order], return_index=True)
-            words[used] = np.add.reduceat(rows[order], starts)
-            words /= np.linalg.norm(words, axis=1, keepdims=True)
-        return words
-
-    @cached_property
-    def _bags(self) -> tuple[Array, Array]:
-        """Of each word the logarithm of views to views that have it; of each view the weighted words, unit vectors."""
-        counts = np.array([self._counts(descriptors) for descriptors, _ in self._views.values()])
-        rarity = np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
-        bags = counts * rarity
-        return rarity, bags / np.linalg.norm(bags, axis=1, keepdims=True)
-
-    def _counts(self, descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
-        return np.bincount((descriptors @ self._vocabulary.T).argmax(1), minlength=len(self._vocabulary))
-
-    def open(self) -> None:
-        """What is made of the map before its first photo."""
-        _ = self._bags
-
-    def retrieved(self, photo: str) -> list[str]:
-        """The views whose words are most like those of the photo."""
-        rarity, bags = self._bags
-        likeness = bags @ (rarity * self._counts(self._features(photo)[1]))
-        return [list(self._views)[i] for i in np.argsort(-likeness, kind="stable")[:RETRIEVED]]
 
     def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
         """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""

@@ -8,44 +8,43 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
+from record import Array, Pose
 from scipy.spatial.transform import Rotation
 
-Array = NDArray[np.float64]
-Pose = tuple[Array, Array]
-Pair = tuple[Array, Array, list[Pose]]
+Drawn = tuple[Array, Array, list[Pose]]
 FOCAL, WIDTH, HEIGHT = 500.0, 640, 480  # pixels
 CAMERA = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]])
 NOISE = 0.5  # pixels
 WINDOW = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0], [0.25, 0.9, 0.15]])
 
 
-def lattice(rng: np.random.Generator) -> Pair:
+def lattice(rng: np.random.Generator) -> Drawn:
     """Part of a lattice of 25 x 25 points, exact or with a jitter of a thirtieth or an eighth of its step."""
     points = _grid(25, 25) * 0.15
     points[:, :2] += rng.choice([0.0, 0.005, 0.02]) * rng.standard_normal((len(points), 2))
     return _in_frame(points, points, _facing(rng, 50, (2, 3), aside=1.0), rng)
 
 
-def board(rng: np.random.Generator) -> Pair:
+def board(rng: np.random.Generator) -> Drawn:
     """Part of a lattice of 14 x 10 points."""
     points = _grid(14, 10) * 0.3
     return _in_frame(points, points, _facing(rng, 40, (1.5, 2.5), aside=0.8), rng)
 
 
-def wallpaper(rng: np.random.Generator) -> Pair:
+def wallpaper(rng: np.random.Generator) -> Drawn:
     """Part of a motif of five points in relief, repeated 8 x 5 times."""
     motif = rng.uniform(0, 0.5, (5, 3)) * (1, 1, 0.3)
     points = np.concatenate([motif + (0.5 * i, 0.5 * j, 0) for i in range(8) for j in range(5)])
     return _in_frame(points, points, _facing(rng, 40, (1.5, 2.5), aside=0.8), rng)
 
 
-def stairs(rng: np.random.Generator) -> Pair:
+def stairs(rng: np.random.Generator) -> Drawn:
     """Part of twelve steps with the same eight points across."""
     points = np.array([[x, 0.2 * k, 0.25 * k] for x in rng.uniform(-1, 1, 8) for k in range(12)])
     return _in_frame(points, points, _facing(rng, 40, (2, 3), aside=0.6), rng)
 
 
-def row_of_windows(rng: np.random.Generator) -> Pair:
+def row_of_windows(rng: np.random.Generator) -> Drawn:
     """Part of two rows of six windows and a door."""
     door = np.array([[6.2, 0, 0], [6.9, 0, 0], [6.9, 1.9, 0], [6.2, 1.9, 0]])
     points = np.concatenate([*(WINDOW[:4] + (i, 1.5 * j, 0) for i in range(6) for j in range(2)), door])
@@ -53,7 +52,7 @@ def row_of_windows(rng: np.random.Generator) -> Pair:
     return _in_frame(points, points, _facing(rng, 45, (4, 6), aside=1.8), rng)
 
 
-def ending_facade(rng: np.random.Generator) -> Pair:
+def ending_facade(rng: np.random.Generator) -> Drawn:
     """Columns 4 to 9 of a facade against a map of columns 1 to 6."""
     column = np.repeat(np.arange(9), 10)
     points = np.concatenate([WINDOW + (i, 1.5 * j, 0) for i in range(9) for j in range(2)])
@@ -61,7 +60,7 @@ def ending_facade(rng: np.random.Generator) -> Pair:
     return _in_frame(points[column >= 3], points, _facing(rng, 45, (6, 8), aside=0.3), rng, column < 6)
 
 
-def colonnade(rng: np.random.Generator) -> Pair:
+def colonnade(rng: np.random.Generator) -> Drawn:
     """Columns 3 to 6 of a colonnade against a map of columns 4 to 8."""
     column = np.repeat(np.arange(8), 12)
     points = np.tile(rng.uniform(-1, 1, (12, 3)) * (0.15, 1, 0.15), (8, 1)) + np.outer(column, (0.8, 0, 0))
@@ -70,7 +69,7 @@ def colonnade(rng: np.random.Generator) -> Pair:
     return _in_frame(points[seen], points, _facing(rng, 30, (3, 5), aside=0.3), rng, column >= 3)
 
 
-def gappy_facade(rng: np.random.Generator) -> Pair:
+def gappy_facade(rng: np.random.Generator) -> Drawn:
     """Part of two rows of nine windows; a fifth of the points is missing in the map, another fifth in the image."""
     points = np.concatenate([WINDOW + (i, 1.5 * j, 0) for i in range(9) for j in range(2)])
     points += 0.002 * rng.standard_normal(points.shape)
@@ -78,20 +77,20 @@ def gappy_facade(rng: np.random.Generator) -> Pair:
     return _in_frame(points[seen], points, _facing(rng, 45, (4, 6), aside=1.8), rng, mapped)
 
 
-def facade_with_door(rng: np.random.Generator) -> Pair:
+def facade_with_door(rng: np.random.Generator) -> Drawn:
     """Two rows of six windows and eight points around a door, of which a pose can be certain."""
     windows = [WINDOW[:4] + (i, 1.5 * j, 0) for i in range(6) for j in range(2)]
     points = np.concatenate([*windows, rng.uniform((0, -1, 0), (5, -0.3, 0.5), (8, 3))])
     return _in_frame(points, points, _facing(rng, 40, (6, 8), aside=0.3), rng)
 
 
-def lines(rng: np.random.Generator) -> Pair:
+def lines(rng: np.random.Generator) -> Drawn:
     """Five lines of 15 points, evenly spaced, in the image, and five others in the scene."""
     image, scene = (np.concatenate([_line(rng, axes) for _ in range(5)]) for axes in (2, 3))
     return image * 200 + (320, 240), scene, []
 
 
-def clumps(rng: np.random.Generator) -> Pair:
+def clumps(rng: np.random.Generator) -> Drawn:
     """Five to eight clumps of eight keypoints, and as many of scene points, at other places."""
     count, width = int(rng.choice([5, 6, 8])), rng.choice([1.0, 3.0, 6.0])
     image = np.repeat(rng.uniform((0, 0), (WIDTH, HEIGHT), (count, 2)), 8, 0)
@@ -100,7 +99,7 @@ def clumps(rng: np.random.Generator) -> Pair:
     return image, scene + width / 100 * rng.standard_normal(scene.shape), []
 
 
-def helix(rng: np.random.Generator) -> Pair:
+def helix(rng: np.random.Generator) -> Drawn:
     """A curve of which the image and the scene have different points."""
     count = int(rng.choice([40, 100]))
     angles = rng.uniform(0, 12.5, (2, count))
@@ -108,14 +107,14 @@ def helix(rng: np.random.Generator) -> Pair:
     return _projected(image, scene, _any(rng), rng)
 
 
-def stretched(rng: np.random.Generator) -> Pair:
+def stretched(rng: np.random.Generator) -> Drawn:
     """A cloud of 8 to 100 points, in the image stretched along one axis by 10 to 30 %."""
     scene = rng.standard_normal((int(rng.choice([8, 12, 30, 100])), 3))
     factors = 1, 1, 1 + rng.choice([-0.3, -0.2, 0.1, 0.2, 0.3])
     return _projected(scene * factors, scene, _any(rng), rng)
 
 
-def hinged(rng: np.random.Generator) -> Pair:
+def hinged(rng: np.random.Generator) -> Drawn:
     """A cloud of 12 to 200 points, of which one half is turned by 4 to 12 degrees; the pose of either is true."""
     scene = rng.uniform(-1, 1, (int(rng.choice([12, 24, 60, 200])), 3)) * (2, 1, 1)
     hinge = Rotation.from_euler("yz"[rng.integers(2)], rng.uniform(4, 12), degrees=True).as_matrix()
@@ -124,19 +123,19 @@ def hinged(rng: np.random.Generator) -> Pair:
     return pixels, scene, [(rotation, translation), (rotation @ hinge, translation)]
 
 
-def wrong_focal_cloud(rng: np.random.Generator) -> Pair:
+def wrong_focal_cloud(rng: np.random.Generator) -> Drawn:
     """A cloud of 8 to 100 points, seen by a camera of 0.5 to 2 times the focal length."""
     scene = rng.standard_normal((int(rng.choice([8, 15, 40, 100])), 3))
     return _projected(scene, scene, _any(rng), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
 
-def wrong_focal_plane(rng: np.random.Generator) -> Pair:
+def wrong_focal_plane(rng: np.random.Generator) -> Drawn:
     """The same with a plane of 8 to 40 points."""
     scene = rng.uniform(-1, 1, (int(rng.choice([8, 15, 40])), 3)) * (1, 1, 0)
     return _projected(scene, scene, _facing(rng, 60, (3, 6)), rng, rng.choice([0.5, 0.6, 0.8, 1.2, 1.5, 2.0]))
 
 
-SCENES: tuple[Callable[[np.random.Generator], Pair], ...] = (
+SCENES: tuple[Callable[[np.random.Generator], Drawn], ...] = (
     ending_facade, colonnade, gappy_facade, row_of_windows, facade_with_door, stretched, hinged, wrong_focal_cloud,
     wrong_focal_plane, helix, lines, clumps, stairs, board, wallpaper, lattice,
 )  # fmt: skip
@@ -161,7 +160,7 @@ def _facing(rng: np.random.Generator, degrees: float, distance: tuple[float, flo
     return turn, np.array([*rng.uniform(-aside, aside, 2), rng.uniform(*distance)])
 
 
-def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Pair:
+def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator, focal: float = 1.0) -> Drawn:
     """Pixels of the points `image` under the pose, in another order, with `focal` times the camera's focal length."""
     camera = image @ pose[0].T + pose[1]
     pixels = camera[:, :2] / camera[:, 2:] * focal * FOCAL + (WIDTH / 2, HEIGHT / 2)
@@ -170,7 +169,7 @@ def _projected(image: Array, scene: Array, pose: Pose, rng: np.random.Generator,
 
 def _in_frame(
     seen: Array, points: Array, pose: Pose, rng: np.random.Generator, mapped: NDArray[np.bool_] | None = None
-) -> Pair:  # fmt: skip
+) -> Drawn:  # fmt: skip
     """Those of the seen points that lie in the frame against the points that are mapped; all about their middle."""
     middle = points.mean(0)
     ahead = seen[((seen - middle) @ pose[0].T + pose[1])[:, 2] > 0.05]

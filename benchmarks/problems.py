@@ -70,30 +70,25 @@ def diagonal_mass(assignment: Tensor) -> float:
     return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
 
 
-def planted_network(problem: Problem, *, autocast: torch.dtype | None = None) -> BPnPNet:
-    """BPnPNet whose nets do all their work, forward and backward, but leave the assignment as sharp as planted.
-
-    autocast: dtype of the nets' products, none for float32; features and layers stay in float32.
-    """
+def planted_network(problem: Problem) -> BPnPNet:
+    """BPnPNet whose nets do all their work, forward and backward, but leave the assignment as sharp as planted."""
     return BPnPNet(
-        _PlantedFeatures(ImageFeatures(centre=True, scale=4.0), problem.features2d, autocast),
-        _PlantedFeatures(SceneFeatures(centre=True), problem.features3d, autocast),
+        _PlantedFeatures(ImageFeatures(centre=True, scale=4.0), problem.features2d),
+        _PlantedFeatures(SceneFeatures(centre=True), problem.features3d),
     )
 
 
 class _PlantedFeatures(nn.Module):
     """Unit vector of a planted feature and a small part of that of the network."""
 
-    def __init__(self, inner: nn.Module, planted: Tensor, autocast: torch.dtype | None) -> None:
+    def __init__(self, inner: nn.Module, planted: Tensor) -> None:
         super().__init__()
-        self.inner, self.autocast = inner, autocast
+        self.inner = inner
         self.register_buffer("planted", planted)
 
     def forward(self, points: Tensor, mask: Tensor) -> Tensor:
-        with torch.autocast(points.device.type, dtype=self.autocast, enabled=self.autocast is not None):
-            z = self.inner(points, mask)
         planted = self.get_buffer("planted")
-        return nn.functional.normalize(planted + NET_SHARE * z.to(planted.dtype), dim=-1)
+        return nn.functional.normalize(planted + NET_SHARE * self.inner(points, mask), dim=-1)
 
 
 def training_step(net: BPnPNet, losses: Callable[[BPnPNet], Tensor]) -> Callable[[], None]:

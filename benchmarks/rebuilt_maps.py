@@ -11,12 +11,10 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
+from record import Array
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

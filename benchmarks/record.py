@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ NEAR_FOCAL = 0.03  # of a focal length that counts as right
 BOUND = 0.999  # share of the confident poses that are within their bound
 
 Array = NDArray[np.float64]
+Pose = tuple[Array, Array]  # rotation, translation: camera = R p + t
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
@@ -43,8 +44,24 @@ def parser(doc: str | None) -> argparse.ArgumentParser:
 
 
 @dataclass(frozen=True)
+class Problem:
+    """Something to solve, and the poses of which any is right: none where points have no pose in common.
+
+    points3d: of the scene, whose middle tells how far a pose is off. distance: unit of the error of the camera's
+    centre. focal: the true focal length in pixels, where it is to be found too.
+    """
+
+    name: str
+    solve: Callable[[], Solution]
+    poses: Sequence[Pose]
+    points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))
+    distance: float = 1.0
+    focal: float = np.nan
+
+
+@dataclass(frozen=True)
 class Outcome:
-    """Of one problem: error of the rotation, and of the translation in units of the distance or of the scene.
+    """Of one problem: error of the rotation, and of the camera's centre in units of the problem's distance.
 
     verdict: "" of a method that has none. outside: whether the true pose lies beyond the bound that the solution claims
     (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where it was known.
@@ -59,22 +76,23 @@ class Outcome:
     focal: float = np.nan
 
 
-Rows = Iterable[tuple[str, Callable[[], Sequence[Outcome]]]]  # the name of each, and what measures it
+Rows = Iterable[tuple[str, Callable[[], Iterable[Problem | Outcome]]]]  # the name of each, and what draws its problems
 
 
-def solved(
-    problem: str, rotation: Any, translation: Any, solve: Callable[[], Solution], *, distance: float = 1.0,
-    focal: float = np.nan,
-) -> Outcome:  # fmt: skip
-    """Solve, and compare with the true pose. distance: unit of the error of the camera's centre. focal: the true focal
-    length in pixels, where it is to be found too."""
+def outcomes(problems: Iterable[Problem | Outcome]) -> list[Outcome]:
+    """What is found of each, compared with its first pose; all are drawn before the first one is solved."""
+    return [one if isinstance(one, Outcome) else solved(one) for one in list(problems)]
+
+
+def solved(problem: Problem) -> Outcome:
+    rotation, translation = problem.poses[0]
     start = time.process_time()
-    found = solve()
+    found = problem.solve()
     seconds = time.process_time() - start
-    shift = np.linalg.norm(found.rotation.T @ found.translation - rotation.T @ translation) / distance
+    shift = np.linalg.norm(found.rotation.T @ found.translation - rotation.T @ translation) / problem.distance
     outside = beyond_bound(found, rotation, translation)
-    turn, ratio = degrees(found.rotation, rotation), float(found.focal_length / focal)
-    return Outcome(problem, turn, float(shift), found.verdict, seconds, outside, ratio)
+    turn, ratio = degrees(found.rotation, rotation), float(found.focal_length / problem.focal)
+    return Outcome(problem.name, turn, float(shift), found.verdict, seconds, outside, ratio)
 
 
 def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
@@ -103,22 +121,22 @@ def degrees(one: Any, other: Any) -> float:
     return float(np.degrees(Rotation.from_matrix(one @ other.T).magnitude()))
 
 
-def summary(outcomes: Sequence[Outcome], right_deg: float, right_shift: float = np.inf) -> dict[str, Any]:
+def summary(found: Sequence[Outcome], right_deg: float, right_shift: float = np.inf) -> dict[str, Any]:
     """Quartiles of the rotation's error, shares right and confident, how many are confident, wrong and beyond their own
     bound, CPU seconds; the share of the focal lengths that are near, where they were not known."""
-    turn, shift = (np.array([getattr(o, name) for o in outcomes]) for name in ("rotation_deg", "shift"))
+    turn, shift = (np.array([getattr(o, name) for o in found]) for name in ("rotation_deg", "shift"))
     right = (turn < right_deg) & ((shift < right_shift) | np.isinf(right_shift))
-    sure = np.array([o.verdict == "confident" for o in outcomes])
-    focal = np.array([o.focal for o in outcomes])
+    sure = np.array([o.verdict == "confident" for o in found])
+    focal = np.array([o.focal for o in found])
     near = {"focal_near": round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)} if np.isfinite(focal).any() else {}
     return near | {
-        "problems": len(outcomes),
+        "problems": len(found),
         "rotation_q_deg": [round(float(q), 4) for q in np.percentile(turn, (25, 50, 75))],
         "right": round(float(right.mean()), 4),
-        "confident": round(float(sure.mean()), 4) if any(o.verdict for o in outcomes) else None,
-        "confident_and_wrong": int((sure & ~right & np.array([o.outside for o in outcomes])).sum()),
-        "cpu_seconds": round(float(np.mean([o.cpu_seconds for o in outcomes])), 4),
-        "median_cpu_seconds": round(float(np.median([o.cpu_seconds for o in outcomes])), 4),
+        "confident": round(float(sure.mean()), 4) if any(o.verdict for o in found) else None,
+        "confident_and_wrong": int((sure & ~right & np.array([o.outside for o in found])).sum()),
+        "cpu_seconds": round(float(np.mean([o.cpu_seconds for o in found])), 4),
+        "median_cpu_seconds": round(float(np.median([o.cpu_seconds for o in found])), 4),
     }
 
 
@@ -136,19 +154,19 @@ def line(row: dict[str, Any]) -> str:
 
 def measured(rows: Rows, options: argparse.Namespace, right_deg: float, right_shift: float = np.inf) -> None:
     """Print a line for each row as it comes, and write all with their outcomes to `--output`."""
-    found: dict[str, dict[str, Any]] = {}
-    for name, measure in rows:
+    results: dict[str, dict[str, Any]] = {}
+    for name, problems in rows:
         if not any(part in name for part in options.only):
             continue
-        outcomes = measure()
-        if not outcomes:
+        found = outcomes(problems())
+        if not found:
             print(f"{name}: no problems", flush=True)
             continue
-        found[name] = summary(outcomes, right_deg, right_shift)
-        print(f"{name}: {line(found[name])}", flush=True)
+        results[name] = summary(found, right_deg, right_shift)
+        print(f"{name}: {line(results[name])}", flush=True)
         if options.output:
-            found[name]["outcomes"] = [asdict(outcome) for outcome in outcomes]
-            write(options.output, {"rows": found})
+            results[name]["outcomes"] = [asdict(outcome) for outcome in found]
+            write(options.output, {"rows": results})
 
 
 def write(path: Path, record: dict[str, Any]) -> None:

@@ -3,7 +3,7 @@
     python -m benchmarks reliability --families leds shapes photos maps hard --seed 9 --limit 100 --output rows.jsonl
     python -m benchmarks reliability --draw docs/images/reliability.png rows.jsonl others.jsonl
 
-Families: leds (the settings of `bench_constellation.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
+Families: leds (the settings of `constellation`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
 the points of one view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard
 (`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong), noise (image and
 scene points drawn independently), shuffled (keypoints of one photo, points that another one sees). --limit: problems of
@@ -16,22 +16,22 @@ twentieth of the distance off. A row is written as soon as it is known; those th
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 from unittest.mock import patch
 
+import bench_constellation
+import bench_search
 import numpy as np
 import pandas as pd
-from bench_constellation import SETTINGS, picture, search
-from bench_search import of_data, shapes
-from bench_views import REPORTED
-from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, wrong_focal_plane
+from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, Drawn, wrong_focal_plane
 from matplotlib.figure import Figure
-from record import TIME_LIMIT, Array, beyond_bound, degrees, parser
+from record import TIME_LIMIT, Array, Problem, beyond_bound, degrees, parser
 from scipy.stats import binomtest
-from view_problems import LEAST_MATCHES, MOST_POINTS, scene_problems
+from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, ViewProblem, scene_problems
 
 from bpnp import Solution, solve, warm_up
 from bpnp.cameras import camera_from
@@ -50,65 +50,42 @@ WRONG_DEG, WRONG_SHIFT, WRONG_CENTRE = 3.0, 0.1, 0.05
 GROUPS = {"right, confident": "tab:green", "right": "tab:olive", "wrong": "0.8", "wrong, confident": "tab:red"}
 
 
-class Problem(NamedTuple):
-    """Something to solve, and the poses of which any is right; none where points have no pose in common.
-
-    points3d: of the scene, whose middle tells how far a pose is off.
-    """
-
-    name: str
-    solve: Callable[[], Solution]
-    poses: list[tuple[Array, Array]]
-    points3d: Array
-
-
 def leds(options: Any) -> Iterator[Problem]:
-    for k, (name, setting) in enumerate(SETTINGS.items()):
-        rng = np.random.default_rng([options.seed, k])
-        for i in range(options.limit):
-            shown = picture(setting, 1000 * options.seed + i // 5, rng)
-            pose = shown.rotation, shown.translation
-            yield Problem(f"{name}/{i}", partial(search, shown, setting, rng), [pose], shown.device.points3d)
+    for name in bench_constellation.SETTINGS:
+        yield from bench_constellation.problems(name, options.limit, options.seed)
 
 
-def of_shapes(options: Any) -> Iterator[Problem]:
+def shapes(options: Any) -> Iterator[Problem]:
     for ratio in RATIOS:
-        for name, points2d, points3d, rotation, translation in shapes(ratio, options.limit, options.seed):
-            run = partial(solve, points2d, points3d, seed=options.seed, time_limit=options.time_limit)
-            yield Problem(f"{ratio:g} outliers a match/{name}", run, [(rotation, translation)], points3d)
+        chosen = f"shapes-{ratio:.2f}", options.data, options.limit, options.seed, options.time_limit
+        for one in bench_search.problems(*chosen):
+            yield replace(one, name=f"{ratio:g} outliers a match/{one.name}")
 
 
 def photos(options: Any) -> Iterator[Problem]:
     for outliers in OUTLIERS:
-        for photo in _photos(options, outliers, 1):
-            yield _with_camera(f"{outliers:.0%} outliers/{photo.name}", photo, 1.0, options)
+        for photo in in_turns(options, outliers, 1):
+            yield with_camera(f"{outliers:.0%} outliers/{photo.name}", photo, 1.0, options)
 
 
 def focal(options: Any) -> Iterator[Problem]:
-    for k, photo in enumerate(_photos(options, 0.5, 1)):
+    for k, photo in enumerate(in_turns(options, 0.5, 1)):
         for factor in FACTORS[k % 2 :: 2]:
-            yield _with_camera(f"photos {abs(factor - 1):.0%}/{photo.name} x {factor}", photo, factor, options)
+            yield with_camera(f"photos {abs(factor - 1):.0%}/{photo.name} x {factor}", photo, factor, options)
     rng = np.random.default_rng([options.seed, 1])
-    for k in range(options.limit):
-        pixels, points3d, poses = wrong_focal_plane(rng)
-        run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
-        yield Problem(f"planes/{k}", run, poses, points3d)
+    yield from with_lens("planes", (wrong_focal_plane(rng) for _ in range(options.limit)), options)
 
 
 def maps(options: Any) -> Iterator[Problem]:
-    for photo in _photos(options, 1.0, 0):
+    for photo in in_turns(options, 1.0, 0):
         run = partial(photo.scene.localize, *photo.pixels, seed=options.seed, time_limit=options.time_limit)
-        seen = photo.points3d[photo.match3d >= 0]
-        yield Problem(f"maps/{photo.name}", run, [(photo.rotation, photo.translation)], seen)
+        yield Problem(f"maps/{photo.name}", run, [photo.pose], photo.seen)
 
 
 def hard(options: Any) -> Iterator[Problem]:
     for draw in SCENES:
         rng = np.random.default_rng(options.seed)
-        for k in range(options.limit):
-            pixels, points3d, poses = draw(rng)
-            run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
-            yield Problem(f"{draw.__name__}/{k}", run, poses, points3d)
+        yield from with_lens(draw.__name__, (draw(rng) for _ in range(options.limit)), options)
 
 
 def noise(options: Any) -> Iterator[Problem]:
@@ -116,12 +93,14 @@ def noise(options: Any) -> Iterator[Problem]:
         rng = np.random.default_rng([options.seed, m, n])
         for k in range(options.limit):
             points = rng.uniform((0, 0), (WIDTH, HEIGHT), (m, 2)), rng.uniform(-1, 1, (n, 3))
-            run = partial(solve, *points, CAMERA, time_limit=options.time_limit)
-            yield Problem(f"{m} x {n}/{k}", run, [], points[1])
+            yield Problem(
+                f"{m} x {n}/{k}", partial(solve, *points, CAMERA, time_limit=options.time_limit), [], points[1]
+            )
 
 
 def shuffled(options: Any) -> Iterator[Problem]:
-    problems = [list(of_data(name, 0.0, options.data, 8, options.seed)) for name in (*options.scenes, "psb")]
+    names = (*options.scenes, "psb")
+    problems = [list(bench_search.of_data(name, 0.0, options.data, 8, options.seed)) for name in names]
     for size in SHUFFLED:
         rng = np.random.default_rng([options.seed, size])
         for k in range(options.limit):
@@ -133,12 +112,11 @@ def shuffled(options: Any) -> Iterator[Problem]:
 
 
 FAMILIES = {
-    "leds": leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal, "noise": noise,
-    "shuffled": shuffled,
+    family.__name__: family for family in (leds, shapes, photos, maps, hard, focal, noise, shuffled)
 }  # fmt: skip
 
 
-def _photos(options: Any, outliers: float, views: int) -> Iterator[Any]:
+def in_turns(options: Any, outliers: float, views: int) -> Iterator[ViewProblem]:
     """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
     known = {"views": views, "outliers": outliers, "seed": options.seed, "most": MOST_POINTS if views else None}
     turns = [scene_problems(options.data, scene, limit=options.limit, **known) for scene in options.scenes]
@@ -146,17 +124,22 @@ def _photos(options: Any, outliers: float, views: int) -> Iterator[Any]:
         yield from (photo for photo in turn if photo.matches >= LEAST_MATCHES)
 
 
-def _with_camera(name: str, photo: Any, factor: float, options: Any) -> Problem:
+def with_lens(name: str, scenes: Iterable[Drawn], options: Any) -> Iterator[Problem]:
+    for k, (pixels, points3d, poses) in enumerate(scenes):
+        run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
+        yield Problem(f"{name}/{k}", run, poses, points3d)
+
+
+def with_camera(name: str, photo: ViewProblem, factor: float, options: Any) -> Problem:
     """A photo against one view, with the cones of the points, and a camera of `factor` times the focal length."""
 
     def run() -> Solution:
         camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
-        cones = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
+        cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
         problem = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
         return solutions_of({0: problem}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
 
-    points3d = photo.points3d if factor == 1 else photo.points3d[photo.match3d >= 0]  # the depth of what is seen
-    return Problem(name, run, [(photo.rotation, photo.translation)], points3d)
+    return Problem(name, run, [photo.pose], photo.points3d if factor == 1 else photo.seen)  # the depth of what is seen
 
 
 def row_of(family: str, problem: Problem) -> dict[str, Any]:

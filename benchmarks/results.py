@@ -14,7 +14,7 @@ import json
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,8 @@ import bench_constellation
 import bench_search
 import bench_views
 import torch
-from record import ROOT, Outcome, line, parser, summary, write
+from record import ROOT, Outcome, Problem, line, outcomes, parser, summary, write
+from view_problems import MOST_POINTS, REPORTED
 
 from bpnp import warm_up
 from bpnp.datamodules import MeshDataModule, Outliers
@@ -44,13 +45,14 @@ TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 class Row:
     """A line of a table.
 
-    measure: outcomes of a number of problems, from a seed and the folder of the data. problems: in full, and quickly.
+    measure: a number of problems or their outcomes, from a seed and the folder of the data. problems: in
+    full, and quickly.
     right_deg, right_shift: up to which a pose is right. data: the folder, below that of the data, that it needs.
     """
 
     table: str
     name: str
-    measure: Callable[[int, int, Path], list[Outcome]]
+    measure: Callable[[int, int, Path], Iterable[Problem | Outcome]]
     problems: tuple[int, int]
     right_deg: float
     right_shift: float = float("inf")
@@ -58,30 +60,31 @@ class Row:
     in_readme: bool = False
 
 
-def search(name: str, limit: int, seed: int, data: Path) -> list[Outcome]:
-    return bench_search.outcomes(name, data, limit, seed)
+def search(name: str, limit: int, seed: int, data: Path) -> Iterator[Problem]:
+    return bench_search.problems(name, data, limit, seed)
 
 
-def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Outcome]:
-    scenes = bench_views.REPORTED
-    each = -(-limit // len(scenes))
-    return [one for scene in scenes for one in search(scene + suffix, each, seed, data)][:limit]
+def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Problem]:
+    each = -(-limit // len(REPORTED))
+    return [one for scene in REPORTED for one in search(scene + suffix, each, seed, data)][:limit]
 
 
-def views(method: str, chosen: dict[str, Any], limit: int, seed: int, data: Path) -> list[Outcome]:
-    return bench_views.outcomes(bench_views.photos(limit, seed, data=data, **chosen), method, seed)
+def views(method: str, chosen: dict[str, Any], limit: int, seed: int, data: Path) -> Iterator[Problem]:
+    return bench_views.problems(bench_views.photos(limit, seed, data=data, **chosen), method, seed)
 
 
-def leds(name: str, limit: int, seed: int, _: Path) -> list[Outcome]:
-    return bench_constellation.outcomes(name, limit, seed)
+def leds(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
+    return bench_constellation.problems(name, limit, seed)
 
 
-def network(weights: str, estimate: str, options: dict[str, Any], limit: int, seed: int, data: Path) -> list[Outcome]:
+def network(
+    weights: str, estimate: str, options: dict[str, Any], limit: int, seed: int, data: Path
+) -> Iterator[Outcome]:
     """Packaged weights on meshes or, without `root`, on procedural shapes."""
     known = {"num_points": 1000, "test_problems": limit, "test_shapes": limit, "batch_size": 1, "seed": seed}
     module = MeshDataModule(**known | options | {"root": str(data / options["root"]) if "root" in options else None})
     module.setup("test")
-    net, found = TrainedNet.from_pretrained(weights).eval(), []
+    net = TrainedNet.from_pretrained(weights).eval()
     for batch in module.test_dataloader():
         start = time.process_time()
         with torch.no_grad():
@@ -89,12 +92,11 @@ def network(weights: str, estimate: str, options: dict[str, Any], limit: int, se
         seconds = time.process_time() - start
         turn = float(rotation_error(pose.rotation, batch.rotation).nan_to_num(nan=180.0))
         shift = float(translation_error(pose.translation, batch.translation).nan_to_num(nan=torch.inf))
-        found.append(Outcome(batch.ids[0], turn, shift, "", seconds))
-    return found
+        yield Outcome(batch.ids[0], turn, shift, "", seconds)
 
 
 MAP = {"views": 0, "outliers": 1.0, "most": None}
-ONE = {"views": 1, "most": bench_views.MOST_POINTS}
+ONE = {"views": 1, "most": MOST_POINTS}
 PAPER = (15.0, 0.5)  # degrees and scene units
 ROWS = (
     *(
@@ -150,7 +152,7 @@ def measure(options: argparse.Namespace) -> Iterator[tuple[Row, dict[str, Any]]]
             print(f"{key(row)}: left out, needs {options.data / row.data}", flush=True)
             continue
         count = row.problems[options.quick]
-        found = summary(row.measure(count, options.seed, options.data), row.right_deg, row.right_shift)
+        found = summary(outcomes(row.measure(count, options.seed, options.data)), row.right_deg, row.right_shift)
         print(f"{key(row)}: {line(found)}", flush=True)
         yield row, found | {"seed": options.seed}
 

@@ -26,7 +26,7 @@ from bpnp.maps.views import View
 
 ROOT = Path(__file__).parents[1]
 MODULES = (
-    "bench_constellation", "bench_layers", "bench_search", "cities", "descriptor_poses", "gpu",
+    "bench_city", "bench_constellation", "bench_layers", "bench_search", "descriptor_poses",
     "paper_layers", "problems", "rebuilt_maps", "record", "reliability", "results",
 )  # fmt: skip
 
@@ -126,9 +126,7 @@ def test_layers_command_writes_what_it_measured(
     bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "new" / "result.json"
-    monkeypatch.setattr(
-        "sys.argv", ["layers", "--points", "40", "--rounds", "1", "--batch", "2", "--output", str(out)]
-    )  # fmt: skip
+    monkeypatch.setattr("sys.argv", f"layers --points 40 --rounds 1 --batch 2 --output {out}".split())
     bench.bench_layers.main()
     record = json.loads(out.read_text())
     assert record["points"] == 40
@@ -136,17 +134,6 @@ def test_layers_command_writes_what_it_measured(
     assert {row["what"].split(",")[0] for row in record["rows"]} == {
         "PnP forward", "PnP backward", "Sinkhorn forward", "Sinkhorn backward", "training step"
     }  # fmt: skip
-
-
-def test_gpu_command_needs_a_gpu(
-    bench: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    monkeypatch.setattr("sys.argv", ["gpu"])
-    with pytest.raises(SystemExit) as stopped:
-        bench.gpu.main()
-    assert stopped.value.code == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
 
 
 def test_constellation_command_writes_what_it_measured(
@@ -195,19 +182,8 @@ def test_reliability_goes_on_where_it_was(bench: SimpleNamespace, tmp_path: Path
     """One device of each setting; a second run solves none of them again, and finds the same."""
     out, told = tmp_path / "rows.jsonl", []
     for _ in range(2):
-        arguments = [
-            "reliability",
-            "--families",
-            "leds",
-            "noise",
-            "--limit",
-            "1",
-            "--time-limit",
-            "1",
-            "--output",
-            str(out),
-        ]
-        monkeypatch.setattr("sys.argv", arguments)
+        words = f"reliability --families leds noise --limit 1 --time-limit 1 --output {out}"
+        monkeypatch.setattr("sys.argv", words.split())
         bench.reliability.main()
         told.append((out.read_text(), capsys.readouterr().out))
     assert told[0] == told[1]
@@ -230,7 +206,7 @@ def test_the_list_has_every_benchmark_and_a_sentence_for_each() -> None:
     listed = run()
     assert listed.returncode == 0
     lines = dict(line.strip().split(maxsplit=1) for line in listed.stdout.splitlines()[2:])
-    assert {"results", "search", "views", "constellation", "layers", "reliability", "left_out", "gpu"} <= lines.keys()
+    assert {"results", "search", "views", "constellation", "layers", "reliability", "left_out"} <= lines.keys()
     assert all(sentence.endswith((".", ":")) or "`" in sentence for sentence in lines.values())
     unknown = run("serch")
     assert unknown.returncode == 1
@@ -264,7 +240,7 @@ def test_results_differ_beyond_the_tolerance(bench: SimpleNamespace, change: dic
 def test_tables_are_filled_and_checked(bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     here, guide, file = bench.results, tmp_path / "guide.md", tmp_path / "results.json"
     rows = [here.Row("leds", "two rings", lambda *_: [bench.outcome] * 2, (2, 1), 3.0)]
-    bench.outcome = bench.bench_search.Outcome("", 0.25, 0.0, "confident", 0.5)
+    bench.outcome = bench.record.Outcome("", 0.25, 0.0, "confident", 0.5)
     monkeypatch.setattr(here, "ROWS", rows)
     monkeypatch.setattr(here, "DOCUMENTS", (guide,))
     monkeypatch.setattr(here, "warm_up", lambda: None)
@@ -288,7 +264,7 @@ def test_tables_are_filled_and_checked(bench: SimpleNamespace, tmp_path: Path, m
     with pytest.raises(SystemExit, match=r"guide\.md: a table is not that of results\.json"):
         run("--check")
     guide.write_text(text)
-    bench.outcome = bench.bench_search.Outcome("", 8.0, 0.0, "confident", 0.5)
+    bench.outcome = bench.record.Outcome("", 8.0, 0.0, "confident", 0.5)
     with pytest.raises(SystemExit, match="leds: two rings: 2 confident and wrong, not 0"):
         run("--check")
     with pytest.raises(SystemExit, match="leds: two rings: never measured"):
@@ -314,7 +290,6 @@ def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:
 
 
 def test_descriptors_are_matched_to_points_seen_from_several_views(bench: SimpleNamespace) -> None:
-    """And the views that see the photo's points are retrieved before those of another place."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 64))
     seen = np.concatenate([points + 0.1 * rng.normal(size=points.shape) for _ in range(3)])
@@ -326,17 +301,13 @@ def test_descriptors_are_matched_to_points_seen_from_several_views(bench: Simple
     assert true.sum() == 100
     np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
     assert (~true).sum() < 25
-    described = object.__new__(bench.descriptor_poses.DescribedMap)
-    described._views = {f"{k}": (theirs[ids // 20 == k % 15], ids[ids // 20 == k % 15]) for k in range(30)}
-    described._features = lambda _: (None, own[:100])  # of the points 7 to 106: views 0 to 5, and 15 to 20
-    assert {int(name) % 15 for name in described.retrieved("photo")} <= set(range(6))
 
 
 def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNamespace, tmp_path: Path) -> None:
     """A planted model without noise: also in its repeated place; changed copies keep what their views see in view."""
     plant_model(tmp_path / "planted", camera=("PINHOLE", [520.0, 500.0, 400.0, 300.0]), images=8, points=200, seen=150)
     model = read_reconstruction(tmp_path / "planted", name="planted")
-    scene, photos = bench.cities.city([model], {"planted": 2}, 0, 5, twice=0.2)
+    scene, photos = bench.bench_city.city([model], {"planted": 2}, 0, 5, twice=0.2)
     assert len(photos) == 2
     assert len(scene.views) == 12
     for photo in photos:
@@ -347,7 +318,7 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNames
             assert (off < 1e-6).mean() > 0.6
         first, second = (-rotation.T @ translation for rotation, translation in photo.poses)
         assert np.linalg.norm(first - second) > photo.distance
-    larger, _ = bench.cities.city([model], {"planted": 2}, 40, 5)
+    larger, _ = bench.bench_city.city([model], {"planted": 2}, 40, 5)
     assert len(larger.views) == 40
     assert len({view.name for view in larger.views}) == 40
     for view in larger.views:
