@@ -37,9 +37,9 @@ def table(
 
     Args:
         data: name or file of a configuration with `data`.
-        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, constellation, hungarian,
-            bpnpnet, matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian
-            need a CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
+        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, hungarian, bpnpnet,
+            matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian need a
+            CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
         limit: problems, a fixed random choice; all by default.
         rho: outliers a match on both sides; a table and a plot over these.
         seeds: of the data; the mean over these and its standard deviation.

@@ -28,7 +28,6 @@ SHORT_NAMES = {
     "ransac": "bpnp.models.baselines.RandomRansac",
     "gosma": "bpnp.models.baselines.GOSMA",
     "gopac": "bpnp.models.baselines.GOPAC",
-    "constellation": "bpnp.models.baselines.Constellation",
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
     "matcher": "bpnp.models.Matcher",

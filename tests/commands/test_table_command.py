@@ -229,7 +229,7 @@ def test_names_in_latex_are_text() -> None:
 @pytest.mark.parametrize(
     ("name", "limited"),
     [
-        *((name, True) for name in ("softposit", "ransac", "gosma", "gopac", "constellation", "search")),
+        *((name, True) for name in ("softposit", "ransac", "gosma", "gopac", "search")),
         *((name, False) for name in ("hungarian", "bpnpnet", "matcher")),
     ],
 )
