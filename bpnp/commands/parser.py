@@ -152,7 +152,7 @@ OPTIONS = {
     "--model.solver CLASS": "class path of an nn.Module from Batch to Prediction",
     "--model.weights NAME": "start from packaged weights, or from a checkpoint",
     "--model.loss CLASS": "class path of a loss in place of --model.matching_loss",
-    "--model.matching_loss KIND": "correspondence (the paper's), likelihood, or reprojection",
+    "--model.matching_loss KIND": "correspondence (the paper's) or likelihood",
     "--model.learning_rate X": "of Adam",
     "--trainer.default_root_dir FOLDER": "folder of the run: checkpoints, logs, results",
     "--trainer.max_epochs N": "epochs",

@@ -1,4 +1,4 @@
-"""What a solver is trained with (paper Eqs. 9 to 13): the true matches of an assignment, the true pose, or neither.
+"""What a solver is trained with (paper Eqs. 9 to 13): the true matches of an assignment, and the true pose.
 
 Every loss is one value per sample; the mean over a batch is the caller's.
 """
@@ -11,10 +11,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
-from bpnp.geometry import angle_between, bearings, chords, rotation_angle, transform
+from bpnp.geometry import bearings, chords, rotation_angle
 from bpnp.types import Batch, Pose, Prediction
 
-MatchingLoss = Literal["correspondence", "likelihood", "reprojection"]
+MatchingLoss = Literal["correspondence", "likelihood"]
 SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
 
 
@@ -39,7 +39,7 @@ class Losses:
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
-    """The loss of each sample's assignment; reprojection is under the pose "pnp". angle: as in `correspondence_losses`.
+    """The loss of each sample's assignment. angle: as in `correspondence_losses`.
 
     Raises ValueError for a prediction without an assignment, or a batch without the labels that the kind needs.
     """
@@ -48,13 +48,10 @@ def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss,
     everyone = torch.ones(len(batch), dtype=torch.bool, device=prediction.assignment.device)
     if kind == "likelihood":
         return Losses(matching_likelihood_loss(prediction, batch), everyone)
-    if kind == "reprojection":
-        pose = prediction.poses["pnp"]
-        return Losses(reprojection_loss(prediction.assignment, batch, pose), pose.stats.converged)
     known = correspondence_losses(prediction, batch, angle=angle)
     if known is None:
         raise ValueError(
-            "expected problems with `match3d` for matching_loss correspondence, got none; try reprojection"
+            "expected problems with `match3d` for matching_loss correspondence, got none; try correspondence_angle"
         )
     return Losses(known, everyone)
 
@@ -159,19 +156,3 @@ def pose_loss(
 ) -> Float[Tensor, " b"]:
     """L_p = angle(R, R_gt) + ||t - t_gt|| (Eqs. 10 to 12), in radians and scene units."""
     return rotation_angle(rotation_gt, rotation) + torch.linalg.vector_norm(translation - translation_gt, dim=-1)
-
-
-def reprojection_loss(assignment: Float[Tensor, "b m n"], batch: Batch, pose: Pose) -> Float[Tensor, " b"]:
-    """sum_ij P_ij angle(f_i, R p_j + t) / sum_ij P_ij in radians (Eq. 2 with P for C), a pose solved from P.
-
-    Neither true pose nor true matches are looked at (paper section 5). The gradient reaches the assignment itself and,
-    through a differentiable solver, the pose. A sample whose pose did not converge has loss zero and no gradient:
-    leave it out of means by `pose.stats.converged`.
-    """
-    solved = pose.stats.converged
-    rotation = torch.where(solved[:, None, None], pose.rotation, torch.eye(3).to(pose.rotation))
-    translation = torch.where(solved[:, None], pose.translation, 0)
-    directions = transform(rotation, translation, batch.points3d)
-    angles = angle_between(bearings(batch.points2d).unsqueeze(2), directions.unsqueeze(1))
-    real = batch.mask2d.unsqueeze(2) & batch.mask3d.unsqueeze(1)
-    return torch.where(solved, (assignment * real * angles).sum((-2, -1)) / assignment.sum((-2, -1)), 0)

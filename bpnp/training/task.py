@@ -51,8 +51,7 @@ class BlindPnPTask(LightningModule):
         pose_weight: gamma_p of Eq. 13, for the pose "pnp". While it is 0 no pose is solved in training;
             `PoseLossWarmup` raises it.
         matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
-            negative log likelihood of each point's partner (`matching_likelihood_loss`); reprojection for the angle
-            between matches under the solved pose, without labels (Eq. 2).
+            negative log likelihood of each point's partner (`matching_likelihood_loss`).
         correspondence_angle: with L_c, supervise by the pose alone: points within this angle (radians) count as
             correspondences; null for the true ones.
         loss: module in place of `matching_loss`, from (Prediction, Batch) to a value a problem (b,); NaN for one that
@@ -109,8 +108,7 @@ class BlindPnPTask(LightningModule):
         return self.solver(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        needs_pose = self.pose_weight > 0 or self.matching_loss == "reprojection"
-        needs_pose |= self.loss is not None and getattr(self.loss, "needs_pose", True)
+        needs_pose = self.pose_weight > 0 or (self.loss is not None and getattr(self.loss, "needs_pose", True))
         solve = self.solver if needs_pose else getattr(self.solver, "match", self.solver)
         prediction = solve(batch)
         with exact_products(self.device):
