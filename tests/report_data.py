@@ -77,15 +77,10 @@ def drawn_problem(index: int, name: str, count: int = 30) -> ProblemPoints:
 
 
 def write_run(folder: Path, count: int, seed: int) -> Results:
-    """Results with the points of their worst and their first pair, and a log of a training whose pose loss joins."""
+    """Results with the points of their worst and their first pair."""
     planted = rows(count, seed)
     results = write_results(folder / "test", planted, correspondence_loss=0.25, settings={"command": HOSTILE})
     first = [row for row in planted if row.estimate == "ransac"]
     worst = max(first, key=lambda row: (row.rotation_error_deg, -row.index))
     write_points(folder / "test", [drawn_problem(row.index, row.id) for row in (first[0], worst)])
-    log = folder / "logs" / "version_0" / "metrics.csv"
-    log.parent.mkdir(parents=True)
-    lines = ["step,train/loss,train/pose_loss,val/rotation_q2_deg"]
-    lines += [f"{step},{1 / (step + 1 + seed)},{0.5 if step >= 50 else ''}," for step in range(0, 100, 10)]
-    log.write_text("\n".join([*lines, "99,,,3.5"]))
     return results

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.text import Text
 
 from bpnp.report.results import Results, read_results
-from bpnp.report.runs import TrainingLog, lines_of, read_runs, trained_only
+from bpnp.report.runs import lines_of, read_runs
 from bpnp.report.terminal import Paper, SplitTable, console, number
 
 if TYPE_CHECKING:
@@ -204,25 +204,12 @@ def learning_table(before: Results, after: Results) -> SplitTable:
     return SplitTable(_title("Learning", {"": after}), ["untrained", "trained"], [rows])
 
 
-def training_table(logs: Mapping[str, TrainingLog]) -> SplitTable:
-    """The last and the smallest value of each curve of each training."""
-    rows = []
-    for name, log in logs.items():
-        for curve, (steps, values) in log.curves.items():
-            texts = f"{steps[-1]:.0f}", number(values[-1]), number(min(values))
-            rows.append((Text(curve if len(logs) == 1 else f"{name}: {curve}"), [*map(Text, texts)]))
-    return SplitTable("Training", ["steps", "last", "smallest"], [rows], "Nothing tested yet; try `bpnp test`.")
-
-
 def report(paths: Sequence[Path], *, paper: Paper | None = None, untrained: Path | None = None) -> None:
     """Print the tables of one or several results folders, named by what their paths do not share.
 
     `untrained` is the folder of the last run's untrained weights. Raises ValueError if a folder cannot be read.
     """
     out = console()
-    if logs := trained_only(paths):
-        out.print(training_table(logs))
-        return
     runs = read_runs(paths)
     out.print(results_table(runs, paper=paper))
     out.print(recall_table(runs))

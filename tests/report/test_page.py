@@ -55,9 +55,6 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
         causes = [r.cause for r in results.of(own["estimate"])]
         assert "".join(f"<td>{5 * causes.count(cause):.1f}%</td>" for cause in CAUSES) in text
     assert text.count("paper, MegaDepth: Lc Lp") == 2
-    (training,) = (chart for chart in map(json.loads, data["charts"]) if "Training" in chart["layout"]["title"]["text"])
-    assert [shape["x0"] for shape in training["layout"]["shapes"]] == [50, 50]  # where the pose loss joins
-    assert [note["text"] for note in training["layout"]["annotations"]] == ["a: pose loss", "b: pose loss"]
 
 
 def test_charts_are_the_shares_and_medians_of_the_rows(tmp_path: Path) -> None:
@@ -111,9 +108,5 @@ def test_what_cannot_be_read_is_named_and_no_page_is_left(tmp_path: Path) -> Non
     write_run(tmp_path / "run", 9, 0)
     (tmp_path / "run" / "test" / "points.npz").write_bytes(b"no archive")
     with pytest.raises(ValueError, match=r"expected points of a test in .*points.npz"):
-        write_page([tmp_path / "run"], output)
-    (tmp_path / "run" / "test" / "points.npz").unlink()
-    (tmp_path / "run" / "logs" / "version_0" / "metrics.csv").write_text("step,train/loss\n1,much\n")
-    with pytest.raises(ValueError, match=r"expected numbers in .*metrics.csv, .*could not convert .* 'much'"):
         write_page([tmp_path / "run"], output)
     assert not output.exists()

@@ -1,13 +1,11 @@
-"""Causes of failures, the palette, the training log and the plain table of a report."""
+"""Causes of failures, of a report."""
 
 import dataclasses
-from pathlib import Path
 
 import pytest
 from report_data import rows
 
 from bpnp.report.results import cause_shares
-from bpnp.report.runs import read_training_log
 
 
 def test_each_row_has_the_cause_that_its_numbers_say() -> None:
@@ -27,40 +25,3 @@ def test_each_row_has_the_cause_that_its_numbers_say() -> None:
     assert shares == {cause: (2 if cause == "solved" else 1) / 6 for cause in cases}
     with pytest.raises(ValueError, match="expected at least one row"):
         cause_shares([])
-
-
-def write_log(folder: Path, version: int, steps: range, value: float, switch: int = 10**9) -> None:
-    path = folder / "logs" / f"version_{version}" / "metrics.csv"
-    path.parent.mkdir(parents=True)
-    lines = [f"{step},{value},{1.0 if step >= switch else ''}" for step in steps]
-    path.write_text("\n".join(["step,train/loss,train/without_pose", *lines]))
-
-
-def test_a_resumed_training_is_one_curve_and_a_repeated_one_the_newest(tmp_path: Path) -> None:
-    write_log(tmp_path / "resumed", 0, range(0, 80, 10), 2.0)
-    write_log(tmp_path / "resumed", 1, range(50, 100, 10), 1.0, switch=70)
-    log = read_training_log(tmp_path / "resumed" / "test")
-    assert log is not None
-    assert log.curves["train/loss"] == (list(range(0, 100, 10)), [2.0] * 5 + [1.0] * 5)
-    assert log.switch_step == 70
-    write_log(tmp_path / "repeated", 9, range(0, 50, 10), 2.0)
-    write_log(tmp_path / "repeated", 10, range(0, 30, 10), 1.0)
-    log = read_training_log(tmp_path / "repeated")
-    assert log is not None
-    assert log.curves["train/loss"] == ([0, 10, 20], [1.0] * 3)
-    assert log.switch_step is None
-    assert read_training_log(tmp_path) is None
-
-
-def test_a_training_too_short_to_log_its_loss_shows_its_validation(tmp_path: Path) -> None:
-    for version, lines in enumerate((["0,0.9"], ["19,0.6", "39,0.5"])):
-        path = tmp_path / "short" / "logs" / f"version_{version}" / "metrics.csv"
-        path.parent.mkdir(parents=True)
-        path.write_text("\n".join(["step,val/correspondence_loss", *lines]))
-    log = read_training_log(tmp_path / "short")
-    assert log is not None
-    assert log.curves == {"val/correspondence_loss": ([19, 39], [0.6, 0.5])}
-    write_log(tmp_path / "short", 2, range(0, 50, 10), 2.0)  # a longer one is all that counts
-    log = read_training_log(tmp_path / "short")
-    assert log is not None
-    assert list(log.curves) == ["train/loss"]

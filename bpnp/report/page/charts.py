@@ -1,5 +1,5 @@
-"""The charts of the page as plotly figures, for notebooks too: recall, errors against the size, time, training; and the
-figures that the page fills with a problem or with two runs.
+"""The charts of the page as plotly figures, for notebooks too: recall, errors against the size, time; and the figures
+that the page fills with a problem or with two runs.
 
 Each chart takes results by name and returns a `plotly.graph_objects.Figure`, or None where there is nothing to draw:
 `recall_chart(results, "rotation_deg").show()`. Colours are those of the light scheme, which the page replaces where the
@@ -14,9 +14,9 @@ import numpy.typing as npt
 import torch
 
 from bpnp.metrics import joint_error, recall_curve
-from bpnp.report.palette import DASHES, INKS, LIGHT, QUIET
+from bpnp.report.palette import DASHES, INKS, LIGHT
 from bpnp.report.results import Results
-from bpnp.report.runs import Line, TrainingLog, lines_of
+from bpnp.report.runs import Line, lines_of
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -43,11 +43,6 @@ CONFIG = {  # of every figure
     "modeBarButtonsToRemove": HIDDEN,
 }
 SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
-TRAINING = {  # curves by chart, and whether their axis is logarithmic
-    "Training loss": (("train/loss", "train/correspondence_loss", "train/pose_loss"), False),
-    "Validation: correspondence loss": (("val/correspondence_loss",), False),
-    "Validation: median rotation error, degrees": (("val/rotation_q2_deg",), True),
-}
 
 
 def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
@@ -108,28 +103,6 @@ def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
     return _logarithmic(figure)
 
 
-def training_charts(logs: Mapping[str, TrainingLog]) -> "list[Figure]":
-    """Losses and the validation error over the steps; a dashed line marks the first step with the pose loss."""
-    charts = []
-    for title, (keys, log) in TRAINING.items():
-        figure = _figure(title, "step", "")
-        figure.update_yaxes(type="log" if log else "linear")
-        for place, (run, training) in enumerate(logs.items()):
-            posed = training.switch_step is not None
-            known = [key for key in keys if key in training.curves and (key == keys[0] or posed)]
-            for key in known:
-                short, number = key.split("/")[1].replace("_", " "), keys.index(key)
-                line = Line(run, key, short if len(logs) == 1 else f"{run} {short}", place, number)
-                _add(figure, None, line._replace(colour=number) if len(logs) == 1 else line, *training.curves[key])
-            if posed and known and known[0].startswith("train"):
-                text = "pose loss joins" if len(logs) == 1 else f"{run}: pose loss"
-                line_style = {"dash": "dash", "width": 1, "color": QUIET}
-                figure.add_vline(x=training.switch_step, line=line_style, annotation={"text": text})
-        if figure.data:
-            charts.append(figure)
-    return charts
-
-
 def chart_text(figure: "Figure") -> str:
     """What a chart shows in words, for screen readers: the last value of each line."""
     form = ".1%" if figure.layout.yaxis.tickformat else ".3g"
@@ -137,14 +110,13 @@ def chart_text(figure: "Figure") -> str:
     return f"{figure.layout.title.text}: {'; '.join(ends)}"
 
 
-def page_charts(runs: Mapping[str, Results], logs: Mapping[str, TrainingLog]) -> "dict[str, list[Figure]]":
+def page_charts(runs: Mapping[str, Results]) -> "dict[str, list[Figure]]":
     """The charts of the page by heading; headings without one are left out."""
-    charts: dict[str, list[Figure | None]] = {}
-    if runs:
-        charts["Recall"] = [recall_chart(runs, error) for error in RECALLS]
-        charts["Errors against size"] = [error_chart(runs, size) for size in SIZES]
-        charts["Time"] = [time_chart(runs)]
-    charts["Training"] = [*training_charts(logs)]
+    charts = {
+        "Recall": [recall_chart(runs, error) for error in RECALLS],
+        "Errors against size": [error_chart(runs, size) for size in SIZES],
+        "Time": [time_chart(runs)],
+    }
     known = {name: [chart for chart in several if chart is not None] for name, several in charts.items()}
     return {name: several for name, several in known.items() if several}
 
@@ -168,7 +140,7 @@ def _logarithmic(figure: "Figure") -> "Figure":
     return figure.update_xaxes(type="log", tickformat="~g", **few)
 
 
-def _add(figure: "Figure", place: int | None, line: Line, x: Any, y: Any, hover: str | None = None) -> None:
+def _add(figure: "Figure", place: int, line: Line, x: Any, y: Any, hover: str) -> None:
     """Add a line; by the place of its estimate the page finds it."""
     dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
     style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}

@@ -23,7 +23,7 @@ from bpnp.report.palette import DASHES, INKS
 from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.points import read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
-from bpnp.report.runs import Line, TrainingLog, lines_of, named_runs, read_training_log, trained_only
+from bpnp.report.runs import Line, lines_of, named_runs
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
 from bpnp.report.terminal import Paper
 
@@ -57,7 +57,7 @@ def write_page(
     """Write the page of one or several results folders, whole or not at all, and return where it is.
 
     photo: what finds the photo of a problem, to lie under its image points; see `bpnp.report.photos`.
-    Raises ValueError if a folder, its points or its training log cannot be read.
+    Raises ValueError if a folder or its points cannot be read.
     """
     return write_text(Path(output), page_html(paths, paper=paper, photo=photo))
 
@@ -65,10 +65,9 @@ def write_page(
 def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photo: PhotoFinder | None = None) -> str:
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
-    logs = _logs(folders)
-    runs = {} if trained_only(paths) else {name: read_results(path) for name, path in folders.items()}
+    runs = {name: read_results(path) for name, path in folders.items()}
     points = {name: read_points(path) for name, path in folders.items()}
-    charts = page_charts(runs, logs)
+    charts = page_charts(runs)
     drawn = [chart for section in charts.values() for chart in section]
     numbers = page_numbers(runs) | {
         "keys": list(COLUMNS),
@@ -172,13 +171,3 @@ def _asset(name: str) -> str:
 
 def _utf8(value: Any) -> Any:
     return utf8(value) if isinstance(value, str) and not isinstance(value, Markup) else value
-
-
-def _logs(folders: Mapping[str, Path]) -> dict[str, TrainingLog]:
-    """Each training once, under the name of the first results that stem from it."""
-    logs: dict[tuple[Path, ...], tuple[str, TrainingLog]] = {}
-    for name, folder in folders.items():
-        log = read_training_log(folder)
-        if log is not None:
-            logs.setdefault(log.files, (name, log))
-    return dict(logs.values())

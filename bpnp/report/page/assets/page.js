@@ -181,8 +181,8 @@ async function start() {
   addEventListener("beforeprint", () => each(".chart", (node) => node.show()));
   dark.onchange = () => { each(".js-plotly-plot", (node) => node.show()); };
   drawSeries();
-  if (SERIES.length) drawProblems();
-  const i = SERIES.length ? listed().ids.indexOf(byId("open").value) : -1;
+  drawProblems();
+  const i = listed().ids.indexOf(byId("open").value);
   if (i >= 0) openProblem(i);
   document.documentElement.dataset.ready = "1";
 }
