@@ -22,7 +22,6 @@ def report(
     paper: Paper | None = None,
     untrained: Path | None = None,
     html: Path | None = None,
-    photos: Path | None = None,
     recall: Path | None = None,
 ) -> None:
     """Show results side by side: tables here, and on request a page and recall curves.
@@ -32,10 +31,8 @@ def report(
         paper: the paper's rows beneath, for orientation.
         untrained: results of the untrained weights, to compare.
         html: write a page that needs no network.
-        photos: the COLMAP scenes, to put the images under the page's 2D views.
         recall: write the recall curves as .png, .svg or .pdf.
     """
-    from bpnp.datamodules.colmap.scenes import photo_finder
     from bpnp.report.figures import recall_curve, save_figure
     from bpnp.report.page.write import write_page
     from bpnp.report.runs import named_runs
@@ -43,8 +40,7 @@ def report(
 
     paths = list(named_runs(runs).values())
     if html is not None:
-        page = write_page(paths, html, paper=paper, photo=None if photos is None else photo_finder(photos))
-        say(f"wrote {page}")
+        say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths), recall)}")
     print_tables(paths, paper=paper, untrained=untrained)
@@ -57,7 +53,6 @@ def view(
     output: Path | None = None,
     estimate: str | None = None,
     lines: Literal["true", "assigned", "none"] = "true",
-    photos: Path | None = None,
     open: bool = False,
 ) -> None:
     """Draw a problem of a test, or a solution: points and cameras in space, and what is seen in the image.
@@ -68,12 +63,9 @@ def view(
         output: .png, .svg or .pdf; RUN/views/PROBLEM.png by default.
         estimate: whose pose reprojects the 3D points; the first by default.
         lines: which matches to draw.
-        photos: the COLMAP scenes, with the images beside them.
         open: show the file with the system's viewer.
     """
-    from bpnp.datamodules.colmap.scenes import photo_finder
     from bpnp.report.figures import plot_problem, save_figure
-    from bpnp.report.photos import picture_box
     from bpnp.report.runs import named_runs
 
     names = problems or []
@@ -83,7 +75,6 @@ def view(
         raise ValueError(f"expected the folder of a test or the JSON of a solution, got {run}, which is not there")
     if run.is_file() and names:
         raise ValueError(f"expected no problem beside the solution {run}, got {names[0]!r}")
-    photo = None if photos is None else photo_finder(photos)
     if run.is_file():
         drawn, folder = [_solution(run)], run.absolute().parent
     else:
@@ -93,8 +84,7 @@ def view(
         drawn = chosen_problems(folder, names)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
-        under = photo and photo(problem.id, picture_box(problem.points2d))
-        figure = plot_problem(problem, estimate=estimate, lines=LINES[lines], photo=under)
+        figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
         written = save_figure(figure, output or folder / "views" / f"{name}.png")
         say(f"wrote {written}")
         if open:

@@ -16,7 +16,7 @@ from bpnp.cameras import in_front
 from bpnp.files import interruptions_later, written_whole
 from bpnp.report.page.charts import RECALLS, Error, recall_of
 from bpnp.report.palette import DASHES, LIGHT, QUIET
-from bpnp.report.photos import Box, picture_box, size_in_camera
+from bpnp.report.photos import size_in_camera
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.runs import lines_of, read_runs
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = (".png", ".svg", ".pdf")
 POINTS = 981  # of a curve
+MARGIN = 0.15  # of the extent of the image points, around them
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
 
@@ -83,19 +84,17 @@ def _line_style(colour: int, dashes: int) -> dict[str, Any]:
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
 
 
-def plot_problem(
-    problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d", photo: Array | None = None
-) -> "Figure":
+def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: Lines | None = "match3d") -> "Figure":
     """A problem in space, points with true and estimated cameras, and in the image, seen and reprojected points.
 
-    estimate, lines, photo: see `plot_image`. Raises ValueError for an unknown estimate.
+    estimate, lines: see `plot_image`. Raises ValueError for an unknown estimate.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6), layout="constrained")
     figure.suptitle(_text(problem.id), fontsize=10)
     plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), problem)
-    axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines, photo=photo)
+    axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines)
     name, pose = _estimate(problem, estimate)
     axes.set_title(_text(f"reprojected by {name}") if np.isfinite(np.c_[pose]).all() else "no pose", fontsize=9)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False, fontsize=8)
@@ -142,20 +141,22 @@ def plot_image(
 
     estimate: whose pose, the first by default. lines: to the true matches or to those assigned by the solver, which a
     problem without known matches always has; those that are not the true ones are dotted. photo: (h, w, 3) uint8, as it
-    was taken with the camera; without a camera, undistorted, and filling `bpnp.report.photos.picture_box` of the image
-    points. Under a photo, 3D points without a match are not drawn. Returns the axes.
+    was taken with the camera; under it, 3D points without a match are not drawn. Returns the axes.
+
+    Raises ValueError for a photo of a problem without a camera, or without an image point in front of it.
     """
     from matplotlib.collections import LineCollection
     from matplotlib.patheffects import withStroke
 
     seen, projected, targets, colour = _drawn(problem, estimate, lines)
-    whole = None if problem.camera is None else photo
-    frame = picture_box(seen) if whole is None else Box(0, 0, *size_in_camera(whole, problem.camera))
+    if photo is not None and problem.camera is None:
+        raise ValueError("expected a camera to draw a photo under the points, got none")
+    left, top, right, bottom = _extent(seen) if photo is None else (0, 0, *size_in_camera(photo, problem.camera))
     size = float(np.clip(80 / np.sqrt(len(seen)), 2, 7))
     rim = "black" if photo is None else "white"
     rims = axes.plot(*seen.T, "o", mfc="none", mec=rim, mew=0.7, ms=size, label="image points", zorder=3)
     if photo is not None:
-        axes.imshow(photo, extent=(frame.left, frame.right, frame.bottom, frame.top), zorder=0)
+        axes.imshow(photo, extent=(left, right, bottom, top), zorder=0)
         rims[0].set_path_effects([withStroke(linewidth=1.7, foreground="black")])  # for bright photos and the legend
     visible = np.isfinite(projected).all(-1)
     joined = visible & (targets >= 0)
@@ -171,7 +172,7 @@ def plot_image(
     if free.any() and photo is None:
         axes.plot(*projected[free].T, "x", color=LIGHT[3], ms=size, mew=0.6, label="3D points, no match", zorder=1)
     unit = _unit(problem)
-    axes.set(xlim=(frame.left, frame.right), ylim=(frame.bottom, frame.top), aspect="equal", xlabel=unit, ylabel=unit)
+    axes.set(xlim=(left, right), ylim=(bottom, top), aspect="equal", xlabel=unit, ylabel=unit)
     axes.tick_params(labelsize=8)
     return axes
 
@@ -229,6 +230,16 @@ def _drawn(problem: ProblemPoints, estimate: str | None, lines: Lines | None) ->
     targets = np.full(len(projected), -1) if lines is None else getattr(problem, lines)
     place = [*problem.estimates].index(name) if name else 0
     return seen, projected, targets, LIGHT[place % len(LIGHT)]
+
+
+def _extent(points2d: Array) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of what image points span, and a little more."""
+    seen = points2d[np.isfinite(points2d).all(-1)].astype(float)
+    if not len(seen):
+        raise ValueError("expected image points in front of the camera to draw, got none")
+    low, high = seen.min(0), seen.max(0)
+    margin = MARGIN * np.maximum(high - low, 1e-6)
+    return *(low - margin).tolist(), *(high + margin).tolist()
 
 
 def _unit(problem: ProblemPoints) -> str:

@@ -1,33 +1,18 @@
-"""Which COLMAP models there are below a folder, which scene each belongs to, and its photos, undistorted."""
+"""Which COLMAP models there are below a folder, and which scene each belongs to."""
 
 import itertools
-import logging
 import os
 import re
 import warnings
-from collections.abc import Callable, Sequence
-from functools import cache
+from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
-from scipy.ndimage import map_coordinates
-
-from bpnp.cameras import Camera, image_size
 from bpnp.datamodules.colmap.model_files import FILES, ColmapError, model_format
-from bpnp.datamodules.colmap.reconstruction import ImagePoints, read_reconstruction
 
 # What lies between the folder of a scene and its models: <scene>/sparse/0, <scene>/sparse/manhattan/0 (MegaDepth),
 # <scene>/dense/0/sparse.
 LAYOUT = re.compile(r"sparse|dense\d*")
 INSIDE_LAYOUT = re.compile(r"sparse|dense\d*|manhattan|\d+")
-PHOTO_FOLDERS = ("images", "imgs", "dense/images", "dense0/imgs", "dense0/images")
-UP = 4  # levels above a model: <scene>/sparse/manhattan/0
-WIDTH = 480  # pixels of a crop
-Pixels = NDArray[np.uint8]
-Box = tuple[float, float, float, float]  # left, top, right, bottom of the normalised image plane
-logger = logging.getLogger(__name__)
 
 
 def find_scenes(roots: str | Path | Sequence[str | Path]) -> dict[str, dict[str, Path]]:
@@ -102,55 +87,3 @@ def _scene_folder(top: Path, folder: Path) -> Path:
         if LAYOUT.fullmatch(folder.parts[depth]):
             return Path(*folder.parts[:depth])
     return folder
-
-
-def photo_finder(root: Path) -> Callable[[str, Box], Pixels | None]:
-    """A function of an image's name, <scene>/<image>, and a box of the normalised image plane.
-
-    It gives the undistorted photo in that box (h, 480, 3), black where there is none, or None without a photo: in
-    `images`, `imgs`, `dense/images` or `dense0/imgs` beside or above the model. Photos that cannot be read are logged.
-    Raises ColmapError if `root` holds no COLMAP model.
-    """
-    models = {name: folder for scene in find_scenes(root).values() for name, folder in scene.items()}
-
-    @cache
-    def images(model: str) -> dict[str, ImagePoints]:
-        return {image.name: image for image in read_reconstruction(models[model], keypoints=False).images}
-
-    def find(name: str, box: Box) -> Pixels | None:
-        model = max((model for model in models if name.startswith(f"{model}/")), key=len, default=None)
-        if model is None:
-            return None
-        image = images(model).get(name[len(model) + 1 :])
-        path = None if image is None else image_file(models[model], image.name)
-        if image is None or path is None:
-            return None
-        try:
-            with Image.open(path) as file:
-                photo = np.asarray(file.convert("RGB"))
-        except (OSError, ValueError) as error:
-            logger.warning("photo %s cannot be read: %s", path, error)
-            return None
-        return _resampled(photo, image.camera, box)
-
-    return find
-
-
-def image_file(model: Path, image: str) -> Path | None:
-    """The photo of a model's image, if it is where COLMAP's or MegaDepth's layout has it."""
-    paths = (folder / name / image for folder in [model, *model.parents][: UP + 1] for name in PHOTO_FOLDERS)
-    return next((path for path in paths if path.is_file()), None)
-
-
-def _resampled(photo: Pixels, camera: Camera, box: Box) -> Pixels:
-    left, top, right, bottom = box
-    height = int(np.clip(round(WIDTH * (bottom - top) / (right - left)), 16, 2 * WIDTH))
-    x = left + (np.arange(WIDTH) + 0.5) / WIDTH * (right - left)
-    y = top + (np.arange(height) + 0.5) / height * (bottom - top)
-    rays = np.stack([*np.meshgrid(x, y), np.ones((height, WIDTH))], -1).reshape(-1, 3)
-    if (size := image_size(camera)) is None:
-        raise ColmapError("expected a camera with a width and a height in the COLMAP model, got 0; try another model")
-    scale = np.array(photo.shape[1::-1]) / size  # a photo may have another size than the camera's image
-    column, row = (camera.project(rays) * scale - 0.5).T  # COLMAP's origin is the corner of the first pixel
-    channels = [map_coordinates(photo[..., c], [row, column], order=1, cval=0) for c in range(3)]
-    return np.stack(channels, -1).reshape(height, WIDTH, 3)

@@ -18,9 +18,8 @@ from markupsafe import Markup
 
 from bpnp.files import write_text
 from bpnp.report.page.charts import CONFIG, SIZES, chart_text, figures, look, page_charts
-from bpnp.report.page.problems import compressed, page_numbers, page_points, shown_id
+from bpnp.report.page.problems import compressed, page_numbers, page_points
 from bpnp.report.palette import DASHES, INKS
-from bpnp.report.photos import PhotoFinder, page_photos
 from bpnp.report.points import read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
 from bpnp.report.runs import Line, lines_of, named_runs
@@ -51,18 +50,15 @@ class TableRow(NamedTuple):
     cells: list[tuple[str, Any, bool]]
 
 
-def write_page(
-    paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None, photo: PhotoFinder | None = None
-) -> Path:
+def write_page(paths: Sequence[Path | str], output: Path | str, *, paper: Paper | None = None) -> Path:
     """Write the page of one or several results folders, whole or not at all, and return where it is.
 
-    photo: what finds the photo of a problem, to lie under its image points; see `bpnp.report.photos`.
     Raises ValueError if a folder or its points cannot be read.
     """
-    return write_text(Path(output), page_html(paths, paper=paper, photo=photo))
+    return write_text(Path(output), page_html(paths, paper=paper))
 
 
-def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photo: PhotoFinder | None = None) -> str:
+def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str:
     """The page as text. Raises ValueError as `write_page`."""
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
@@ -73,7 +69,6 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None, photo:
         "keys": list(COLUMNS),
         "causes": CAUSES,
         "inks": INKS,
-        "photos": {shown_id(id): image for id, image in page_photos(points, photo).items()},
         "charts": [chart.to_json() for chart in drawn],
         "config": CONFIG,
         "figures": {name: json.dumps(figure) for name, figure in figures().items()},

@@ -18,7 +18,7 @@ function drawnProblem(series, i) {
   const [[left, right], [top, bottom]] = [extent(drawn.points2d, 0), extent(drawn.points2d, 1)];
   const cameras = [{ name: "true pose", colour: ink("text"), pose: drawn.truth }, ...SERIES.map((own, k) =>
     ({ name: own.name, series: own, k, colour: ink(own.colour), pose: drawn.poses[own.run]?.[own.estimate] }))];
-  return { ...drawn, box: [left, top, right - left, bottom - top], photo: DATA.photos[series.ids[i]],
+  return { ...drawn, box: [left, top, right - left, bottom - top],
     cameras: cameras.filter(({ pose }) => pose) };
 }
 
@@ -40,7 +40,6 @@ function openProblem(i) {
   if (!owner) return;
   byId("pose").replaceChildren(...open.drawn.cameras.map(({ name }, k) => element("option", { value: k }, name)));
   byId("pose").value = Math.max(0, open.drawn.cameras.findIndex((camera) => camera.series === series));
-  byId("photo-label").hidden = !open.drawn.photo;
   drawProblem();
 }
 
@@ -60,7 +59,7 @@ function drawProblem() {
   byId("picked").textContent = "Click a point to see its number and its partner.";
   drawScene(drawn);
   open.ends = drawn.points3d.map((p) => camera && projected(camera.pose, p));
-  draw(byId("image"), image(drawn, camera, open.targets, byId("photo").checked && drawn.photo), { scrollZoom: true },
+  draw(byId("image"), image(drawn, camera, open.targets), { scrollZoom: true },
     ({ curveNumber, pointNumber }) => {
       if (curveNumber === 2) pick(pointNumber, open.targets.indexOf(pointNumber));
       if (curveNumber === 3) pick(open.targets[pointNumber] ?? -1, pointNumber);
@@ -112,7 +111,7 @@ function drawScene({ points3d, ids2d, ids3d, match3d, box: [left, top, width, he
 }
 
 // Image points, 3D points where a camera reprojects them, lines to their targets, dotted where these are wrong.
-function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, width, height] }, camera, targets, photo) {
+function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, width, height] }, camera, targets) {
   const ends = points3d.map((p) => camera && projected(camera.pose, p));
   const lines = (right) => xyz(ends.flatMap((end, j) => (end && targets[j] >= 0 &&
     (targets === match3d || match3d[j] === targets[j]) === right ? [points2d[targets[j]], end, null] : [])));
@@ -121,12 +120,10 @@ function image({ points2d, points3d, ids2d, ids3d, match3d, box: [left, top, wid
   const small = points2d.length > 100 ? 0.6 : 1;
   const marks = (k, name, ids, size, color) => Object.assign(data[k], { text: ids.map((id) => `${name} point ${id}`),
     marker: { ...data[k].marker, size: size * small, color, line: { width: 1.8 * small, color } } });
-  marks(2, "2D", ids2d, 9, photo ? "#ffffff" : ink("text"));
+  marks(2, "2D", ids2d, 9, ink("text"));
   marks(3, "3D", ids3d, 7, camera?.colour ?? ink("focus"));
-  Object.assign(layout.xaxis, { range: [left - 0.15 * width, left + 1.15 * width], showgrid: !photo });
-  Object.assign(layout.yaxis, { range: [top + 1.15 * height, top - 0.15 * height], showgrid: !photo });
-  if (photo) data[0].line.color = "#ffffff";
-  layout.images = photo ? [photo] : [];
+  Object.assign(layout.xaxis, { range: [left - 0.15 * width, left + 1.15 * width] });
+  Object.assign(layout.yaxis, { range: [top + 1.15 * height, top - 0.15 * height] });
   return { data, layout: { ...layout, uirevision: open.i } };
 }
 
@@ -134,7 +131,7 @@ function thumbnail(series, i) {
   const picture = element("div");
   watch(picture, () => {
     const drawn = drawnProblem(series, i);
-    const { data, layout } = image(drawn, drawn.cameras.find((camera) => camera.series === series), [], drawn.photo);
+    const { data, layout } = image(drawn, drawn.cameras.find((camera) => camera.series === series), []);
     layout.xaxis.visible = layout.yaxis.visible = false;
     draw(picture, { data, layout: { ...layout, margin: { l: 0, r: 0, t: 0, b: 0 } } }, { staticPlot: true });
   });
