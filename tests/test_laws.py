@@ -7,13 +7,14 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
-from planted import Planted, degrees_between
+from planted import Planted, degrees_between, padded
 from planted_strategies import FEW, problems
 from small_data import small_net
 
 from bpnp import Batch, solve
+from bpnp.geometry import bearings, retract
 from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
-from bpnp.models import Search
+from bpnp.models import Matcher, Search
 from bpnp.types import Pose
 
 Solver = Callable[[Batch], dict[str, Pose]]
@@ -51,6 +52,61 @@ def test_neighbours_and_padding_do_not_matter(name: str, planted: Planted, other
         torch.testing.assert_close(both[estimate].translation[:1], pose.translation, **exact)
 
 
+def true_matches(batch: Batch) -> torch.Tensor:
+    index = torch.arange(batch.points2d.shape[1]).unsqueeze(-1)
+    return (index == batch.match3d.unsqueeze(1)).double()
+
+
+def by_pnp(method: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
+    def solved(batch: Batch) -> tuple[torch.Tensor, ...]:
+        near = retract(torch.full((len(batch), 6), 0.03, dtype=torch.float64), batch.rotation, batch.translation)
+        return weighted_pnp(true_matches(batch), bearings(batch.points2d), batch.points3d, *near, method=method)[:2]
+
+    return solved
+
+
+def by_ransac(backend: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
+    def solved(batch: Batch) -> tuple[torch.Tensor, ...]:
+        masks = {"mask2d": batch.mask2d, "mask3d": batch.mask3d}
+        return ransac_pnp(true_matches(batch), batch.points2d, batch.points3d, backend=backend, **masks)[:2]
+
+    return solved
+
+
+def by_sinkhorn(batch: Batch) -> tuple[torch.Tensor]:
+    cost = torch.cdist(batch.points2d, batch.points3d[..., :2])
+    return (sinkhorn(cost, mu=0.05, tolerance=1e-12, mask2d=batch.mask2d, mask3d=batch.mask3d)[0],)
+
+
+def by_matcher(frame: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
+    torch.manual_seed(0)
+    net = Matcher(channels=16, depth=2, heads=2, neighbours=3, frame=frame).double().eval()  # type: ignore[arg-type]
+    if net.seen is not None:
+        torch.nn.init.normal_(net.seen.weight)  # zero until it is trained
+    return lambda batch: (net.match(batch).assignment.detach(),)
+
+
+LAYERS = {
+    "sinkhorn": by_sinkhorn,
+    **{f"pnp by {method}": by_pnp(method) for method in ("newton", "lbfgs")},
+    **{f"ransac of {backend}": by_ransac(backend) for backend in ("poselib", "opencv", "torch")},
+    **{f"matcher in {frame} frame": by_matcher(frame) for frame in ("any", "view")},
+}
+
+
+@pytest.mark.parametrize("name", LAYERS)
+@FEW
+@given(planted=problems(), others=problems())
+def test_a_layer_gives_what_it_gives_for_a_problem_alone(name: str, planted: Planted, others: Planted) -> None:
+    """Whatever else is in the batch, and nothing to the padding."""
+    both, alone = LAYERS[name](padded([others, planted])), LAYERS[name](padded([planted]))
+    for together, single in zip(both, alone, strict=True):
+        inside = together[1][tuple(slice(size) for size in single.shape[1:])]
+        torch.testing.assert_close(inside, single[0], rtol=0, atol=1e-7)
+        if "pnp" not in name and "ransac" not in name:
+            assert float(together[1].abs().sum()) == pytest.approx(float(inside.abs().sum()), rel=1e-12)
+
+
 @FEW
 @given(planted=problems(noise=0.0, least=20), seed=st.integers(0, 100))
 def test_the_order_of_the_points_changes_the_places_of_matches_alone(planted: Planted, seed: int) -> None:
@@ -82,8 +138,8 @@ def test_unit_and_origin_of_the_scene_change_the_translation_alone(
 
 @FEW
 @given(planted=problems(size=2, least=6, most=20), seed=st.integers(0, 100))
-def test_layers_keep_the_order_and_the_unit(planted: Planted, seed: int) -> None:
-    """Sinkhorn's assignment is permuted with its cost; a pose's translation has the unit of the points."""
+def test_layers_keep_the_order_the_unit_and_the_origin(planted: Planted, seed: int) -> None:
+    """Sinkhorn's assignment is permuted with its cost; a pose's translation follows the points."""
     generator = torch.Generator().manual_seed(seed)
     m, n = planted.points2d.shape[1], planted.points3d.shape[1]
     rows, cols = torch.randperm(m, generator=generator), torch.randperm(n, generator=generator)
@@ -92,9 +148,11 @@ def test_layers_keep_the_order_and_the_unit(planted: Planted, seed: int) -> None
     torch.testing.assert_close(permuted, plan[:, rows][:, :, cols], atol=1e-12, rtol=1e-9)
     assignment, near = planted.permutation(), planted.near(0.02)
     pose = weighted_pnp(assignment, planted.bearings, planted.points3d, *near)[:2]
-    tenfold = weighted_pnp(assignment, planted.bearings, 10 * planted.points3d, near[0], 10 * near[1])[:2]
-    torch.testing.assert_close(tenfold[0], pose[0], atol=1e-6, rtol=0)
-    torch.testing.assert_close(tenfold[1], 10 * pose[1], atol=1e-4, rtol=1e-5)
+    shift = torch.tensor([30.0, -20, 10], dtype=torch.float64)
+    start = near[0], 10 * near[1] - near[0] @ shift
+    moved = weighted_pnp(assignment, planted.bearings, 10 * planted.points3d + shift, *start)[:2]
+    torch.testing.assert_close(moved[0], pose[0], atol=1e-6, rtol=0)
+    torch.testing.assert_close(moved[1], 10 * pose[1] - pose[0] @ shift, atol=1e-4, rtol=1e-5)
     shuffled = ransac_pnp(assignment[:, rows][:, :, cols], planted.points2d[:, rows], planted.points3d[:, cols])
     plain = ransac_pnp(assignment, planted.points2d, planted.points3d)
     torch.testing.assert_close(shuffled[0], plain[0], atol=0.02, rtol=0)

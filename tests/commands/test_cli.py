@@ -153,13 +153,6 @@ def test_a_broken_configuration_is_named(content: str, message: str, fails: Call
     assert re.search(message, fails("fit", f"--config={tmp_path}/wrong.yaml"))
 
 
-def test_a_checkpoint_that_is_none_is_named(fails: Callable[..., str], tmp_path: Path) -> None:
-    broken = tmp_path / "broken.ckpt"
-    broken.write_bytes(b"no checkpoint")
-    root = [f"--trainer.default_root_dir={tmp_path}", f"--data.cache_dir={tmp_path}"]
-    assert "broken.ckpt" in fails("test", *MESHES, *root, *SMALL_NET, f"--ckpt_path={broken}")
-
-
 def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
     common = [

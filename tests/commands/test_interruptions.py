@@ -10,9 +10,7 @@ import torch
 from lightning.pytorch import Callback
 from small_data import SMALL_MESHES, SMALL_NET
 
-import bpnp
 from bpnp.cli import main
-from bpnp.models.weights import read_checkpoint
 from bpnp.report import read_results
 from bpnp.report.points import read_points
 from bpnp.training.callbacks import SafeCheckpointIO
@@ -59,15 +57,6 @@ def test_an_interrupted_test_keeps_its_finished_pairs(tmp_path: Path, capsys: py
     assert results.settings["complete"] is False
     assert len(read_points(tmp_path / "run" / "test")) == 2
     assert "weights of the solver are untrained" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("share", [0, 0.01, 0.5, 0.9999])
-def test_a_checkpoint_that_was_cut_short_is_named(tmp_path: Path, share: float) -> None:
-    whole = (Path(bpnp.__file__).parent / "weights" / "procedural-so3.ckpt").read_bytes()
-    cut = tmp_path / "cut.ckpt"
-    cut.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=r"expected a checkpoint of `bpnp fit`, got a file that cannot be read: .*cut"):
-        read_checkpoint(cut)
 
 
 def test_a_full_disk_leaves_the_checkpoint_before_and_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

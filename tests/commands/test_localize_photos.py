@@ -130,21 +130,6 @@ def test_photos_in_folders_within_are_named_by_their_path_and_results_are_no_pho
     assert photo_files([given], besides=folder / "found") == {"0005.jpg": given}
 
 
-def test_a_photo_of_a_format_that_cannot_be_read_is_named(
-    place: tuple[Path, Path], tmp_path: Path, fails: Callable[..., str]
-) -> None:
-    model, photos = place
-    folder = tmp_path / "query"
-    folder.mkdir()
-    shutil.copy(photos / "0004.jpg", folder)
-    (folder / "IMG_1.HEIC").write_bytes(b"\0\0\0\x18ftypheic")
-    error = fails(
-        "localize", str(model), str(folder), "--camera", CAMERA, "--no-pictures", "--output", str(tmp_path / "out")
-    )
-    assert "1 of 2 photos could not be tried, such as IMG_1.HEIC: expected a photo that can be read" in error
-    assert error.rstrip().endswith("try a JPEG or PNG file")
-
-
 def test_ctrl_c_while_a_picture_is_drawn_ends_the_run_and_keeps_the_photo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

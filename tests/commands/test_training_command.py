@@ -130,13 +130,6 @@ def test_packaged_weights_are_found_by_name_wherever_a_checkpoint_is_taken(name:
         assert type(net) is kind
 
 
-def test_an_unknown_name_lists_the_packaged_weights() -> None:
-    with pytest.raises(ValueError, match=r"or packaged weights \(matcher-clutter, .*\), got 'procedural-so2'"):
-        source_from("procedural-so2")
-    with pytest.raises(FileNotFoundError, match="no file at procedural-so2; try .*, or packaged weights: matcher-c"):
-        TrainedNet.from_checkpoint("procedural-so2")
-
-
 def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -146,21 +139,6 @@ def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
     assert "train/loss:" in printed
     for name in ("best", "last"):
         assert f"wrote {tmp_path}/run/checkpoints/{name}.ckpt" in printed.replace("\n", " ")
-
-
-def test_the_log_of_weights_and_biases_is_in_the_folder_of_the_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    wandb = pytest.importorskip("wandb", reason="needs wandb")
-    monkeypatch.setenv("WANDB_MODE", "offline")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    monkeypatch.chdir(tmp_path)
-    wandb.finish()  # a run that another test left would be joined
-    main(["fit", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path), "--trainer.logger=bpnp.training.OfflineWandbLogger"])
-    wandb.finish()
-    assert len(list((tmp_path / "run" / "wandb").glob("offline-run-*"))) == 1
-    assert not (tmp_path / "wandb").exists()
-    assert (tmp_path / "run" / "logs").is_dir()
 
 
 def test_a_class_in_the_current_folder_is_found(tmp_path: Path) -> None:

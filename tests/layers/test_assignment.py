@@ -57,24 +57,6 @@ def test_becomes_the_optimal_assignment_as_mu_falls() -> None:
         assert (12 * sample[i, j]).min() > 0.99
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_padding_and_neighbours_change_nothing(dtype: torch.dtype) -> None:
-    sizes = [(5, 7), (12, 9), (1, 4), (3, 1), (12, 12)]
-    costs = [random_cost(1, m, n, seed=m * n).to(dtype) for m, n in sizes]
-    padded = torch.full((len(sizes), 12, 12), 0.7, dtype=dtype)
-    mask2d, mask3d = (torch.zeros(len(sizes), 12, dtype=torch.bool) for _ in range(2))
-    for i, (m, n) in enumerate(sizes):
-        padded[i, :m, :n], mask2d[i, :m], mask3d[i, :n] = costs[i][0], True, True
-    together, stats = sinkhorn(padded, mu=0.02, mask2d=mask2d, mask3d=mask3d)
-    for i, (m, n) in enumerate(sizes):
-        alone, alone_stats = sinkhorn(costs[i], mu=0.02)
-        assert (together[i, :m, :n] - alone[0]).abs().max() < 16 * torch.finfo(
-            dtype
-        ).eps  # a padded sum has another order
-        assert not together[i].masked_select(~(mask2d[i, :, None] & mask3d[i])).any()
-        assert stats.iterations[i] == alone_stats.iterations[0]
-
-
 def test_a_pair_of_infinite_cost_is_never_matched() -> None:
     cost = random_cost(2, 6, 6)
     cost[:, torch.arange(6), torch.arange(6)] = torch.inf

@@ -75,30 +75,6 @@ def test_points_of_one_plane_are_no_trap(backend: str) -> None:
 
 
 @pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
-def test_neighbours_and_padding_change_nothing(backend: str) -> None:
-    planted = plant(3, 30, noise=0.002, seed=5)
-    assignment = wrong_pairs(planted, 0.3)
-    r, t, stats = ransac_pnp(assignment, planted.points2d, planted.points3d, backend=backend)
-    pad = torch.nn.functional.pad
-    mask2d, mask3d = (torch.arange(k).expand(3, k) < 30 for k in (35, 33))
-    padded = ransac_pnp(
-        pad(assignment, (0, 3, 0, 5), value=9.0),
-        pad(planted.points2d, (0, 0, 0, 5), value=0.3),
-        pad(planted.points3d, (0, 0, 0, 3), value=4.0),
-        mask2d=mask2d,
-        mask3d=mask3d,
-        backend=backend,
-    )
-    torch.testing.assert_close(padded[0], r, atol=1e-9, rtol=0)
-    torch.testing.assert_close(padded[1], t, atol=1e-9, rtol=0)
-    for i in range(3):
-        some = [x[i : i + 1] for x in (assignment, planted.points2d, planted.points3d)]
-        alone = ransac_pnp(*some, backend=backend)
-        torch.testing.assert_close(alone[0][0], r[i], atol=1e-9, rtol=0)
-        assert alone[2].iterations[0] == stats.iterations[i]
-
-
-@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
 def test_a_seed_gives_the_same_pose_again(backend: str) -> None:
     planted = plant(2, 40, noise=0.005, seed=6)
     assignment = wrong_pairs(planted, 0.4)

@@ -1,5 +1,3 @@
-from typing import Any
-
 import pytest
 import torch
 from planted import padded, plant
@@ -75,25 +73,6 @@ def test_the_cost_is_the_distance_between_unit_features() -> None:
     aligned = net.features3d.align(batch.points3d, batch.mask3d)
     z3d = PointFeatures.forward(net.features3d, aligned, batch.mask3d)
     torch.testing.assert_close(net.cost(batch), torch.cdist(z2d, z3d), atol=1e-7, rtol=0)
-
-
-@pytest.mark.parametrize("options", [{}, {"centre": True, "normalise": True}])
-def test_padding_neighbours_and_batch_size_change_nothing(options: dict[str, Any]) -> None:
-    net = small_net(**options).double().eval()
-    sizes = (8, 30, 3, 17)
-    with torch.no_grad():
-        together = net(different_sizes(*sizes))
-        for i, n in enumerate(sizes):
-            alone = net(different_sizes(n))
-            m = n + n // 4
-            assert (together.assignment[i, :m, :n] - alone.assignment[0]).abs().max() < 1e-12
-            for name, pose in alone.poses.items():
-                # A refined pose starts from poses rounded to float32, whose last bit a rounding in float64 may turn.
-                tolerance = 1e-4 if name == "refined" else 1e-7
-                torch.testing.assert_close(
-                    together.poses[name].rotation[i], pose.rotation[0], atol=tolerance, rtol=0, equal_nan=True
-                )
-                assert together.poses[name].stats.converged[i] == pose.stats.converged[0]
 
 
 def test_learns_one_pair_by_heart(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:

@@ -1,25 +1,21 @@
 """Rounds of matching again under a pose, and refinement."""
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
 from planted import Planted, plant, posed
-from torch import Tensor, nn
+from torch import Tensor
 
 from bpnp import Batch, Pose, Prediction, SolveStats
-from bpnp.geometry import is_finite, transform
+from bpnp.geometry import is_finite
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP, sinkhorn
 from bpnp.metrics import rotation_error
 from bpnp.models import Refinement, evaluation
 from bpnp.models.evaluation import (
     ALONE,
-    FARTHEST,
-    FEATURE_WEIGHT,
     TRUST,
     WIDTH,
-    cost_under_pose,
     log_support,
     match_again,
     pnp_pose,
@@ -59,21 +55,6 @@ def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
     assert masses[1].min() > 0.7
 
 
-def test_the_cost_is_a_gaussian_of_the_angle_with_a_floor() -> None:
-    scene = plant(2, 5, noise=0.05, seed=1)
-    batch, cost = scene.batch(), torch.rand(2, 5, 5, dtype=torch.float64)
-    rotation, translation = scene.near(0.1)
-    rotation[1] = torch.nan
-    found = cost_under_pose(cost, batch, posed(rotation, translation), width=0.05, mu=MU)
-    torch.testing.assert_close(found[1], cost[1])
-    directions = nn.functional.normalize(transform(rotation, translation, scene.points3d), dim=-1)
-    for i in range(5):
-        for j in range(5):
-            chord = float((scene.bearings[0, i] - directions[0, j]).norm())
-            expected = FEATURE_WEIGHT * cost[0, i, j] + MU * min(chord**2 / (2 * 0.05**2), FARTHEST)
-            assert float(found[0, i, j]) == pytest.approx(float(expected), rel=1e-9)
-
-
 def support(
     plan: Tensor, planted: Planted, rotation: Tensor, translation: Tensor, batch: Batch | None = None
 ) -> Tensor:
@@ -96,25 +77,6 @@ def test_is_the_sum_over_bearings_written_out() -> None:
             inner += given * area * math.exp(-(chord**2) / 2 / WIDTH**2) / (2 * math.pi * WIDTH**2)
         total += math.log(ALONE + (1 - ALONE) * inner)
     assert float(found[0]) == pytest.approx(total, rel=1e-7)
-
-
-def test_speaks_for_the_true_pose_and_against_a_wrong_one_whatever_the_padding() -> None:
-    planted = plant(3, 40, outliers2d=20, outliers3d=20)
-    plan, batch = planted.diffuse(0.03), planted.batch()
-    right = support(plan, planted, *planted.pose)
-    wrong = support(plan, planted, *planted.near(2.0))
-    assert (right > 0).all()
-    assert (wrong < 0).all()
-    pad = nn.functional.pad
-    wide = replace(
-        batch,
-        points2d=pad(batch.points2d, (0, 0, 0, 3)),
-        points3d=pad(batch.points3d, (0, 0, 0, 5)),
-        mask2d=pad(batch.mask2d, (0, 3)),
-        mask3d=pad(batch.mask3d, (0, 5)),
-        match3d=None,
-    )
-    torch.testing.assert_close(support(pad(plan, (0, 5, 0, 3)), planted, *planted.pose, wide), right)
 
 
 def test_a_pose_that_the_assignment_contradicts_gives_way_to_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from bpnp.models.nets.features import InputTransform, PointFeatures, ResidualBlock, normalise_points3d
+from bpnp.models.nets.features import InputTransform, PointFeatures, normalise_points3d
 from bpnp.models.nets.normalisation import MaskedBatchNorm, linear_context_norm
 
 SIZES = (9, 1, 14)
@@ -23,12 +23,6 @@ def sets(channels: int, *, garbage: float = 50.0) -> tuple[list[Tensor], Tensor,
     return single, padded, mask
 
 
-def plain_context_norm(x: Tensor) -> Tensor:
-    deviation = x - x.mean(0)
-    variance = (deviation**2).sum(0) / max(len(x) - 1, 1)
-    return deviation / (variance + 1e-3).sqrt()
-
-
 def randomise(module: nn.Module) -> nn.Module:
     """Batch norms as after some training: no statistic or factor at its neutral start."""
     for norm in module.modules():
@@ -38,30 +32,6 @@ def randomise(module: nn.Module) -> nn.Module:
             nn.init.normal_(norm.running_mean)
             nn.init.uniform_(norm.running_var, 0.5, 2)
     return module
-
-
-def test_a_block_is_the_released_block() -> None:
-    block = ResidualBlock(6).double()
-    single, padded, mask = sets(6)
-    out = block(padded, mask)
-    for i, x in enumerate(single):
-        z = F.conv1d(x.T[None], block.linear_a.weight[..., None], block.linear_a.bias)
-        z = F.conv1d(z, block.linear_b.weight[..., None], block.linear_b.bias)[0].T
-        z = F.linear(plain_context_norm(z), block.linear_c.weight, block.linear_c.bias)
-        torch.testing.assert_close(out[i, : len(x)], x + F.relu(plain_context_norm(z)))
-
-
-@pytest.mark.parametrize("centre", [True, False])
-def test_features_are_a_chain_of_blocks_of_unit_length(centre: bool) -> None:
-    net = PointFeatures(2, channels=8, depth=3, centre=centre).double()
-    single, padded, mask = sets(2)
-    features = net(padded, mask)
-    for i, x in enumerate(single):
-        z = net.enter(x[None])[0]
-        for block in net.blocks:
-            z = block(z[None], torch.ones(1, len(x)).bool())[0]
-        z = z - z.mean(0) if centre else z
-        torch.testing.assert_close(features[i, : len(x)], z / z.norm(dim=-1, keepdim=True).clamp_min(1e-12))
 
 
 @pytest.mark.parametrize("net", [PointFeatures(3, channels=16, depth=4), InputTransform()], ids=["plain", "transform"])
@@ -158,27 +128,3 @@ def test_the_normed_map_has_the_gradient_of_its_formula(residual: bool, padded: 
     assert torch.autograd.gradcheck(
         lambda x, w, b, s: linear_context_norm(x, w, b, mask if padded else None, s if residual else None), inputs
     )
-
-
-@pytest.mark.parametrize("padded", [True, False])
-@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
-def test_a_quick_block_is_the_plain_one_in_double_precision(dtype: torch.dtype, padded: bool) -> None:
-    block = PointFeatures(3, channels=16, depth=3)
-    _, points, mask = sets(3, garbage=1.0)
-    mask = mask if padded else torch.ones_like(mask)
-    weights = torch.randn(*mask.shape, 16, dtype=torch.float64)
-
-    def gradients(dtype: torch.dtype) -> tuple[Tensor, list[Tensor]]:
-        net = PointFeatures(3, channels=16, depth=3).to(torch.float64 if dtype == torch.float64 else torch.float32)
-        net.load_state_dict(block.state_dict())
-        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.bfloat16):
-            out = net(points.to(net.enter.weight.dtype), mask)
-        (out * weights)[mask].sum().backward()
-        return out[mask].double(), [p.grad.double() for n, p in net.named_parameters() if "bias" not in n]
-
-    (out, grads), (exact, exact_grads) = gradients(dtype), gradients(torch.float64)
-    differences = [got - expected for got, expected in zip(grads, exact_grads, strict=True)]
-    rounding = 1e-5 if dtype == torch.float32 else 0.1
-    assert (out - exact).abs().max() < rounding
-    error, size = (float(torch.cat([g.flatten() for g in parts]).norm()) for parts in (differences, exact_grads))
-    assert error < 7 * rounding * size  # of the whole gradient, as the digits of 30 other draws; a wrong one has 1

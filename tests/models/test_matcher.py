@@ -4,7 +4,6 @@ from typing import Literal
 import pytest
 import torch
 from planted import padded, plant
-from torch import Tensor
 
 from bpnp import Batch
 from bpnp.models import Matcher
@@ -26,29 +25,12 @@ def cluttered(*sizes: int) -> Batch:
     return padded([plant(1, n, outliers2d=n // 3, outliers3d=n // 3 + 1, seed=n) for n in sizes])
 
 
-def plan(net: Matcher, batch: Batch) -> Tensor:
-    transported, stats = net.transport(batch)
-    assert stats.converged.all()
-    return transported.detach()
-
-
 def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
     batch = cluttered(9, 21)
     prediction = small().match(batch)
     total = (batch.count2d + batch.count3d).unsqueeze(-1).double()
     torch.testing.assert_close(prediction.assignment.sum(2) + prediction.unmatched2d, batch.mask2d / total)
     torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
-
-
-@pytest.mark.parametrize("frame", ["any", "view"])
-def test_a_pair_depends_neither_on_its_batch_nor_on_padding(frame: Literal["any", "view"]) -> None:
-    net, batch = small(frame=frame), cluttered(9, 21, 14)
-    joint = net.match(batch).assignment
-    for i, size in enumerate((9, 21, 14)):
-        alone = net.match(cluttered(size)).assignment[0]
-        torch.testing.assert_close(joint[i, : alone.shape[0], : alone.shape[1]], alone, rtol=1e-8, atol=1e-14)
-        assert not joint[i, alone.shape[0] :].any()
-        assert not joint[i, :, alone.shape[1] :].any()
 
 
 def test_the_image_of_a_view_holds_what_is_before_it_and_the_rest_at_its_edge() -> None:

@@ -50,11 +50,6 @@ def test_same_number_of_poses_and_same_poses_as_poselib() -> None:
     assert (torch.cat(distances).amin(-1) < 1e-6).double().mean() > 0.999
 
 
-def test_a_small_triangle_seen_from_afar_is_solved() -> None:
-    rays, points3d, rotation, _ = planted(2000, seed=5, field=0.02)
-    assert angles(p3p(rays, points3d).rotation, rotation).amin(-1).quantile(0.999) < 1e-6
-
-
 DEGENERATE = {
     "collinear": lambda rays, points3d: (rays, torch.arange(3.0).unsqueeze(-1).double() * points3d[0]),
     "two points repeated": lambda rays, points3d: (rays, points3d[[0, 0, 2]]),

@@ -5,19 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import degrees_between, directions, plant
+from planted import directions, plant
 from scipy.spatial.transform import Rotation
 
 from bpnp.geometry import bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import Search
-from bpnp.models.evaluation import best_poses, refine
-from bpnp.search import pool, schedule
-from bpnp.search.candidates import Candidates
+from bpnp.models.evaluation import best_poses
+from bpnp.search import schedule
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
-from bpnp.search.refine import score_poses
 from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Draws, RasterSearch, Schedule, SearchSettings
@@ -107,37 +105,6 @@ def test_poses_that_are_proposed_are_tried_where_the_search_ends_in_doubt():
     assert alike.hits.sum() == 0  # fifty alike are no evidence
 
 
-def test_refine_mends_a_rough_pose_and_leaves_the_missing(problem):
-    rotation, translation = problem.near(0.08, seed=2)
-    rotation, translation = rotation.unsqueeze(1).clone(), translation.unsqueeze(1).clone()
-    rotation[2] = torch.nan
-    pose = refine(problem.batch(), rotation, translation)
-    assert (rotation_error(pose.rotation, problem.rotation)[:2] < 0.3).all()
-    assert (translation_error(pose.translation, problem.translation)[:2] < 0.02).all()
-    assert pose.rotation[2].isnan().all()
-    assert not pose.stats.converged[2]
-    assert pose.stats.converged[:2].all()
-
-
-def test_given_poses_are_fitted_and_judged():
-    """One near the true pose is believed; a wrong one alone is not, and none is none."""
-    planted = plant(1, 60, noise=0.001)
-    sets = PointSets(planted.bearings[0].numpy(), planted.points3d[0].numpy())
-    (wrong, right), missing = (
-        ([x.numpy() for x in planted.near(off)] for off in (1.0, 0.003)),
-        np.full((1, 3, 3), np.nan),
-    )
-    poses = np.concatenate([missing, wrong[0], right[0]]), np.concatenate([missing[:, 0], wrong[1], right[1]])
-    result = score_poses(sets, *poses, Deadline())
-    assert result.verdict == "confident"
-    assert rotation_error(torch.as_tensor(result.best[0])[None], planted.rotation) < 0.3
-    assert result.batches == 2
-    alone = score_poses(sets, *wrong, Deadline())
-    assert alone.verdict == "failed"
-    assert (alone.candidates.hits == 0).all()
-    assert score_poses(sets, missing, wrong[1], Deadline()).verdict == "failed"
-
-
 @pytest.mark.parametrize(
     ("call", "named"),
     [
@@ -193,25 +160,6 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     assert np.degrees(Rotation.from_matrix(turned.T @ aside @ rotation).magnitude()) < 0.2
     assert np.linalg.norm(moved - aside @ translation) < 0.002 * translation[2]
     assert found.residual == pytest.approx(0.002 * spread, rel=0.3)
-
-
-def test_a_search_in_doubt_looks_beside_its_best_pose(monkeypatch):
-    """All batches end at a pose that beats chance and is 4 degrees off, as in a wide optimum beside the right one."""
-    planted = plant(1, 200, seed=5, noise=1e-3, outliers2d=20, outliers3d=20)
-    sets = PointSets(planted.bearings[0].double().numpy(), planted.points3d[0].double().numpy())
-    truth, middle = planted.rotation[0].double().numpy(), sets.points3d.mean(0)
-    wrong = Rotation.from_rotvec([np.radians(4), 0, 0]).as_matrix() @ truth
-    translation = planted.translation[0].double().numpy() + (truth - wrong) @ middle
-
-    def ends(scene, *_):
-        pose = Candidates.unscored(*scene.enter(wrong[None], translation[None]), hits=1)
-        return replace(pose, scale=np.full(1, 0.03, np.float32), score=np.full(1, 4, np.float32)), 1.0
-
-    monkeypatch.setattr(schedule, "multistart", ends)
-    monkeypatch.setattr(pool, "finish", lambda scene, poses, annealed=None: poses)
-    result = search_poses(sets, settings=DEFAULT.limited(3))
-    assert result.verdict == "confident"
-    assert degrees_between(result.best[0], truth) < 0.5
 
 
 def test_of_points_that_have_no_label_in_common_no_pose_is_found():

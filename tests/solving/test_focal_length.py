@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -89,26 +88,6 @@ def test_a_radial_coefficient_is_found_where_the_points_support_one() -> None:
         coefficient = json.loads(solution.to_json())["camera"]["params"][3]
         assert coefficient == pytest.approx(radial, abs=0.1)
         assert (coefficient == 0) == (radial == 0)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"image_size": SIZE, "camera": np.diag([600, 600, 1.0])}, "a `camera` or the `image_size` .*, got both"),
-        ({"image_size": (480, 640)}, "inside the 480 x 640 pixels .* are width and height swapped"),
-        ({"image_size": (320, 200)}, "inside the 320 x 200 pixels .* try the size of the image"),
-        ({"image_size": (640.5, 480)}, "`image_size` as .width, height. in whole pixels"),
-        ({"image_size": 640}, "`image_size` as .width, height. in whole pixels"),
-        ({"image_size": SIZE, "focal_error": 0.1}, "`focal_error` beside a `camera`"),
-        ({"focal_error": 0.1}, "expected a `camera` whose focal length"),
-        ({"camera": np.diag([600, 600, 1.0]), "focal_error": 1.5}, "`focal_error` above 0 and below 1"),
-        ({"camera": np.diag([600, 600, 1.0]), "distortion": True}, "`distortion=True` beside an `image_size`"),
-    ],
-)
-def test_errors_name_the_argument(options: dict[str, Any], message: str) -> None:
-    pixels, scene, _ = planted(600.0, points=200, distance=2.5)
-    with pytest.raises(ValueError, match=message):
-        solve(pixels, scene, **options)
 
 
 def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:

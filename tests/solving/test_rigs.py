@@ -80,25 +80,3 @@ def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
         assert solution.verdict == "confident"
         assert solution.log10_false_alarms < -80
         assert degrees_between(solution.rotation, pose[0]) < 0.5
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"camera": [CAMERA]}, "expected 2 of `camera`, one a camera of the `rig`, got 1"),
-        ({"rig": [np.eye(4)]}, "expected 1 of `points2d`, one a camera of the `rig`, got 2"),
-        ({"rig": [np.eye(4), np.eye(3)]}, r"expected `rig\[1\]` as cam_from_rig, \(3, 4\), \(4, 4\) or \(R, t\)"),
-        ({"rig": [np.eye(4), 2 * np.eye(4)]}, r"expected a rotation in `rig\[1\].rotation`"),
-        ({"prior": bpnp.GravityPrior([0, 1, 0], [0, 1, 0])}, "expected no `prior` with `rig`"),
-        ({"scores3d": np.ones(20)}, "expected no `scores3d` with `rig`"),
-        ({"image_size": (640, 480)}, "expected no `image_size` with `rig`"),
-        ({"solver": "matcher-sfm"}, "expected no `solver` with `rig`"),
-        ({"points2d": [np.zeros((3, 2)), np.zeros((5, 2))]}, "camera 0: .* points in `points2d`, got 3"),
-        ({"labels2d": [np.zeros(6, int)]}, "expected 2 of `labels2d`"),
-    ],
-)
-def test_a_bad_rig_is_named(change: dict[str, Any], message: str) -> None:
-    images, scene, *_ = planted_rig(0, (6, 6))
-    given: dict[str, Any] = {"points2d": images, "points3d": scene, "camera": [CAMERA] * 2, "rig": [np.eye(4)] * 2}
-    with pytest.raises(ValueError, match=message):
-        bpnp.solve(**given | change)

@@ -85,20 +85,3 @@ def test_only_the_classes_tell_two_equal_things_apart() -> None:
     assert bpnp.verify(image, points, *right).verdict != "confident"
     assert bpnp.verify(image, points, *right, **classes).verdict == "confident"
     assert bpnp.verify(image, points, *twin, **classes).verdict == "failed"
-
-
-@pytest.mark.parametrize(
-    ("classes2d", "classes3d", "message"),
-    [
-        (np.full((100, 4), 0.3), np.full((100, 4), 0.25), "add up to 1 in `labels2d`"),
-        (np.full((100, 4), 0.25), np.tile([1.5, -0.5, 0, 0], (100, 1)), "probabilities from 0 .* in `labels3d`"),
-        (np.full((100, 4), 0.25), np.full((100, 5), 0.2), "as many classes in `labels2d` as .*, got 4 and 5"),
-        (np.full((99, 4), 0.25), np.full((100, 4), 0.25), r"in `labels2d` of shape \(100, c\)"),
-        (np.full((100, 4), 0.25), np.zeros(100, int), r"in `labels3d` of shape \(100, c\)"),
-        (np.full((100, 4), np.nan), np.full((100, 4), 0.25), "in `labels2d`"),
-        (np.full((100, 4), 0.25), None, "both `labels2d` and `labels3d`"),
-    ],
-)
-def test_what_is_no_probability_is_refused(view: Any, classes2d: Any, classes3d: Any, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        bpnp.solve(view[0], view[1], labels2d=classes2d, labels3d=classes3d)

@@ -7,9 +7,8 @@ import pytest
 import torch
 from planted import Planted, degrees_between, plant
 from scipy.spatial.transform import Rotation
-from small_data import small_net
 
-from bpnp import GravityPrior, PosePrior, Solution, solve, solve_many
+from bpnp import PosePrior, Solution, solve, solve_many
 from bpnp.examples import load
 from bpnp.models import Search
 from bpnp.types import Pose, Prediction, SolveStats
@@ -119,23 +118,6 @@ def test_many_pairs_are_solved_as_each_alone() -> None:
     assert degrees(again[1], planted[1]) < 1
 
 
-def test_a_symmetric_shape_has_several_answers() -> None:
-    """Points on a square prism look the same after a quarter turn about its axis."""
-    rng = np.random.default_rng(0)
-    side = np.column_stack([rng.uniform(-1, 1, 20), np.ones(20), rng.uniform(-2, 2, 20)])
-    turns = [Rotation.from_rotvec([0, 0, k * np.pi / 2]).as_matrix() for k in range(4)]
-    points3d = np.concatenate([side @ turn.T for turn in turns])
-    rotation, translation = Rotation.random(rng=1).as_matrix(), np.array([0.1, 0.2, 8.0])
-    camera = points3d @ rotation.T + translation
-    solution = solve(camera[:, :2] / camera[:, 2:], points3d)
-    assert solution.verdict in ("ambiguous", "confident")
-    full = [candidate for candidate in solution.candidates if candidate.inlier_count == 80]
-    axes = np.stack([candidate.rotation for candidate in full])
-    for turn in turns:
-        gaps = [Rotation.from_matrix((rotation @ turn).T @ axis).magnitude() for axis in axes]
-        assert min(gaps) < 0.01
-
-
 @pytest.mark.parametrize(
     ("change2d", "change3d", "reason"),
     [
@@ -158,68 +140,6 @@ def test_points_that_fix_no_pose_fail_with_the_reason(change2d, change3d, reason
     assert not solution.found
     assert np.isnan(solution.rotation).all()
     assert (solution.matches.shape, solution.inlier_count, solution.candidates) == ((0, 2), 0, ())
-
-
-X, P = plant(1, 20).points2d[0].numpy(), plant(1, 20).points3d[0].numpy()
-WITH_NAN = np.where(np.arange(20)[:, None] == 7, np.nan, P)
-
-
-@pytest.mark.parametrize(
-    ("points2d", "points3d", "options", "message"),
-    [
-        (X[:3], P, {}, "4 or more points in `points2d`, got 3"),
-        (X, P[:3], {}, "4 or more points in `points3d`, got 3"),
-        (X[:0], P, {}, "4 or more points in `points2d`, got 0"),
-        (X, WITH_NAN, {}, "finite `points3d`, got .* at point 7"),
-        (X + np.inf, P, {}, "finite `points2d`"),
-        (P, X, {}, "swapped"),
-        (P, P, {}, "unit bearings .* swapped"),
-        (P, X, {"camera": K}, "swapped"),
-        (X, X, {}, r"`points3d` of shape \(k, 3\).* swapped"),
-        (X.T, P, {}, r"`points2d` of shape \(k, 2\) or \(k, 3\), got \(2, 20\)"),
-        (X[:, 0], P, {}, r"got \(20,\)"),
-        (X, "points.npy", {}, "`points3d` as an array of numbers"),
-        (X.astype(complex), P, {}, "`points2d` as an array of numbers"),
-        (None, P, {}, "`points2d` as an array of numbers"),
-        (500 * X + 300, P, {}, "look like pixels; try camera=K"),
-        (X, P, {"camera": K}, "look normalised"),
-        (500 * X, P, {"camera": np.zeros((3, 3))}, "last row"),
-        (500 * X, P, {"camera": np.diag([500.0, 0, 1])}, "invertible `camera`"),
-        (X, P, {"inlier_threshold": 0.0}, "positive `inlier_threshold`"),
-        (X, P, {"time_limit": -1.0}, "positive `time_limit`"),
-        (X, P, {"clutter": 1.5}, "`clutter`"),
-        (X, P, {"solver": "serch"}, '`solver` "auto", "search"'),
-        (X, P, {"device": "gpu0"}, "`device` of this machine"),
-        (X, P, {"prior": PosePrior(2 * np.eye(3), None, 5.0)}, "a rotation in `prior.rotation`"),
-        (X, P, {"prior": PosePrior(np.eye(3), np.zeros(2), 5.0)}, r"`prior.translation` of shape \(3,\)"),
-        (X, P, {"prior": PosePrior(np.eye(3), None, 0.0)}, "positive `prior.rotation_sigma_deg`"),
-        (X, P, {"prior": GravityPrior(np.zeros(3), np.ones(3), 1.0)}, "expected directions"),
-        (X, P, {"prior": "nothing.ckpt"}, "nothing.ckpt"),
-        (X, P, {"solver": "nothing.ckpt"}, "nothing.ckpt"),
-    ],
-)
-def test_a_mistake_is_one_clear_error(points2d, points3d, options, message: str) -> None:
-    with pytest.raises((ValueError, FileNotFoundError), match=message):
-        solve(points2d, points3d, **options)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (([X, X[:3]], [P, P]), "problem 1: .* points in `points2d`, got 3"),
-        (([X], [P, P]), "1 of `points3d`, one a problem, got 2"),
-        ((X, P), r"`points2d` as a sequence of arrays, one a problem, got shape \(20, 2\)"),
-        (([], []), "one array a problem in `points2d`, got 0"),
-        ((5, P), "`points2d` as a sequence"),
-        (([X, X], P, [K]), "2 of `camera`, one a problem, got 1"),
-        (([X, X], P, None, 3), "`prior` as PosePrior, GravityPrior, BPnPNet"),
-        (([X, X], P, None, [None]), "2 of `prior`, one a problem, got 1"),
-    ],
-)
-def test_of_many_pairs_the_wrong_one_is_named(arguments, message: str) -> None:
-    points2d, points3d, camera, prior = (*arguments, *(None, None)[len(arguments) - 2 :])
-    with pytest.raises(ValueError, match=message):
-        solve_many(points2d, points3d, camera, prior=prior)
 
 
 class Fixed(torch.nn.Module):
@@ -247,26 +167,6 @@ def test_a_module_solves_and_is_judged_by_the_points() -> None:
     assert (missing.verdict, missing.found) == ("failed", False)
     searched = solve(x, p, solver=Search())
     assert degrees(searched, planted) < 0.1
-
-
-def test_a_net_is_a_solver_and_a_source_of_candidates() -> None:
-    """Untrained, it knows nothing: as a solver it is not believed, as a prior it does no harm.
-
-    With the many starts of its hypotheses even that may find the pose; believed, it is then right.
-    """
-    planted = plant(1, 60, noise=0.001)
-    x, p = planted.points2d[0], planted.points3d[0]
-    torch.manual_seed(0)
-    net = small_net()
-    net.refinement.hypotheses = 0
-    assert solve(x, p, solver=net).verdict != "confident"
-    assert net.training  # as it came
-    net.refinement.hypotheses = 192
-    lucky = solve(x, p, solver=net)
-    assert lucky.verdict != "confident" or degrees(lucky, planted) < 0.2
-    solution = solve(x, p, prior=net)
-    assert solution.verdict == "confident"
-    assert degrees(solution, planted) < 0.2
 
 
 def test_a_solution_is_the_same_after_its_json(tmp_path) -> None:
