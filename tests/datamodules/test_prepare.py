@@ -4,8 +4,6 @@ import multiprocessing
 import os
 import shutil
 import signal
-import subprocess
-import sys
 import time
 import zipfile
 import zlib
@@ -251,44 +249,6 @@ def end_worker(parent: int) -> Made:
     assert os.getpid() != parent
     os.kill(os.getpid(), signal.SIGKILL)
     return [], {}
-
-
-def test_two_at_once_are_refused(meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("bpnp.datamodules.shapes.sample_surface", lambda *_: run(meshes, tmp_path / "store"))
-    with pytest.raises(ValueError, match="no other process writes to"):
-        run(meshes, tmp_path / "store")
-
-
-PREPARE = """
-import os, signal, sys
-from pathlib import Path
-from torch.utils.data import DataLoader
-from bpnp.datamodules.meshes import prepare_meshes
-
-start = DataLoader.__iter__
-
-def interrupted(loader):
-    workers = start(loader)
-    os.killpg(0, signal.SIGINT)
-    return workers
-
-if __name__ == "__main__":
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell that starts tests in the background ignores it
-    DataLoader.__iter__ = interrupted
-    try:
-        prepare_meshes(*map(Path, sys.argv[1:]), points=32, normalisation="none", processes=2)
-    except KeyboardInterrupt:
-        sys.exit(130)
-"""
-
-
-def test_ctrl_c_while_processes_start_is_one_clean_end(meshes: Path, tmp_path: Path) -> None:
-    """No worker is left to find that its parent has gone."""
-    (tmp_path / "script.py").write_text(PREPARE)
-    words = [sys.executable, str(tmp_path / "script.py"), str(meshes), str(tmp_path / "store")]
-    ended = subprocess.run(words, text=True, capture_output=True, start_new_session=True)
-    assert (ended.returncode, "Traceback" in ended.stderr) == (130, False), ended.stderr
-    check(run(meshes, tmp_path / "store"), meshes)
 
 
 def scenes(root: Path, count: int) -> None:

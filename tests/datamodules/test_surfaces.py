@@ -8,7 +8,6 @@ import pytest
 import trimesh
 from scipy import stats
 
-from bpnp.datamodules.shapes import primitives
 from bpnp.datamodules.surfaces import Mesh, MeshError, read_mesh, sample_surface
 
 VERTICES = "0 0 0\n2 0 0\n2 1 0\n0 1 0\n0 0 3\n"
@@ -99,14 +98,3 @@ def test_samples_are_uniform_by_area() -> None:
     assert stats.kstest(points[flat, 0], stats.uniform(0, 2).cdf).pvalue > 1e-3
     assert stats.kstest(points[flat, 1], stats.uniform(0, 1).cdf).pvalue > 1e-3
     np.testing.assert_allclose(points[~flat].mean(0), [2 / 3, 0, 1], atol=0.03)  # centroid of the triangle
-
-
-def test_primitives_have_the_areas_of_their_formulas() -> None:
-    """Box, wedge exactly; the round ones from below, by the polygons inscribed in their circles."""
-    pi = np.pi
-    tori = [4 * pi**2 * 0.75 * 0.25, 4 * pi**2 * 0.9 * 0.1]
-    round_ones = [4 * pi + 2 * pi, pi * (1 + 5**0.5), 2 * pi * 0.6 * (2 * 0.6 + 1), *tori, 4 * pi]
-    areas = [mesh.areas.sum() for mesh in primitives()]
-    assert areas[:2] == pytest.approx([24, 2 * 2 + 1.5 * (4 + 8**0.5)])
-    for area, formula in zip(areas[2:8], round_ones, strict=True):
-        assert 0.9 * formula < area < formula

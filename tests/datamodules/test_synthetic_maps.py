@@ -15,15 +15,8 @@ from bpnp.datamodules.synthetic_maps.maps import (
     draw_map_problem,
 )
 from bpnp.datamodules.synthetic_maps.scene import (
-    NO_BLOBS,
-    NO_WALLS,
-    Scene,
-    Viewpoint,
     Walls,
-    camera_at,
-    details,
     hidden_by_walls,
-    look,
 )
 
 
@@ -122,36 +115,6 @@ def test_a_wall_hides_what_is_behind_it_and_nothing_else() -> None:
     }
     found = hidden_by_walls(wall, np.array([2.0, -10.0, 1.5]), np.array(list(points)))
     assert found.tolist() == list(points.values())
-
-
-def plane(count: int, rng: np.random.Generator, *, repeatability: float) -> Scene:
-    """A wall of points at x = 0 that faces the negative x axis; nothing hides them."""
-    points = np.stack([np.zeros(count), *rng.uniform(-2, 2, (2, count))], 1)
-    normals = np.tile([-1.0, 0.0, 0.0], (count, 1))
-    return Scene(points, normals, np.full(count, repeatability), NO_WALLS, NO_BLOBS)
-
-
-FRONT = Viewpoint(np.array([-10.0, 0, 0]), np.zeros(3), orbit=0.0, shift=0.0, heading=0.0, parallax=(0.1, 0.1))
-SQUARE = np.array([0.5, 0.5])
-
-
-def test_a_photo_has_keypoints_where_points_repeat_face_it_and_are_near_enough() -> None:
-    rng = np.random.default_rng(0)
-    scene = plane(20_000, rng, repeatability=0.6)
-    everywhere = np.full(20_000, np.inf)
-    front = camera_at(FRONT.centre, FRONT.target, SQUARE, rng)
-    assert len(look(scene, front, everywhere, rng, alone=True).of) / 20_000 == pytest.approx(0.6, abs=0.02)
-    behind = camera_at(-FRONT.centre, FRONT.target, SQUARE, rng)
-    assert len(look(scene, behind, everywhere, rng, alone=True).of) == 0
-    reach = details(scene, FRONT, 0.5, rng)
-    shares = []
-    for far in (20.0, 40.0):
-        camera = camera_at(np.array([-far, 0.0, 0.0]), FRONT.target, SQUARE, rng)
-        shares.append(len(look(scene, camera, reach, rng, alone=False).of) / (0.6 * 20_000))
-    np.testing.assert_allclose(shares, [1 / 4, 1 / 16], rtol=0.1)  # as the square of the distance
-    single = scene._replace(repeatability=np.zeros(20_000))
-    assert len(look(single, front, everywhere, rng, alone=False).of) == 0
-    assert len(look(single, front, everywhere, rng, alone=True).of) > 0
 
 
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:

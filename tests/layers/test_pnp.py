@@ -5,9 +5,8 @@ import torch
 from planted import Planted, plant
 from torch import Tensor
 
-from bpnp.geometry import camera_centre, hat, rotation_angle, transform
+from bpnp.geometry import camera_centre, rotation_angle, transform
 from bpnp.layers import weighted_pnp
-from bpnp.layers.objective import aggregate, dense_objective, derivatives, pose_gradient
 from bpnp.types import SolveStats
 
 Solved = tuple[Tensor, Tensor, SolveStats]
@@ -20,42 +19,6 @@ def solve(planted: Planted, assignment: Tensor, start: tuple[Tensor, Tensor], **
 def apart(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> float:
     """Largest angle in radians or distance between the poses of two lists."""
     return torch.maximum(rotation_angle(a[0], b[0]), (a[1] - b[1]).norm(dim=-1)).max().item()
-
-
-def test_gradient_and_hessian_are_those_of_autograd() -> None:
-    planted = plant(3, 12, outliers2d=5, seed=2)
-    assignment = planted.diffuse(0.3)
-    rotation, translation = planted.near(0.4)
-    found = derivatives(aggregate(assignment, planted.bearings), planted.points3d.mT, rotation, translation)
-    for i in range(3):
-
-        def value(step: Tensor, i: int = i) -> Tensor:
-            turn = torch.eye(3) + hat(step[:, :3]) + hat(step[:, :3]) @ hat(step[:, :3]) / 2  # exp to second order
-            moved = turn @ rotation[i : i + 1], translation[i : i + 1] + step[:, 3:]
-            some = (x[i : i + 1] for x in (assignment, planted.bearings, planted.points3d))
-            return dense_objective(*some, *moved).sum()
-
-        zero = torch.zeros(1, 6, dtype=torch.float64)
-        gradient = torch.autograd.functional.jacobian(value, zero)[0]
-        hessian = torch.autograd.functional.hessian(value, zero)[0, :, 0]
-        assert (found.gradient[i] - gradient).abs().max() < 1e-13
-        assert (found.hessian[i] - hessian).abs().max() < 1e-13
-    q = aggregate(assignment, planted.bearings)
-    same = pose_gradient(q, planted.points3d.mT, rotation, translation)
-    torch.testing.assert_close(same, found.gradient, rtol=1e-12, atol=1e-14)
-
-
-def test_a_point_at_the_camera_has_finite_derivatives_and_nan_stays_visible() -> None:
-    planted = plant(3, 12, outliers2d=5, seed=3)
-    q, (rotation, translation) = aggregate(planted.diffuse(0.3), planted.bearings), planted.near(0.4)
-    points = planted.points3d.mT.clone()
-    points[0, :, 0] = -(rotation[0].mT @ translation[0])
-    points[1, 1, 2] = torch.nan
-    found = derivatives(q, points, rotation, translation)
-    for value in (found.value, found.gradient, found.hessian):
-        assert value[0].isfinite().all()
-        assert value[1].isnan().any()
-        assert value[2].isfinite().all()
 
 
 @pytest.mark.parametrize("method", ["newton", "lbfgs"])

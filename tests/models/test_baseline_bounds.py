@@ -2,7 +2,6 @@
 
 import math
 
-import pytest
 import roma
 import torch
 from planted import plant
@@ -16,8 +15,6 @@ from bpnp.models.baselines.gosma import (
     align_mixtures,
     distance,
     lower_bound,
-    ray_mixture,
-    scene_mixture,
     squared_norm,
 )
 
@@ -105,20 +102,6 @@ def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() 
         lowest = min(lowest, float(values.min()) / norm + 1)
     assert found.bound <= lowest
     assert found.value <= lowest  # no grid point beats it
-
-
-def test_mixtures_find_planted_clusters_in_any_order() -> None:
-    centres = torch.tensor([[0.0, 0, 0], [3, 0, 0], [0, 3, 1]]).double()
-    points = (centres.unsqueeze(1) + 0.1 * normal(3, 200, 3)).flatten(0, 1)
-    mixture = scene_mixture(points, 1.0)
-    assert len(mixture.weights) == 3
-    assert torch.cdist(centres, mixture.means).amin(-1).max() < 0.05
-    shuffled = scene_mixture(points[torch.randperm(600)], 1.0)
-    torch.testing.assert_close(shuffled.means.sum(0), mixture.means.sum(0))
-    rays = torch.nn.functional.normalize(centres.new_tensor([0, 0, 1.0]) + 0.05 * normal(500, 3), dim=-1)
-    fitted = ray_mixture(rays, 0.3)
-    assert len(fitted.weights) == 1
-    assert float(fitted.concentrations) == pytest.approx(1 / 0.05**2, rel=0.15)
 
 
 def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:

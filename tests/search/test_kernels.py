@@ -88,42 +88,6 @@ def test_the_likelihood_on_tiles_is_the_mixture_and_close_to_that_on_clusters(en
     assert entry(assign)(*sides, *at, dense) == pytest.approx(likelihood, abs=0.1)
 
 
-@pytest.mark.parametrize("clumped", [False, True])
-def test_the_likelihood_on_tiles_is_exact_where_points_lie_together_and_in_a_mirror(clumped: bool) -> None:
-    """600 bearings of which most lie within the kernel's reach of one another, and 40 points: 38 tiles meet a point."""
-    rng = np.random.default_rng(3)
-    f = np.concatenate([rng.normal(0, 0.002 if clumped else 0.1, (500, 2)), rng.uniform(-0.3, 0.3, (100, 2))])
-    points = np.concatenate([rng.normal(0, 0.01 if clumped else 0.5, (30, 3)), rng.uniform(-1.5, 1.5, (10, 3))])
-    translation, scale, outlier = np.array([0.001, -0.002, 5.0], np.float32), np.float32(0.01), np.float32(20)
-    found = []
-    for sign in (1, -1):
-        bearings = np.column_stack([f * (sign, 1), np.ones(600)])
-        bearings /= np.linalg.norm(bearings, axis=1, keepdims=True)
-        one, free = np.ones(600, np.float32), np.full(600, -1, np.int32)
-        side = WeightedBearings(np.ascontiguousarray((bearings - FORWARD).T, np.float32), one, one, free)
-        mirrored = (points * (sign, 1, 1)).T.astype(np.float32).copy()
-        scene = WeightedPoints(
-            mirrored, one[:40], one[:40], free[:40], np.empty((0, 4), np.uintp), np.empty((6, 0), np.float32)
-        )
-        tiles = build_tiles(side).with_margin(float(scale))
-        turned, moved = np.eye(3, dtype=np.float32)[None].copy(), (translation * (sign, 1, 1))[None].astype(np.float32)
-        result = np.zeros((1, 3), np.float32)
-        scales = np.array([scale], np.float32)
-        for pairs in (0, 40 * len(tiles.f)):  # the place that is enough for most problems, and for all pairs
-            scratch = sparse_scratch(tiles, 40, pairs)
-            done = descend_sparse(tiles, scene, turned, moved, scales, outlier, 3, result, scratch)
-            assert done == (0 if clumped and not pairs else 1)
-            assert (turned == np.eye(3)).all()
-        found.append(result[0].copy())
-        camera = mirrored.T.astype(float) + translation * (sign, 1, 1)
-        seen = camera / np.linalg.norm(camera, axis=1, keepdims=True)
-        squared = cdist(bearings, seen, "sqeuclidean")
-        kernel = np.where(squared < (REACH * scale) ** 2, np.exp(-squared / (2 * scale**2)), 0)
-        expected = np.log(kernel.mean(1) / scale**2 + outlier).mean()
-        assert result[0, 0] == pytest.approx(expected, abs=2e-3)
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-4)
-
-
 @pytest.mark.parametrize("spread", [0.5, 0.01])
 def test_the_gradient_is_that_of_finite_differences(entry: Any, spread: float) -> None:
     view = View(spread)

@@ -89,15 +89,6 @@ def test_the_file_of_a_solution_is_drawn_and_broken_ones_are_named(
         assert "castle.json" in shown
 
 
-def test_a_solution_is_drawn_with_a_cross_on_every_image_point() -> None:
-    solution = bpnp.solve(PLANTED.points2d[0].numpy(), PLANTED.points3d[0].numpy())
-    lines = {line.get_label(): line.get_xydata() for line in solution.plot().axes[0].get_lines()}
-    crosses = np.asarray(lines["3D points, matched"])
-    seen = np.asarray(lines["image points"])
-    distance = np.linalg.norm(seen[:, None] - crosses, axis=-1)
-    assert distance.min(1).max() < 1e-6
-
-
 class Page(HTMLParser):
     """The text of a page, and the attributes of its images."""
 

@@ -203,21 +203,6 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
     assert float(validated["val/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
 
 
-class Unnumbered(BlindPnPTask):
-    """A user's own task: its batches keep the numbers that they came with."""
-
-    def on_test_batch_start(self, batch: Batch, *_: int) -> None: ...
-
-
-def test_the_results_of_any_task_have_every_problem(tmp_path: Path) -> None:
-    run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
-    with warnings.catch_warnings():
-        warnings.filterwarnings("error", message="expected one problem per")
-        run.test(Unnumbered(small_net()), datamodule=OwnData(), verbose=False)
-    rows = read_results(tmp_path / "test").of("ransac")
-    assert [(row.index, row.id) for row in rows] == [(i, str(i)) for i in range(10)]
-
-
 def test_several_processes_cannot_number_anew() -> None:
     first, second = (collated([Numbers()[i], Numbers()[i + 1]]) for i in (0, 2))
     numbers = set[int]()
