@@ -12,7 +12,7 @@ SLOW = {
     "test_localize_photos", "test_metric_states", "test_notebooks", "test_on_cluster", "test_page_browser",
     "test_precision", "test_prepare", "test_pretrained", "test_processes", "test_readme", "test_reconstruction",
     "test_search_poses", "test_store", "test_synthetic_maps", "test_table_command", "test_task",
-    "test_training_command", "test_tutorials", "test_twins", "test_two_processes", "test_wheel",
+    "test_training_command", "test_tutorials", "test_twins", "test_wheel",
 }  # fmt: skip
 
 

@@ -118,19 +118,6 @@ def test_evaluation_covers_every_pair(count: int, replicas: int, max_cells: int 
         assert [{k for part in parts for k in part} for parts in zip(*shares, strict=True)] == alone
 
 
-def test_loader_takes_its_share_of_the_process_group(monkeypatch: pytest.MonkeyPatch) -> None:
-    data = Problems(batch_size=4)
-    data.setup("test")
-    whole = [batch.ids for batch in data.test_dataloader()]
-    monkeypatch.setattr(torch.distributed, "is_initialized", lambda: True)
-    monkeypatch.setattr(torch.distributed, "get_world_size", lambda: 2)
-    halves = []
-    for rank in (0, 1):
-        monkeypatch.setattr(torch.distributed, "get_rank", lambda rank=rank: rank)
-        halves.append([batch.ids for batch in data.test_dataloader()])
-    assert [a + b for a, b in zip(*halves, strict=True)] == whole
-
-
 def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match=r"2 processes divide, got 15; try 16"):
         sampler([4] * 20, batch_size=15, shuffle=True, replicas=2)

@@ -14,10 +14,6 @@ from bpnp.datamodules.synthetic_maps.maps import (
     MapOptions,
     draw_map_problem,
 )
-from bpnp.datamodules.synthetic_maps.scene import (
-    Walls,
-    hidden_by_walls,
-)
 
 
 def problems(count: int, **options: object) -> list[Problem]:
@@ -96,25 +92,6 @@ def test_an_upright_frame_is_tilted_by_so_many_degrees() -> None:
         angles.append(np.degrees(np.arccos(turn[2, 2])))
         assert np.abs(errors_px(turned)).max() < 0.1
     assert np.sqrt(np.mean(np.square(angles))) == pytest.approx(10 * 2**0.5, rel=0.2)
-
-
-def test_a_wall_hides_what_is_behind_it_and_nothing_else() -> None:
-    """A wall 4 m wide and 3 m high on the x axis; rays from (2, -10, 1.5) by hand."""
-    one = np.ones(1)
-    wall = Walls(
-        np.zeros((1, 2)), np.array([[1.0, 0.0]]), np.array([[0.0, -1.0]]), 4 * one, 3 * one, one, one, 0.8 * one
-    )
-    points = {
-        (2.0, 10.0, 1.5): True,
-        (5.9, 10.0, 1.5): True,  # crosses at x = 3.95
-        (6.2, 10.0, 1.5): False,  # passes at x = 4.1
-        (2.0, 10.0, 4.6): False,  # passes at 3.05 m
-        (2.0, 0.3, 1.5): False,  # in a window's recess
-        (2.0, -1.0, 1.5): False,
-        (2.0, -12.0, 1.5): False,
-    }
-    found = hidden_by_walls(wall, np.array([2.0, -10.0, 1.5]), np.array(list(points)))
-    assert found.tolist() == list(points.values())
 
 
 def test_the_module_is_configured_by_yaml(tmp_path: Path) -> None:

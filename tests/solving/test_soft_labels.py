@@ -53,25 +53,6 @@ def test_probabilities_of_one_are_labels_and_equal_ones_say_nothing(view: Any) -
     assert certain[0].sum() > equal[0].sum() + 10
 
 
-def test_the_evidence_is_that_of_the_written_out_sum(view: Any) -> None:
-    """x_i with a_ij = sum_c p_ic q_jc / b_c over its mean over j, at one scale and share."""
-    from bpnp.search.evidence.false_alarms import directions_of, point_evidence
-
-    bearings, points, rotation, translation, labels2d, labels3d = view
-    rng = np.random.default_rng(9)
-    p, q = probabilities(rng, labels2d), probabilities(rng, labels3d)
-    sets = problem_from(bearings, points, None, labels2d=p, labels3d=q).sets
-    seen, scale, share = directions_of(sets, rotation, translation), 1e-3, 0.4
-    agreement = (p / p.mean(0)) @ q.T
-    agreement /= agreement.mean(1, keepdims=True)
-    squared = ((bearings[:, None] - seen) ** 2).sum(-1)
-    near = np.where(squared < 18 * scale**2, np.exp(-squared / (2 * scale**2)), 0.0)
-    ratio = (agreement * near).sum(1) / (2 * np.pi * scale**2) / (100 / sets.image.solid_angle)
-    expected = np.log(1 - share + share * ratio)
-    found = point_evidence(sets, seen, np.array([scale]), np.array([share]), even=True)[:, 0, 0]
-    np.testing.assert_allclose(found, expected, atol=1e-9)
-
-
 def test_only_the_classes_tell_two_equal_things_apart() -> None:
     rng = np.random.default_rng(9)
     shape, label = rng.uniform(-0.7, 0.7, (50, 3)), rng.integers(0, 4, 50)
