@@ -142,21 +142,6 @@ def test_quartiles_are_those_of_numpy(size: int) -> None:
         np.testing.assert_allclose(ours, np.quantile(error.numpy(), [0.25, 0.5, 0.75]), rtol=1e-14)
 
 
-@pytest.mark.parametrize(
-    ("values", "expected"),
-    [
-        ([math.inf], [math.inf] * 3),
-        ([1, 2, 3, 4, math.inf], [2, 3, 4]),
-        ([1, 2, 3, math.inf, math.inf], [2, 3, math.inf]),
-        ([1, 2, math.inf, math.inf], [1.75, math.inf, math.inf]),
-    ],
-)
-def test_quartiles_next_to_infinity(values: list[float], expected: list[float]) -> None:
-    column = torch.tensor(values, dtype=torch.float64)
-    result = pose_quartiles(PoseErrors(column, column, column, column))
-    assert [result[f"centre_q{number}"].item() for number in (1, 2, 3)] == expected
-
-
 def test_recall_counts_errors_up_to_and_including_the_threshold() -> None:
     rotation = torch.tensor([1.0, 5.0, 9.0, 15.0, 180.0], dtype=torch.float64)
     translation = torch.tensor([0.4, 0.5, 0.9, 0.6, math.inf], dtype=torch.float64)

@@ -1,6 +1,5 @@
 """The layers keep their digits whatever precision the user chose for products, and leave that choice as it was."""
 
-import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +17,7 @@ import bpnp
 from bpnp.cli import main
 from bpnp.layers import sinkhorn, weighted_pnp
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.precision import HALF, exact_products, full_precision
+from bpnp.precision import HALF, full_precision
 
 PACKAGE = str(Path(bpnp.__file__).parent)
 PRODUCTS = {torch.ops.aten.mm, torch.ops.aten.bmm, torch.ops.aten.addmm, torch.ops.aten.baddbmm}
@@ -83,27 +82,6 @@ def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatc
         assert emulated.rounded == 1
     for value, exact in zip(found, expected, strict=True):
         assert (value - exact).abs().max() < 1e-6 * exact.abs().max()
-    assert torch.get_float32_matmul_precision() == "high"
-
-
-@pytest.mark.usefixtures("high")
-def test_overlapping_threads_are_exact_to_their_end_and_restore_the_setting() -> None:
-    inside, release = threading.Event(), threading.Event()
-    seen = []
-
-    def late() -> None:
-        with exact_products(torch.device("cpu")):
-            inside.set()
-            release.wait(20)
-            seen.append(torch.get_float32_matmul_precision())
-
-    thread = threading.Thread(target=late)
-    with exact_products(torch.device("cpu")):
-        thread.start()
-        inside.wait(20)
-    release.set()
-    thread.join()
-    assert seen == ["highest"]
     assert torch.get_float32_matmul_precision() == "high"
 
 

@@ -84,44 +84,49 @@ def test_the_same_photo_is_kept_and_the_output_says_so(place: Place, capsys: pyt
     assert (place.folder / "out/poses.txt").read_text() == poses
 
 
-def test_a_photo_that_was_overwritten_is_another_one(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    """As of every camera that writes frame.jpg; its keypoints were extracted anew too."""
-    place.run("a.png", "b.png")
+def overwritten(place: Place) -> dict[str, int]:
+    """As by a camera that writes frame.jpg."""
+    shot(place.folder / "a.png", 7)
+    return {"a.png": 0}
+
+
+def taken_elsewhere(place: Place) -> dict[str, int]:
+    """Its keypoints were extracted anew too."""
     shot(place.folder / "a.png", 7)
     place.write({"a.png": 2, "b.png": 1})
-    place.run("a.png", "b.png")
-    shown = capsys.readouterr().out
-    assert "solved again, with another photo, other keypoints: a.png" in shown
-    assert "kept 1 of 2 photos" in shown
-    assert place.is_right("a.png", 2)
-    shot(place.folder / "b.png", 8)
-    place.run("b.png")
-    assert "solved again, with another photo: b.png" in capsys.readouterr().out
+    return {"a.png": 2, "b.png": 1}
 
 
-def test_a_map_that_was_rebuilt_has_another_frame(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    place.run("a.png", "b.png")
+def rebuilt(place: Place) -> dict[str, int]:
+    """A map in another frame, in which the other photo's pose means nothing."""
     place.truth = plant_model(place.folder / "map", camera=PINHOLE, images=3, points=140, seen=90, clutter=15, seed=5)
     place.write({"a.png": 0})
-    place.run("a.png")
-    shown = capsys.readouterr().out
-    assert "solved again, with another map, other keypoints: a.png" in shown
-    assert "not in poses.txt: 1 solutions in another map, such as b.png" in shown
-    assert list(place.poses()) == ["a.png"]
-    assert place.is_right("a.png", 0)
+    return {"a.png": 0}
 
 
-def test_other_views_and_options_are_solved_again(place: Place, capsys: pytest.CaptureFixture[str]) -> None:
-    views = place.folder / "views.txt"
-    views.write_text("a.png nowhere\n")
+@pytest.mark.parametrize(
+    ("change", "more", "told"),
+    [
+        (overwritten, (), "with another photo: a.png"),
+        (taken_elsewhere, (), "with another photo, other keypoints: a.png"),
+        (rebuilt, (), "with another map, other keypoints: a.png"),
+        (None, ("--seed", "3"), "with other options: a.png"),
+    ],
+)
+def test_a_photo_is_solved_again_where_anything_is_another(
+    change: Callable[[Place], dict[str, int]] | None, more: tuple[str, ...], told: str, place: Place,
+    capsys: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
     place.run("a.png", "b.png")
-    with pytest.raises(SystemExit):
-        place.run("a.png", more=("--views", str(views)))
-    assert "expected names of views of the map, got nowhere" in capsys.readouterr().err
-    place.run("a.png", more=("--seed", "3"))
-    assert "solved again, with other options: a.png" in capsys.readouterr().out
+    views = {} if change is None else change(place)
+    place.run("a.png", more=more)
+    shown = capsys.readouterr().out
+    assert f"solved again, {told}" in shown
+    assert all(place.is_right(photo, view) for photo, view in views.items())
+    assert ("not in poses.txt: 1 solutions in another map, such as b.png" in shown) == (change is rebuilt)
+    assert list(place.poses()) == (["a.png"] if change is rebuilt else ["a.png", "b.png"])
     content = json.loads((place.folder / "out/results.json").read_text())["photos"]
-    assert [content[name]["made_with"]["seed"] for name in ("a.png", "b.png")] == [3, 0]
+    assert content["a.png"]["made_with"]["seed"] == (3 if more else 0)
 
 
 def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_changed(place: Place) -> None:
@@ -132,15 +137,15 @@ def test_an_edited_file_of_views_is_another_one_for_the_photos_whose_lines_chang
         lines = {"a.png": views, "b.png": ["photo 1.jpg"]}
         return photo_task(scene, name, place.folder / name, map_content="this", views=lines, **options)
 
-    for name in ("a.png", "b.png"):
-        before = task(name, "photo 2.jpg")
-        solution = attempt(scene, before)
-        assert isinstance(solution, Solution)
-        SolutionFolder(place.folder / "out", "this").keep(before, solution)
     folder = SolutionFolder(place.folder / "out", "this")
-    assert folder.changes(task("a.png", "photo 2.jpg")) == []
-    assert folder.changes(task("a.png", "photo 0.jpg")) == ["views"]
-    assert folder.changes(task("b.png", "photo 0.jpg")) == []
+    for name in ("a.png", "b.png"):
+        solution = attempt(scene, task(name, "photo 2.jpg"))
+        assert isinstance(solution, Solution)
+        folder.keep(task(name, "photo 2.jpg"), solution)
+    again = SolutionFolder(place.folder / "out", "this")
+    assert again.changes(task("a.png", "photo 2.jpg")) == []
+    assert again.changes(task("a.png", "photo 0.jpg")) == ["views"]
+    assert again.changes(task("b.png", "photo 0.jpg")) == []
 
 
 def test_poses_are_those_of_all_runs_also_after_a_photo_that_failed(place: Place, fails: Callable[..., str]) -> None:

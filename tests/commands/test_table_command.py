@@ -15,7 +15,7 @@ from bpnp.files import claimed
 from bpnp.models.baselines import RandomRansac
 from bpnp.report import read_points, read_results
 from bpnp.report.tables import Row, as_latex, paper_rows
-from bpnp.training.comparison import MethodTest, parse_methods, problem_order, read_data
+from bpnp.training.comparison import parse_methods
 from bpnp.training.task import BlindPnPTask
 from bpnp.types import Batch, Prediction
 
@@ -166,17 +166,6 @@ def test_a_table_of_several_seeds_has_their_mean_and_spread(recipes: list[str], 
     assert (blind["method"], blind["problems"], len(ours)) == ("blind", "6", 4)
     assert float(blind["translation_q2"]) == pytest.approx(np.mean(medians))
     assert float(spread["translation_q2"]) == pytest.approx(np.std(medians, ddof=1))
-
-
-def test_a_limited_table_takes_the_first_of_a_fixed_order(tmp_path: Path) -> None:
-    assert sorted(problem_order(30)) == list(range(30))
-    assert problem_order(30) == problem_order(30) != list(range(30))
-    (tmp_path / "data.yaml").write_text(RECIPE.format(folder=tmp_path))
-    data = read_data(tmp_path / "data.yaml", ["--data.test_shapes=30", "--data.seed=3"])
-    assert data["init_args"]["test_shapes"] == 30
-    (method,) = parse_methods(["ransac"], time_limit=0.2)
-    MethodTest(method, data, tmp_path / "out", limit=2).run()
-    assert {row.index for row in read_results(tmp_path / "out").rows} == set(problem_order(30)[:2])
 
 
 @pytest.mark.parametrize(

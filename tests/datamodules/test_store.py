@@ -108,20 +108,13 @@ def limited() -> None:
     resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
 
 
-@pytest.mark.parametrize("way", ["limit", "disk"])
-def test_a_full_disk_is_one_error_that_names_the_store(tmp_path: Path, way: str) -> None:
-    """No SIGBUS and nothing left; on a file system of 2 MB where this user may mount one."""
-    command, before = [sys.executable, "-c", FULL, str(tmp_path / "disk" / "store")], limited
-    (tmp_path / "disk").mkdir()
-    if way == "disk":
-        mount = f"mount -t tmpfs -o size=2m none {tmp_path / 'disk'}"
-        if subprocess.run(["unshare", "-rm", "sh", "-c", mount], capture_output=True).returncode:
-            pytest.skip("no file system can be mounted here")
-        script = f'{mount} && "$@"; code=$?; ls -A {tmp_path / "disk"}; exit $code'
-        command, before = ["unshare", "-rm", "sh", "-c", script, "sh", *command], None
-    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=before)
+def test_a_full_disk_is_one_error_that_names_the_store(tmp_path: Path) -> None:
+    """No SIGBUS and nothing left."""
+    store = tmp_path / "disk" / "store"
+    store.parent.mkdir()
+    command = [sys.executable, "-c", FULL, str(store)]
+    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limited)
     assert result.returncode == 1, result.stderr
-    message = {"limit": "File too large", "disk": "No space left on device"}[way]
-    assert f"{message}: '{tmp_path / 'disk' / 'store'}'" in result.stderr
+    assert f"File too large: '{store}'" in result.stderr
     assert result.stdout == ""
-    assert list((tmp_path / "disk").iterdir()) == []
+    assert list(store.parent.iterdir()) == []

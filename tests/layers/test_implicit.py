@@ -101,16 +101,3 @@ def test_weak_links_between_groups_spoil_no_gradient(mu: float, dtype: torch.dty
         found = gradient(cost, lambda c: sinkhorn(c, mu=mu)[0], weights)[0].double()
         scale = float((plan * weights).abs().max()) / mu
         assert (found - projected(plan[0], weights[0], mu)).abs().max() < digits * scale
-
-
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-@pytest.mark.parametrize("gap", [0.0, 1e-6, 0.3, 0.45, 1.0, 2.0, 4.0, 8.0, 100.0])
-def test_from_equal_costs_to_an_exact_permutation(dtype: torch.dtype, gap: float) -> None:
-    n, mu = 10, 0.05  # at 0.45, 99.9 % of the mass is on the diagonal; at 8 the rest underflows in float32
-    cost = (gap * (1 - torch.eye(n, dtype=dtype))).unsqueeze(0)
-    weights = uniform(1, n, n, low=-1).to(dtype)
-    plan, _ = sinkhorn(cost, mu=mu)
-    found = gradient(cost, lambda c: sinkhorn(c, mu=mu)[0], weights)[0].double()
-    scale = float((plan * weights).abs().max()) / mu
-    assert found.isfinite().all()
-    assert (found - projected(plan[0], weights[0], mu)).abs().max() < 32 * torch.finfo(dtype).eps * scale

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import PoseErrors
 from bpnp.report import ProblemRow, read_results, write_results
-from bpnp.report.results import count_inliers, rows_from, summarise
+from bpnp.report.results import count_inliers, rows_from
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 HOSTILE = [
@@ -111,18 +111,6 @@ def test_the_files_are_plain_csv_and_strict_json(tmp_path: Path) -> None:
     assert summary["estimates"]["pnp"]["translation_q3"] == "inf"
     assert summary["estimates"]["pnp"]["without_matches"] == 1
     assert read_results(tmp_path).estimates["pnp"]["translation_q3"] == math.inf
-
-
-def test_a_summary_is_numpys_quantiles_and_counts_of_its_rows() -> None:
-    rows = [row(i, seconds=0.1 * i, converged=i % 2 == 0) for i in range(11)]
-    summary = summarise(rows)["pnp"]
-    degrees, lengths = (np.array([getattr(r, n) for r in rows]) for n in ("rotation_error_deg", "translation_error"))
-    for i, quantile in enumerate(np.quantile(degrees, [0.25, 0.5, 0.75]), start=1):
-        assert summary[f"rotation_q{i}_deg"] == pytest.approx(quantile, rel=1e-14)
-    assert summary["recall_rotation_5deg"] == (degrees <= 5).mean()
-    assert summary["recall_joint_10deg_1"] == ((degrees <= 10) & (lengths <= 1)).mean()
-    assert summary["seconds_mean"] == pytest.approx(0.5)
-    assert summary["converged"] == 6 / 11
 
 
 @pytest.mark.parametrize(

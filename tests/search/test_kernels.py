@@ -1,6 +1,5 @@
 """The compiled loops against the formulas of docs/search.md in float64, finite differences, and each other."""
 
-import math
 from typing import Any
 
 import numpy as np
@@ -9,9 +8,9 @@ import torch
 from scipy.spatial.distance import cdist
 
 from bpnp.geometry import random_rotations, retract
-from bpnp.search.kernels.dense import POWER, assign, dense_scratch, descend, normal_equations
+from bpnp.search.kernels.dense import POWER, assign, dense_scratch, normal_equations
 from bpnp.search.kernels.sides import WeightedBearings, WeightedPoints
-from bpnp.search.kernels.sparse import REACH, Tiles, assign_sparse, build_tiles, descend_sparse, sparse_scratch
+from bpnp.search.kernels.sparse import REACH, Tiles, assign_sparse, build_tiles, sparse_scratch
 
 FORWARD = np.array([0.0, 0.0, 1.0])
 
@@ -110,22 +109,3 @@ def test_the_gradient_is_that_of_finite_differences(entry: Any, spread: float) -
         slope = (values[0] - values[1]) / (2 * float(step[k]))
         assert gradient[k] == pytest.approx(slope, rel=1e-4, abs=1e-6 * np.abs(gradient).max() * spread)
     assert np.linalg.eigvalsh(hessian + np.tril(hessian, -1).T).min() > 0
-
-
-@pytest.mark.parametrize("part", ["rotation", "translation"])
-@pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_start_that_is_not_finite_scores_minus_infinity(part: str, value: float) -> None:
-    view, scales = View(0.3), np.array([0.1, 0.05, 0.02], np.float32)
-    rotation, translation = (np.stack([values] * 3) for values in view.pose())
-    (rotation if part == "rotation" else translation)[1].flat[0] = value
-    poses = [(rotation.copy(), translation.copy()) for _ in range(2)]
-    score, result = np.zeros(3, np.float32), np.zeros((3, 3), np.float32)
-    bearings, points = view.sides()
-    descend(bearings, points, *poses[0], scales, np.float32(0.5), score, dense_scratch(60, 60))
-    tiles = view.tiles(0.1)
-    scratch = sparse_scratch(tiles, 60)
-    descend_sparse(tiles, points, *poses[1], scales, np.float32(0.5), 3, result, scratch)
-    for values in (score, result[:, 0]):
-        assert values[1] == -math.inf
-        assert np.isfinite(values[[0, 2]]).all()
-        assert values[0] == values[2]
