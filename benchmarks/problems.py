@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+import roma
 import torch
 from torch import Tensor, nn
 
@@ -47,7 +48,7 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0)
     scene = nn.functional.normalize(torch.randn(batch, points, 3, generator=generator), dim=-1)
     scene = scene * torch.rand(batch, points, 1, generator=generator) ** (1 / 3)
     x, y, z = (torch.rand(3, batch, generator=generator) * torch.pi / 4).unbind()
-    rotation = _axis_rotation(z, 0, 1) @ _axis_rotation(y, 2, 0) @ _axis_rotation(x, 1, 2)
+    rotation = roma.euler_to_rotmat("ZYX", [z, y, x])
     translation = torch.rand(batch, 3, generator=generator) - 0.5 + torch.tensor([0, 0, DISTANCE])
     camera = scene @ rotation.mT + translation.unsqueeze(1)
     exact = camera[..., :2] / camera[..., 2:]
@@ -112,12 +113,3 @@ def losses_of(prediction: Prediction, batch: Batch) -> Tensor:
     losses = correspondence_losses(prediction, batch, angle=None)
     assert losses is not None
     return losses + pose_losses(prediction.poses["pnp"], batch) if "pnp" in prediction.poses else losses
-
-
-def _axis_rotation(angle: Tensor, i: int, j: int) -> Tensor:
-    """Rotation that turns axis i towards axis j."""
-    rotation = torch.eye(3).repeat(len(angle), 1, 1)
-    rotation[:, i, i] = rotation[:, j, j] = angle.cos()
-    rotation[:, j, i] = angle.sin()
-    rotation[:, i, j] = -angle.sin()
-    return rotation
