@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from bench_constellation import Camera
+from numpy.typing import NDArray
 from record import TIME_LIMIT, Array, Outcome, Problem, Rows, degrees, measured, parser
 from scipy.spatial.transform import Rotation
 
@@ -30,16 +31,18 @@ NARROW, IN_VIEW = 5.0, 15.0  # up to these degrees a catalogue is a belt of the 
 
 
 class Frame(NamedTuple):
-    """Pixels (m, 2) of stars and others, directions (n, 3), rotation."""
+    """Pixels (m, 2) of stars and others, directions (n, 3), rotation, and which direction each pixel is (-1: none)."""
 
     pixels: Array
     directions: Array
     rotation: Array
+    star: NDArray[np.int64]
 
 
-def lens(field: float) -> Camera:
+def lens(field: float, factor: float = 1.0) -> Camera:
+    """The camera of a field of view in degrees, with `factor` times its focal length."""
     half = np.radians(field / 2)
-    return Camera(float(SIZE / 2 / (half if field > WIDE else np.tan(half))), SIZE, field > WIDE)
+    return Camera(float(factor * SIZE / 2 / (half if field > WIDE else np.tan(half))), SIZE, field > WIDE)
 
 
 def anywhere(rng: np.random.Generator, count: int, field: float) -> Array:
@@ -61,7 +64,7 @@ def catalogue(count: int, field: float, seed: int) -> Array:
     return np.stack([aside * np.cos(around), aside * np.sin(around), height], -1)
 
 
-def frame(count: int, field: float, seed: int, i: int) -> Frame:
+def frame(count: int, field: float, seed: int, i: int, false: float = FALSE) -> Frame:
     """A field around a star with LEAST stars or more that are detected."""
     rng = np.random.default_rng([seed, count, int(field), i])
     directions = catalogue(count, field, 1000 * seed + i // 10)
@@ -70,12 +73,13 @@ def frame(count: int, field: float, seed: int, i: int) -> Frame:
         rotation = (Rotation.from_rotvec([0, 0, rng.uniform(0, 2 * np.pi)]) * to_middle).as_matrix()
         pixels = lens(field).project(directions @ rotation.T)
         shown = np.isfinite(pixels[:, 0]) & (np.linalg.norm(pixels - SIZE / 2, axis=-1) < SIZE / (2 - (field < WIDE)))
-        found = pixels[shown & (rng.random(count) > MISSING)]
-        if len(found) >= LEAST:
+        star = np.flatnonzero(shown & (rng.random(count) > MISSING))
+        if len(star) >= LEAST:
             break
-    others = anywhere(rng, round(len(found) * FALSE / (1 - FALSE)), field)
-    found = found + NOISE_PX * rng.standard_normal(found.shape)
-    return Frame(rng.permutation(np.concatenate([found, others])), directions, rotation)
+    others = anywhere(rng, round(len(star) * false / (1 - false)), field)
+    every = np.concatenate([pixels[star] + NOISE_PX * rng.standard_normal((len(star), 2)), others])
+    order = rng.permutation(len(every))
+    return Frame(every[order], directions, rotation, np.r_[star, np.full(len(others), -1)][order])
 
 
 def problems(count: int, field: float, limit: int, seed: int) -> Iterator[Problem]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
-from bpnp import solve
 from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
 from bpnp.search.verdict import SearchResult, judged
@@ -92,34 +91,3 @@ def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, v
     assert alarms[0] < min(alarms[1] - 3, -5)
     assert found.verdict == verdict
     assert ("50 deg away explains" in found.reason) == (verdict == "ambiguous")
-
-
-def lines(rng: np.random.Generator, dimensions: int) -> Array:
-    """Five straight lines of 15 evenly spaced points."""
-    steps = np.linspace(0, 1, 15)
-    return np.concatenate([
-        rng.uniform(-1, 1, dimensions) + np.outer(steps, rng.uniform(-1.5, 1.5, dimensions)) for _ in range(5)
-    ])  # fmt: skip
-
-
-def test_lines_that_have_nothing_in_common_are_not_called_confident() -> None:
-    """A pose lays two or three of them onto others, and all points of these agree."""
-    for pair in (15, 32, 35):
-        rng = np.random.default_rng([1, pair])
-        image = lines(rng, 2)
-        found = solve(0.4 * image, lines(rng, 3), time_limit=2)
-        assert found.verdict != "confident", pair
-
-
-def test_curves_of_which_either_side_has_other_points_are_not_called_confident() -> None:
-    """Two turns of a helix: along it points agree by chance, and a screw takes one such pose to the next."""
-    for pair in (7, 9, 10, 26, 37):
-        rng = np.random.default_rng([1, pair])
-        angles = rng.uniform(0, 4 * np.pi, (2, 100))
-        seen, scene = (np.column_stack([np.cos(a), np.sin(a), 0.15 * a - 0.9]) for a in angles)
-        rotation = Rotation.random(rng=rng).as_matrix()
-        camera = seen @ rotation.T + (0, 0, 5)
-        pixels = camera[:, :2] / camera[:, 2:] + 1e-3 * rng.standard_normal((100, 2))
-        found = solve(pixels, scene, time_limit=2)
-        right = Rotation.from_matrix(found.rotation @ rotation.T).magnitude() < np.radians(3)
-        assert found.verdict != "confident" or right, pair
