@@ -24,10 +24,10 @@ def prepare_modelnet40(
     normalisation: Literal["unit_sphere", "unit_cube", "none"] = "unit_sphere",
     processes: int = PROCESSES,
 ) -> None:
-    """Pack ModelNet40, or any folder or zip of meshes in its layout. A run that is stopped leaves nothing.
+    """Pack ModelNet40, or any folder of meshes in its layout. A run that is stopped leaves nothing.
 
     Args:
-        source: ModelNet40.zip, its folder, or the folder of ply_data_*.h5.
+        source: folder of <class>/{train,test}/*.{off,obj,ply,stl,glb}.
         output: new folder.
         points: surface samples of a mesh.
         normalisation: of each mesh.

@@ -1,21 +1,17 @@
-"""Collections of shapes to sample: procedural ones, and meshes in a folder, in a zip or as rows of HDF5 files."""
+"""Collections of shapes to sample: procedural ones, and meshes in a folder."""
 
-import importlib
-import os
 import re
-import zipfile
 import zlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cache, lru_cache, partial
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from bpnp.datamodules.surfaces import SUFFIXES, Mesh, MeshError, parse_mesh, read_mesh, sample_surface
+from bpnp.datamodules.surfaces import SUFFIXES, Mesh, read_mesh, sample_surface
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.geometry import random_rotations
 
@@ -102,95 +98,28 @@ def primitives() -> tuple[Mesh, ...]:
 
 
 def open_shapes(source: Path) -> Shapes:
-    """The meshes of `source`: ModelNet40.zip, its folder, the folder of its HDF5 files, or any folder in its layout.
+    """The meshes of `source`: the folder of ModelNet40, or any in its layout, or their parent.
 
-    Their names are ``<class>/<split>/<stem>``; the training meshes come first. Raises ValueError that names the file or
-    folder: missing, empty, foreign, or h5py not installed.
+    Their names are ``<class>/<split>/<stem>``; the training meshes come first. Raises ValueError that names the folder:
+    missing, or without a mesh.
     """
-    if source.is_file():
-        try:
-            entries = _named(_open(source).namelist())
-        except (zipfile.BadZipFile, OSError) as error:
-            raise ValueError(f"expected a zip of meshes, got {source} ({error}); try downloading it again") from error
-        if not entries:
-            raise ValueError(f"expected meshes {LAYOUT} in {source}, got none; try ModelNet40.zip")
-        return _of_files({name: partial(_packed_mesh, source, entry) for name, entry in entries.items()}, [source])
     if not source.is_dir():
-        raise ValueError(f"expected a folder with {LAYOUT}, or ModelNet40.zip, got {source}, which is not there")
+        raise ValueError(f"expected a folder with {LAYOUT}, got {source}, which is none; try unpacking its archive")
     for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
-        if list(folder.glob("ply_data_*.h5")):
-            return _sampled_shapes(folder)
         if entries := _named(str(path) for path in folder.glob("*/*/*") if path.is_file()):
-            paths = [Path(path) for path in entries.values()]
-            return _of_files({name: partial(read_mesh, Path(path)) for name, path in entries.items()}, paths)
-    raise ValueError(f"expected a folder with {LAYOUT}, or ply_data_*.h5, got {source} without; try its parent")
+            meshes = {name: Path(path) for name, path in entries.items()}
+            samplers = {name: partial(_mesh_samples, name, path) for name, path in meshes.items()}
+            return Shapes(samplers, fingerprint([list(meshes), files_as_they_are(meshes.values())]))
+    raise ValueError(f"expected a folder with {LAYOUT}, got {source} without; try its parent")
 
 
-def _of_files(meshes: Mapping[str, Callable[[], Mesh]], files: Iterable[Path]) -> Shapes:
-    samplers = {name: partial(_mesh_samples, name, mesh) for name, mesh in meshes.items()}
-    return Shapes(samplers, fingerprint([list(meshes), files_as_they_are(files)]))
-
-
-def _mesh_samples(name: str, mesh: Callable[[], Mesh], count: int) -> NDArray[np.float64]:
-    return sample_surface(mesh(), count, np.random.default_rng(zlib.crc32(name.encode())))
-
-
-def _packed_mesh(archive: Path, entry: str) -> Mesh:
-    try:
-        return parse_mesh(_open(archive).read(entry), Path(entry).suffix)
-    except (MeshError, zipfile.BadZipFile, zlib.error, EOFError, RuntimeError, NotImplementedError) as error:
-        raise MeshError(f"{archive}/{entry}: {error}") from error
+def _mesh_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
+    return sample_surface(read_mesh(path), count, np.random.default_rng(zlib.crc32(name.encode())))
 
 
 def _named(paths: Iterable[str]) -> dict[str, str]:
     """Path of each mesh by its name; others are no meshes."""
-    meshes = (ENTRY.fullmatch(path) for path in paths if "__MACOSX" not in path)
+    meshes = (ENTRY.fullmatch(path) for path in paths)
     entries = {f"{mesh[1]}/{mesh[2].lower()}/{mesh[3]}": mesh[0] for mesh in meshes if mesh}
     order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
     return {name: entries[name] for name in order}
-
-
-def _sampled_shapes(folder: Path) -> Shapes:
-    """The rows of points in the HDF5 files of ``modelnet40_ply_hdf5_2048``."""
-    names = folder / "shape_names.txt"
-    if not names.is_file():
-        raise ValueError(f"expected {names} beside the HDF5 files, got none; try unpacking the archive again")
-    classes = names.read_text(encoding="utf-8").split()
-    samplers: dict[str, Sampler] = {}
-    paths = [path for split in SPLITS for path in sorted(folder.glob(f"ply_data_{split}*.h5"))]
-    for path in paths:
-        try:
-            file, split = _open(path), path.stem.removeprefix("ply_data_").rstrip("0123456789")
-            labels, shape = np.asarray(file["label"]).reshape(-1), file["data"].shape
-            if len(shape) != 3 or len(labels) != shape[0]:
-                raise ValueError(f"{len(labels)} labels for {shape}")
-            rows = [f"{classes[label]}/{split}/{path.stem}-{row:04d}" for row, label in enumerate(labels)]
-        except (OSError, KeyError, IndexError, ValueError) as error:
-            raise ValueError(
-                f"expected `data` (k, points, 3) and k of `label` in {path}, got something else ({error}); try "
-                "unpacking the archive again"
-            ) from error
-        samplers |= {name: partial(_stored_samples, name, path, row) for row, name in enumerate(rows)}
-    return Shapes(samplers, fingerprint([list(samplers), files_as_they_are(paths)]))
-
-
-def _stored_samples(name: str, path: Path, row: int, count: int) -> NDArray[np.float64]:
-    points = np.asarray(_open(path)["data"][row], np.float64)
-    if points.shape[0] < count or points.shape[1:] != (3,) or not np.isfinite(points).all():
-        raise MeshError(f"{path}: expected {count} finite points, got shape {points.shape} in row {row}")
-    return np.random.default_rng(zlib.crc32(name.encode())).permutation(points)[:count]
-
-
-def _open(path: Path) -> Any:
-    """A file of many meshes, kept open for the next one of this process; a file that has changed is another."""
-    return _opened(path, os.getpid(), *files_as_they_are([path]))
-
-
-@lru_cache(maxsize=8)
-def _opened(path: Path, process: int, stamp: tuple[str, int, int]) -> Any:
-    if path.suffix != ".h5":
-        return zipfile.ZipFile(path)
-    try:
-        return importlib.import_module("h5py").File(path, "r")  # optional
-    except ImportError as error:
-        raise ValueError("expected the package h5py, to read HDF5 files, got none; try `pip install h5py`") from error

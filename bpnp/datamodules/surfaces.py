@@ -51,7 +51,7 @@ def read_mesh(path: Path) -> Mesh:
     Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
     vertices.
     """
-    return _of_file(path, parse_mesh)
+    return _of_file(path, _mesh)
 
 
 def _of_file(path: Path, parse: Callable[[bytes, str], Any]) -> Any:
@@ -62,11 +62,11 @@ def _of_file(path: Path, parse: Callable[[bytes, str], Any]) -> Any:
         raise MeshError(f"{path}: {error}") from error
 
 
-def parse_mesh(content: bytes, suffix: str) -> Mesh:
-    """The mesh in the bytes of a file with this suffix, as `read_mesh`; the MeshError names no file."""
-    if suffix.lower() == ".off":
+def _mesh(content: bytes, suffix: str) -> Mesh:
+    """The mesh in the bytes of a file with this suffix; the MeshError names no file."""
+    if suffix == ".off":
         return _parse_off(content)
-    mesh = _load(content, suffix.lower())
+    mesh = _load(content, suffix)
     if not isinstance(mesh, trimesh.Trimesh):
         raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
     return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))

@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import zipfile
 from pathlib import Path
 
 import pytest
@@ -29,10 +28,7 @@ def commands(heading: str) -> list[list[str]]:
 
 
 def modelnet40(folder: Path) -> None:
-    root = write_mesh_tree(folder / "ModelNet40", train=4)
-    with zipfile.ZipFile(folder / "ModelNet40.zip", "w") as archive:
-        for file in root.rglob("*.off"):
-            archive.write(file, Path("ModelNet40") / file.relative_to(root))
+    write_mesh_tree(folder / "ModelNet40", train=4)
 
 
 def megadepth(folder: Path) -> None:
@@ -44,7 +40,7 @@ def authors(folder: Path) -> None:
     write(folder / "FOLDER", [sample(i) for i in range(8)])
     torch.save(checkpoint(Released()), folder / "ModelNet40_LcLp.pth.tar")
     modelnet40(folder)
-    main(["prepare", "modelnet40", "ModelNet40.zip", "--output", "data/modelnet40", "--processes", "1"])
+    main(["prepare", "modelnet40", "ModelNet40", "--output", "data/modelnet40", "--processes", "1"])
 
 
 @pytest.mark.parametrize(

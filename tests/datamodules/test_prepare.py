@@ -5,9 +5,7 @@ import os
 import shutil
 import signal
 import time
-import zipfile
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -64,16 +62,6 @@ def names(store: Store) -> list[str]:
     return [store.name(row) for row in range(len(store))]
 
 
-def zipped(root: Path, folders: Callable[[str], str] = str) -> Path:
-    path = root.with_suffix(".zip")
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for file in sorted(root.rglob("*.off")):
-            archive.write(file, Path("ModelNet40") / folders(str(file.relative_to(root))))
-            archive.writestr(f"__MACOSX/ModelNet40/{file.relative_to(root).parent}/._{file.name}", b"junk")
-        archive.writestr("ModelNet40/README.txt", "read me")
-    return path
-
-
 def check(store: Store, root: Path) -> None:
     """Samples of each mesh, by its name, training meshes first; the bad ones are listed."""
     assert {name.removeprefix("box0/") for name in store.skipped} == set(BAD)
@@ -87,16 +75,14 @@ def check(store: Store, root: Path) -> None:
         assert store.columns["radius"][row] == pytest.approx(1)
 
 
-@pytest.mark.parametrize("form", ["folder", "parent", "zip", "zip in capitals", "folder in capitals"])
+@pytest.mark.parametrize("form", ["folder", "parent", "folder in capitals"])
 def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: Path, form: str) -> None:
     """The same splits, whether a folder is `train` or `Train`, and the data module opens them."""
-    source = meshes if form == "folder" else meshes.parent
-    if "zip" in form or "capitals" in form:
-        splits = {"train": "Train", "test": "TEST"} if "capitals" in form else {}
-        source = zipped(meshes, lambda name: "/".join(splits.get(part, part) for part in name.split("/")))
+    source = meshes.parent if form == "parent" else meshes
     if form == "folder in capitals":
-        zipfile.ZipFile(source).extractall(tmp_path / "unpacked")
-        source = tmp_path / "unpacked"
+        source = shutil.copytree(meshes, tmp_path / "capitals")
+        for split in [*source.glob("*/train"), *source.glob("*/test")]:
+            split.rename(split.with_name(split.name.upper()))
     prepared = run(source, tmp_path / "out" / "store")
     assert len(prepared) == 12
     check(prepared, meshes)
@@ -109,44 +95,10 @@ def test_every_form_of_the_meshes_gives_the_same_store(meshes: Path, tmp_path: P
 def test_several_processes_give_the_same_bytes(
     meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:  # fmt: skip
-    source = zipped(meshes)
-    run(source, tmp_path / "one")
+    run(meshes, tmp_path / "one")
     monkeypatch.setattr("bpnp.datamodules.meshes.MESHES_A_PART", 1)
-    run(source, tmp_path / "two", processes=2)
+    run(meshes, tmp_path / "two", processes=2)
     check_same_bytes(tmp_path / "two", tmp_path / "one")
-
-
-def hdf5(folder: Path) -> dict[str, np.ndarray]:
-    h5py = pytest.importorskip("h5py")
-    folder.mkdir()
-    (folder / "shape_names.txt").write_text("airplane\nbathtub\n")
-    expected = {}
-    for name, count in (("train0", 5), ("train1", 3), ("test0", 4)):
-        rng = np.random.default_rng(count)
-        data, label = rng.normal(size=(count, 64, 3)).astype("f4"), rng.integers(0, 2, (count, 1)).astype("u1")
-        with h5py.File(folder / f"ply_data_{name}.h5", "w") as file:
-            file["data"], file["label"] = data, label
-        for row in range(count):
-            split = name.rstrip("01")
-            expected[f"{('airplane', 'bathtub')[label[row, 0]]}/{split}/ply_data_{name}-{row:04d}"] = data[row]
-    return expected
-
-
-def test_sampled_hdf5_files(tmp_path: Path) -> None:
-    expected = hdf5(tmp_path / "modelnet40_ply_hdf5_2048")
-    store = run(tmp_path / "modelnet40_ply_hdf5_2048", tmp_path / "store", normalisation="none")
-    assert set(names(store)) == set(expected)
-    for row, name in enumerate(names(store)):
-        points = store.row(row)[POINTS]
-        assert {tuple(p) for p in points} <= {tuple(p) for p in expected[name]}
-        assert len(np.unique(points, axis=0)) == 32
-    with pytest.raises(StoreError, match="at least one usable mesh.*expected 99 finite points"):
-        run(tmp_path / "modelnet40_ply_hdf5_2048", tmp_path / "more", points=99)
-    shutil.copytree(tmp_path / "modelnet40_ply_hdf5_2048", tmp_path / "copy")
-    path = tmp_path / "copy" / "ply_data_test0.h5"
-    path.write_bytes(path.read_bytes()[:-50])
-    with pytest.raises(ValueError, match="ply_data_test0"):
-        run(tmp_path / "copy", tmp_path / "cut")
 
 
 def test_the_data_module_reads_the_store(meshes: Path, tmp_path: Path) -> None:
@@ -165,26 +117,11 @@ def test_the_data_module_reads_the_store(meshes: Path, tmp_path: Path) -> None:
 
 def test_unusable_sources_are_named(meshes: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    (tmp_path / "cut.zip").write_bytes(zipped(meshes).read_bytes()[:-300])
-    (tmp_path / "text.zip").write_text("404 Not Found")
-    with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
-        archive.writestr("a.txt", "a")
-    for name in ("empty", "cut.zip", "text.zip", "other.zip", "nowhere"):
+    (tmp_path / "ModelNet40.zip").write_bytes(b"an archive")
+    for name in ("empty", "ModelNet40.zip", "nowhere"):
         with pytest.raises(ValueError, match=name):
             run(tmp_path / name, tmp_path / "out")
     assert not (tmp_path / "out").exists()
-
-
-def test_a_damaged_entry_of_a_zip_is_skipped(meshes: Path, tmp_path: Path) -> None:
-    path = zipped(meshes)
-    with zipfile.ZipFile(path) as archive:
-        entry = archive.getinfo("ModelNet40/box1/train/box1_0001.off")
-    content = bytearray(path.read_bytes())
-    start = entry.header_offset + 30 + len(entry.filename) + entry.compress_size // 2
-    content[start : start + 8] = bytes(8)
-    path.write_bytes(content)
-    prepared = run(path, tmp_path / "store")
-    assert set(prepared.skipped) - {f"box0/{name}" for name in BAD} == {"box1/train/box1_0001"}
 
 
 def test_again_does_nothing_and_otherwise_is_refused(meshes: Path, tmp_path: Path) -> None:
