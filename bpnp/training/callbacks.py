@@ -1,9 +1,9 @@
-"""Callbacks of a training and its log: the pose loss that joins later, checkpoints read as data, and what is shown."""
+"""Callbacks of a training and its log: the pose loss that joins later, safe checkpoints, and what is watched."""
 
 import io
+import math
 import os
 import signal
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,17 +12,16 @@ from typing import Any
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
-from lightning.pytorch.loggers import TensorBoardLogger, WandbLogger
+from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from torch import Tensor, nn
 
+from bpnp.checks import check_within
 from bpnp.files import written_whole
 from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import read_checkpoint
-from bpnp.report.figures import plot_problem, save_figure
-from bpnp.report.points import ProblemPoints, points_from
 from bpnp.types import Batch, Prediction
 
 
@@ -121,38 +120,19 @@ class OfflineWandbLogger(WandbLogger):
 
 
 class TrainingMonitor(Callback):
-    """Logs "train/problems_per_second" per epoch and, of the first few validation problems, "val/true_match_mass", the
-    probability that the assignment gives to their true matches, "val/<estimate>_iterations" of each pose, and
-    "val/feature_spread_2d" and "_3d" (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a
-    set have the same feature the assignment is uniform, and the loss stays where it is.
-
-    Every `every` epochs the same problems are drawn: to W&B or TensorBoard where one logs, else to files in `pictures`
-    of the trainer's default_root_dir.
+    """Logs, of the first few validation problems, "val/true_match_mass", the probability that the assignment gives to
+    their true matches, "val/<estimate>_iterations" of each pose, and "val/feature_spread_2d" and "_3d"
+    (`feature_spreads`). A spread below 0.05 brings a warning: where all points of a set have the same feature the
+    assignment is uniform, and the loss stays where it is.
 
     Args:
         problems: how many validation problems are watched.
-        every: epochs between pictures; 0 for none.
     """
 
-    def __init__(self, problems: int = 4, every: int = 10) -> None:
-        if problems < 1 or every < 0:
-            raise ValueError(f"expected problems >= 1 and every >= 0, got {problems} and {every}")
-        self.problems, self.every = problems, every
+    def __init__(self, problems: int = 4) -> None:
+        check_within(1, math.inf, problems=problems)
+        self.problems = problems
         self.watched: Batch | None = None
-        self.started = 0.0
-        self.seen = 0
-
-    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.started, self.seen = time.perf_counter(), 0
-
-    def on_train_batch_end(
-        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
-    ) -> None:
-        self.seen += len(batch)
-        if trainer.is_last_batch:
-            # Before the validation that ends the epoch, which is no training.
-            speed = self.seen * trainer.world_size / (time.perf_counter() - self.started)
-            pl_module.log("train/problems_per_second", speed, on_step=False, on_epoch=True, batch_size=1)
 
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
@@ -175,8 +155,6 @@ class TrainingMonitor(Callback):
                 f"{max(spreads.values()):.2g} at step {trainer.global_step}: the features have collapsed; try a lower "
                 "model.learning_rate, a warm-up, or `centre` of the solver's features"
             )
-        if self.every and trainer.current_epoch % self.every == 0 and trainer.is_global_zero:
-            _draw(trainer, points_from(prediction, batch))
 
 
 def first_problems(batch: Batch, count: int) -> Batch:
@@ -207,18 +185,3 @@ def watched_values(prediction: Prediction, batch: Batch) -> dict[str, Tensor]:
         mass = prediction.assignment.gather(1, batch.match3d.clamp(min=0)[:, None]).squeeze(1)
         values["true_match_mass"] = mass.where(matched, 0).sum(-1).mean()
     return values
-
-
-def _draw(trainer: Trainer, problems: list[ProblemPoints]) -> None:
-    """To every logger that takes pictures; to files where none does."""
-    figures, loggers = [plot_problem(problem) for problem in problems], trainer.loggers
-    for logger in loggers:
-        if isinstance(logger, WandbLogger):
-            logger.log_image("val/problems", figures, caption=[problem.id for problem in problems])
-        elif isinstance(logger, TensorBoardLogger):
-            for number, figure in enumerate(figures):
-                logger.experiment.add_figure(f"val/problem{number}", figure, trainer.global_step)
-    if loggers and not any(isinstance(logger, (WandbLogger, TensorBoardLogger)) for logger in loggers):
-        folder = Path(trainer.default_root_dir) / "pictures" / f"epoch_{trainer.current_epoch:04d}"
-        for number, figure in enumerate(figures):
-            save_figure(figure, folder / f"problem{number}.png")
