@@ -95,7 +95,6 @@ def convert_weights(
     out: Path,
     *,
     ransac: Literal["poselib", "opencv"] = "poselib",
-    pnp: Literal["newton", "lbfgs"] = "newton",
 ) -> None:
     """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
 
@@ -106,7 +105,6 @@ def convert_weights(
         file: the authors' file, *.pth.tar.
         out: checkpoint to write, *.ckpt.
         ransac: backend of the RANSAC step; opencv is the paper's.
-        pnp: solver of the weighted PnP; lbfgs is the paper's.
     """
     import lightning
     import torch
@@ -114,7 +112,7 @@ def convert_weights(
     from bpnp.models.authors import load_authors_weights
     from bpnp.training.task import BlindPnPTask
 
-    task = BlindPnPTask(load_authors_weights(file, backend=ransac, method=pnp))
+    task = BlindPnPTask(load_authors_weights(file, backend=ransac))
     checkpoint: dict[str, Any] = {
         "epoch": 0,
         "global_step": 0,

@@ -1,4 +1,4 @@
-"""The weighted blind PnP objective (paper Eq. 7), its derivatives in the pose, and its solvers.
+"""The weighted blind PnP objective (paper Eq. 7), its derivatives in the pose, and its solver.
 
 f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)),  g(y) = y / |y|.
 It is linear in the bearings: with q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product the
@@ -6,32 +6,19 @@ cost of an evaluation is O(n), not O(m n). A step (w, s) acts on the left: y = e
 The q_j and p_j are the columns of (b, 3, n) tensors: torch adds up three rows of n numbers faster than n rows of three.
 """
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from bpnp.geometry import choose, hat, retract, transform
+from bpnp.geometry import choose, hat, retract
 from bpnp.layers.implicit import first_derivative
 
 Columns = Float[Tensor, "b 3 n"]
 Rotations = Float[Tensor, "b 3 3"]
 Translations = Float[Tensor, "b 3"]
 NEAR = 1e-12  # scene radii; smaller distances are set to this: a point at the camera centre has no direction
-
-
-def dense_objective(
-    assignment: Float[Tensor, "b m n"],
-    bearings: Float[Tensor, "b m 3"],
-    points3d: Float[Tensor, "b n 3"],
-    rotation: Rotations,
-    translation: Translations,
-) -> Float[Tensor, " b"]:
-    """Eq. 7 as it is written, over all m n matches that may be."""
-    directions = torch.nn.functional.normalize(transform(rotation, translation, points3d), dim=-1, eps=NEAR)
-    return (assignment * (1 - bearings @ directions.mT)).sum((-2, -1))
 
 
 def aggregate(assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]) -> Columns:
@@ -157,50 +144,3 @@ def newton(
         lowered = torch.where(damping > 1e-6, damping / 10, 0)
         damping = torch.where(active, torch.where(accept, lowered, raised), damping)
     return rotation, translation, iterations
-
-
-def lbfgs(
-    assignment: Float[Tensor, "b m n"],
-    bearings: Float[Tensor, "b m 3"],
-    points3d: Float[Tensor, "b n 3"],
-    rotation: Rotations,
-    translation: Translations,
-    *,
-    tolerance: float,
-    max_iterations: int,
-) -> tuple[Rotations, Translations, Int[Tensor, " b"]]:
-    """L-BFGS with a strong Wolfe line search on the dense objective, as `newton` with a tolerance per unit of weight.
-
-    One sample at a time, so that no pose depends on its neighbours' line searches. The pose is an angle-axis vector
-    and a translation; the weight of a sample is sum_j |sum_i P_ij f_i|.
-    """
-    import roma  # as in `bpnp.geometry.retract`
-
-    rotations, translations, iterations = [], [], []
-    for p, f, x, r0, t0 in zip(assignment, bearings, points3d, rotation, translation, strict=True):
-        pose = torch.cat([roma.rotmat_to_rotvec(r0), t0]).requires_grad_()
-        weight = float(torch.linalg.vector_norm(p.mT @ f, dim=-1).sum())
-        optimiser = torch.optim.LBFGS(
-            [pose],
-            max_iter=max_iterations,
-            tolerance_grad=0.01 * tolerance * weight,  # it bounds the largest entry; in other units than `tolerance`
-            tolerance_change=0.0,
-            line_search_fn="strong_wolfe",
-        )
-        optimiser.step(partial(_evaluate, pose, p, f, x))
-        iterations.append(optimiser.state[pose]["n_iter"])
-        rotations.append(roma.rotvec_to_rotmat(pose[:3].detach()))
-        translations.append(pose[3:].detach())
-    return torch.stack(rotations), torch.stack(translations), torch.tensor(iterations, device=points3d.device)
-
-
-def _evaluate(pose: Tensor, assignment: Tensor, bearings: Tensor, points: Tensor) -> Tensor:
-    """Value of Eq. 7 at an angle-axis vector and translation; its gradient is left in `pose.grad`."""
-    import roma  # as above
-
-    pose.grad = None
-    with torch.enable_grad():
-        rotation, translation = roma.rotvec_to_rotmat(pose[None, :3]), pose[None, 3:]
-        value = dense_objective(assignment[None], bearings[None], points[None], rotation, translation).sum()
-        value.backward()
-    return value

@@ -1,7 +1,5 @@
 """The weighted blind PnP layer (paper Eq. 7): from a start to the pose that best explains a soft assignment."""
 
-from typing import Literal
-
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
@@ -16,16 +14,13 @@ from bpnp.layers.objective import (
     Translations,
     aggregate,
     derivatives,
-    lbfgs,
     newton,
     pose_gradient,
 )
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
-Method = Literal["newton", "lbfgs"]
 FARTHEST = 1e4  # scene radii; beyond this distance all bearings coincide: the solver has diverged
-LINE_SEARCH_TOLERANCE = 1e-7  # smallest gradient that a line search on values in float64 can tell from zero
 WELL_POSED = 1e-9  # smallest Hessian eigenvalue, as a part of the trace, at which the pose has a derivative
 
 
@@ -38,7 +33,6 @@ def weighted_pnp(
     rotation: Float[Tensor, "b 3 3"],
     translation: Float[Tensor, "b 3"],
     *,
-    method: Method = "newton",
     tolerance: float = 1e-9,
     max_iterations: int = 50,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
@@ -49,17 +43,15 @@ def weighted_pnp(
     points3d: p_j in scene units.
     rotation, translation: the start, camera = R p + t; no gradient flows to it. A sample whose start is
         NaN has no pose.
-    method: "newton", damped, O(n) an iteration; "lbfgs", the paper's, O(m n) an evaluation.
-    tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii; for "lbfgs" at
-        least 1e-7.
-    max_iterations: of the solver, for each sample.
+    tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii.
+    max_iterations: of damped Newton steps, O(n) each, for each sample. The paper has L-BFGS, for the same optimum.
 
     Returns rotation, translation and stats per sample (residual: the norm that is compared with the tolerance). The
     solver runs in float64; the results have the dtype of the assignment. Gradients flow to assignment, bearings and
     points3d by the implicit function theorem with the true Hessian (Lemma 1). `converged` is False, and the gradient
     zero, where the start is missing, the tolerance was not met, the camera is farther than 10^4 scene radii or the
     Hessian is not positive definite: leave such samples out of a loss. There is no second derivative.
-    Raises ValueError for an unknown method, shapes that do not fit, an empty axis or integers.
+    Raises ValueError for shapes that do not fit, an empty axis or integers.
 
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
     >>> bearings = torch.nn.functional.normalize(points3d + torch.tensor([0.0, 0, 4]), dim=-1)
@@ -70,8 +62,6 @@ def weighted_pnp(
     """
     import roma  # as in `bpnp.geometry.retract`
 
-    if method not in ("newton", "lbfgs"):
-        raise ValueError(f"expected `method` 'newton' or 'lbfgs', got {method!r}")
     q = aggregate(assignment, bearings).double()
     # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
     q = q / _lengths(q.detach()).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
@@ -82,12 +72,7 @@ def weighted_pnp(
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
         r = roma.special_procrustes(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _turned(r, centre)) / scale
-        if method == "newton":
-            r, t, iterations = newton(q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
-        else:
-            tolerance = max(tolerance, LINE_SEARCH_TOLERANCE)
-            dense = assignment.double(), bearings.double(), points.mT
-            r, t, iterations = lbfgs(*dense, r, t, tolerance=tolerance, max_iterations=max_iterations)
+        r, t, iterations = newton(q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
         residual, well_posed, factor = _judge(derivatives(q, points, r, t))
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
 
@@ -142,9 +127,8 @@ class WeightedPnP(nn.Module):
     """`weighted_pnp` with its options as a module.
 
     Args:
-        method: newton, or lbfgs as in the paper.
         tolerance: norm of the gradient per unit of weight at which a sample stops, radians and scene radii.
-        max_iterations: of the solver, at most.
+        max_iterations: Newton steps, at most.
 
     >>> layer = WeightedPnP(max_iterations=20)
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
@@ -154,9 +138,9 @@ class WeightedPnP(nn.Module):
     tensor([True])
     """
 
-    def __init__(self, *, method: Method = "newton", tolerance: float = 1e-9, max_iterations: int = 50) -> None:
+    def __init__(self, *, tolerance: float = 1e-9, max_iterations: int = 50) -> None:
         super().__init__()
-        self.method, self.tolerance, self.max_iterations = method, tolerance, max_iterations
+        self.tolerance, self.max_iterations = tolerance, max_iterations
 
     def forward(
         self, assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor
@@ -167,7 +151,6 @@ class WeightedPnP(nn.Module):
             points3d,
             rotation,
             translation,
-            method=self.method,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
         )

@@ -13,7 +13,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from bpnp.layers.pnp import Method, WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
 from bpnp.models.bpnpnet import BPnPNet
 
@@ -63,10 +62,10 @@ def tensor_maps() -> dict[str, TensorMap]:
     return maps
 
 
-def load_authors_weights(path: str | Path, *, backend: Backend = "auto", method: Method = "newton") -> BPnPNet:
+def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnPNet:
     """The network of a ``*.pth.tar`` file in evaluation mode: the same assignment as the authors' for every problem.
 
-    backend, method: of `bpnp.layers.RansacPnP` and `bpnp.layers.WeightedPnP`, which have no weights.
+    backend: of `bpnp.layers.RansacPnP`, which has no weights.
     Only tensors, plain containers and numbers are unpickled. Raises FileNotFoundError, or ValueError that names the
     file and, where one tensor is wrong (missing, unexpected, of another shape, not finite), its key.
     """
@@ -89,7 +88,7 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto", method:
             f"expected the {len(maps)} tensors of the authors' BPnPNet in {file}, got "
             f"{'; '.join(sorted(problems)[:3])}{more}; try the authors' file as it was downloaded"
         )
-    net = BPnPNet(ransac=RansacPnP(backend=backend), pnp=WeightedPnP(method=method))
+    net = BPnPNet(ransac=RansacPnP(backend=backend))
     shapes = {name: value.shape for name, value in net.state_dict().items()}
     net.load_state_dict({m.ours: state[key].reshape(shapes[m.ours]) for key, m in maps.items()})
     return net.eval()

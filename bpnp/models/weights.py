@@ -27,7 +27,8 @@ LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 PLAIN = (bool, int, float, str, type(None))
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
 RENAMED = {"pairs_factor": "matches_factor"}  # settings in older checkpoints
-REMOVED = {"batch_norm": False, "principal": False}  # settings of older checkpoints that had no other value in use
+# Settings of older checkpoints that had no other value in use.
+REMOVED = {"batch_norm": False, "principal": False, "method": "newton"}
 
 Net = TypeVar("Net", bound="TrainedNet")
 

@@ -39,7 +39,6 @@ def as_users_run_it(monkeypatch: pytest.MonkeyPatch) -> None:
         (weighted_pnp, {"bearings": PLANTED.points2d}, r"expected `bearings` of shape \(b, m, 3\), got \(2, 8, 2\)"),
         (weighted_pnp, {"bearings": PLANTED.bearings[:, 1:]}, r"`bearings` .* with m = 8 as in `assignment`"),
         (weighted_pnp, {"translation": torch.zeros(2, 3, 1)}, r"expected `translation` of shape \(b, 3\), got"),
-        (weighted_pnp, {"method": "adam"}, "expected `method` 'newton' or 'lbfgs', got 'adam'"),
         (ransac_pnp, {"points2d": PLANTED.bearings}, r"expected `points2d` of shape \(b, m, 2\), got \(2, 8, 3\)"),
         (ransac_pnp, {"assignment": PAIRS["assignment"][:0]}, "no empty axis"),
         (ransac_pnp, {"points3d": PLANTED.points3d.numpy()}, "expected `points3d` as a tensor"),

@@ -87,7 +87,7 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
         SceneFeatures(channels=8, depth=1, normalise=True),
         Sinkhorn(mu=0.3, learn_mu=True, tolerance=1e-5, max_iterations=7),
         RansacPnP(backend="opencv", matches_factor=2.0, threshold=0.1, max_iterations=9, seed=4),
-        WeightedPnP(method="lbfgs", tolerance=1e-8, max_iterations=3),
+        WeightedPnP(tolerance=1e-8, max_iterations=3),
         Refinement(hypotheses=3, enabled=False),
         Matcher(channels=8, depth=1, heads=2, neighbours=0, mu=0.2, tolerance=1e-5, ransac=RansacPnP(threshold=0.2)),
     ]
