@@ -11,7 +11,7 @@ from typing import Any
 
 from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.page.charts import RECALLS, recall_chart
-from bpnp.report.points import FEW, ProblemPoints, read_points, utf8
+from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_shares, read_results
 
 MOST_PICTURES = 12
@@ -71,8 +71,7 @@ def _media(results: Results, problems: Sequence[ProblemPoints]) -> dict[str, Any
         if (chart := recall_chart({"test": results}, error)) is not None:
             media[f"test/recall_curve/{error}"] = chart
     media["test/recall"] = wandb.Image(recall_curve({"test": results}))
-    # Problems with many points: the worst and some others, as a test keeps them.
-    worst = sorted(problems, key=lambda problem: (len(problem.points2d) <= FEW, -problem.error))[:MOST_PICTURES]
+    worst = sorted(problems, key=lambda problem: -problem.error)[:MOST_PICTURES]
     if drawn := [wandb.Image(plot_problem(problem), caption=utf8(problem.id)) for problem in worst]:
         media["test/worst_problems"] = drawn
     return media

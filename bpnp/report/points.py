@@ -1,8 +1,5 @@
-"""The points of the problems of a test, `points.npz`: enough to draw what the cameras see.
-
-Of every problem up to `FEW` points a side are kept; of the worst and of some others, up to `MANY`. Which ones does not
-depend on the order of batches or on processes.
-"""
+"""The points of the problems of a test, `points.npz`: up to `MOST` a side of each, enough to draw what the cameras
+see."""
 
 import json
 from collections.abc import Iterable, Sequence
@@ -21,8 +18,7 @@ from bpnp.types import Batch, Prediction
 
 FORMAT = 2
 FILE = "points.npz"
-FEW, MANY = 24, 1000  # points a side
-WORST, OTHERS = 12, 12  # problems with up to `MANY`
+MOST = 100  # points a side
 IDS = ("ids2d", "ids3d")
 POINTS: dict[str, tuple[Any, ...]] = {  # columns of all problems one after the other: type and width
     "points2d": (np.float32, 2),
@@ -40,7 +36,7 @@ class ProblemPoints:
     points2d: (m, 2). points3d: (n, 3). match3d: (n,) the 2D point that each 3D point truly is, -1 for none.
     assigned3d: (n,) the 2D point to which the solver's assignment gives most of each 3D point, -1 if it has none.
     pose: true rotation (3, 3) and translation (3,), None if unknown. estimates: the same by name; NaN without a pose.
-    error: rotation error of the first estimate in degrees, by which the worst are chosen. ids2d, ids3d: the places of
+    error: rotation error of the first estimate in degrees. ids2d, ids3d: the places of
     the points in the problem as it was solved, if only some of them are here; None for all. camera: in whose pixels the
     problem is drawn, None for normalised coordinates; it is not kept on disk.
     """
@@ -70,7 +66,7 @@ def utf8(name: str) -> str:
 
 
 def points_from(prediction: Prediction, batch: Batch) -> list[ProblemPoints]:
-    """The points of a batch. Of larger sets `MANY` are kept on each side, evenly spaced, matched ones first."""
+    """The points of a batch. Of larger sets `MOST` are kept on each side, evenly spaced, matched ones first."""
     points2d, points3d, mask2d, mask3d = map(_host, (batch.points2d, batch.points3d, batch.mask2d, batch.mask3d))
     unknown = np.full(mask3d.shape, -1)
     match3d = unknown if batch.match3d is None else _host(batch.match3d)
@@ -95,30 +91,11 @@ def points_from(prediction: Prediction, batch: Batch) -> list[ProblemPoints]:
             estimates={name: (rotation[i], translation[i]) for name, (rotation, translation) in poses.items()},
             error=errors[i],
         )
-        problems.append(thin(problem, MANY))
+        problems.append(thin(problem))
     return problems
 
 
-def select_points(problems: Iterable[ProblemPoints]) -> tuple[ProblemPoints, ...]:
-    """The `WORST` problems and `OTHERS` spread over the data set, by index.
-
-    Choosing from what was chosen of the parts gives the same as choosing from the whole, so that problems can be
-    selected batch by batch and process by process:
-    `chosen = select_points([*chosen, *points_from(prediction, batch)])`.
-    """
-    once = {problem.index: problem for problem in problems}
-    by_error = sorted(once.values(), key=lambda problem: (-problem.error, problem.index))
-    spread = sorted(once.values(), key=lambda problem: spread_key(problem.index))
-    chosen = {problem.index: problem for problem in [*by_error[:WORST], *spread[:OTHERS]]}
-    return tuple(chosen[index] for index in sorted(chosen))
-
-
-def spread_key(index: int) -> int:
-    """A key whose order spreads indices evenly, whatever their number: multiples of the golden ratio modulo 1."""
-    return index * 2654435769 % 2**32
-
-
-def thin(problem: ProblemPoints, most: int = FEW) -> ProblemPoints:
+def thin(problem: ProblemPoints, most: int = MOST) -> ProblemPoints:
     """The problem with at most `most` points on each side, evenly spaced, matched ones first."""
     count2d = len(problem.points2d)
     keep3d = _first_then_rest(problem.match3d >= 0, most)

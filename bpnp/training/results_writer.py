@@ -11,7 +11,7 @@ from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
-from bpnp.report.points import ProblemPoints, points_from, select_points, thin, write_points
+from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import report
 from bpnp.training.task import number_globally
@@ -21,7 +21,7 @@ RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPT
 
 
 class ResultsWriter(Callback):
-    """Writes `problems.csv`, `summary.json`, the points of some problems and a few points of every one after a test.
+    """Writes `problems.csv`, `summary.json` and points of every problem after a test.
 
     Args:
         folder: where; null for `test` in the trainer's default_root_dir.
@@ -29,7 +29,6 @@ class ResultsWriter(Callback):
 
     rows: list[ProblemRow]
     losses: dict[int, float]
-    chosen: Sequence[ProblemPoints]
     points: list[ProblemPoints]
     numbers: set[int]  # of the problems so far
 
@@ -39,7 +38,7 @@ class ResultsWriter(Callback):
         self.folder = folder
 
     def on_test_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.rows, self.losses, self.chosen, self.points, self.numbers = [], {}, (), [], set()
+        self.rows, self.losses, self.points, self.numbers = [], {}, [], set()
         self._check_replaced(trainer)
 
     def on_test_batch_start(
@@ -54,14 +53,12 @@ class ResultsWriter(Callback):
         if not isinstance(outputs, dict) or not {"prediction", "seconds", "losses"} <= outputs.keys():
             return  # of a task of the user's own
         self.rows += rows_from(outputs["prediction"], batch, outputs["seconds"])
-        points = points_from(outputs["prediction"], batch)
-        self.chosen = select_points([*self.chosen, *points])
-        self.points += map(thin, points)
+        self.points += points_from(outputs["prediction"], batch)
         if outputs["losses"] is not None:
             self.losses |= dict(zip(batch.index.tolist(), outputs["losses"].tolist(), strict=True))
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        gathered = _gather((self.rows, self.losses, self.chosen, self.points))
+        gathered = _gather((self.rows, self.losses, self.points))
         tabled = getattr(pl_module, "tabled", ())
         others = {name: value for name, value in trainer.callback_metrics.items() if name not in tabled}
         logged = ", ".join(f"{name} {float(value):.6g}" for name, value in others.items())
@@ -75,18 +72,17 @@ class ResultsWriter(Callback):
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
         """Of an interrupted test the problems that are finished; of several processes those of the first."""
         if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "test" and self.rows:
-            self._write_test(trainer, [(self.rows, self.losses, self.chosen, self.points)], complete=False)
+            self._write_test(trainer, [(self.rows, self.losses, self.points)], complete=False)
 
     def _write_test(self, trainer: Trainer, gathered: Sequence[Any], *, complete: bool) -> None:
         if trainer.is_global_zero:
-            rows = [row for part, _, _, _ in gathered for row in part]
-            losses = {index: loss for _, part, _, _ in gathered for index, loss in part.items()}
+            rows = [row for part, _, _ in gathered for row in part]
+            losses = {index: loss for _, part, _ in gathered for index, loss in part.items()}
             mean = sum(losses[i] for i in sorted(losses)) / len(losses) if losses else None
             folder = self._folder(trainer)
             settings = _settings(trainer) if self.settings is None else self.settings
             write_results(folder, rows, correspondence_loss=mean, settings={**settings, "complete": complete})
-            chosen = select_points([problem for _, _, part, _ in gathered for problem in part])
-            write_points(folder, [*chosen, *(problem for *_, part in gathered for problem in part)])
+            write_points(folder, (problem for *_, part in gathered for problem in part))
             if self.settings is None:
                 report([folder])
             count = len({row.index for row in rows})

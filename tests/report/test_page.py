@@ -10,7 +10,7 @@ from report_data import HOSTILE, inflated, rows, write_run
 
 from bpnp.report import write_page, write_results
 from bpnp.report.page.charts import chart_text, error_chart, recall_chart
-from bpnp.report.page.write import MOST_BYTES, page_html, plotly_script
+from bpnp.report.page.write import page_html, plotly_script
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 
@@ -89,12 +89,12 @@ def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path:
 
 
 def test_eight_runs_of_ten_thousand_pairs_stay_under_20_mb(tmp_path: Path) -> None:
-    """Numbers grow with the pairs, and points fill the room that is left."""
+    """Numbers grow with the problems; the points of 500 take 3 MB."""
     sizes = []
     for count in (200, 1200):
         write_results(tmp_path / str(count), rows(count, 0, ("ransac", "pnp", "refined")))
         sizes.append(len(page_html([tmp_path / str(count)]).encode()))
-    assert sizes[0] + 8 * 10_795 * (sizes[1] - sizes[0]) / 1000 < MOST_BYTES - 3e6
+    assert sizes[0] + 8 * 10_795 * (sizes[1] - sizes[0]) / 1000 < 17e6
     assert len(plotly_script()) < sizes[0] < 2.3e6
 
 

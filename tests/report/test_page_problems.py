@@ -1,16 +1,15 @@
-"""The points of pairs on the page: planted points and poses survive, and the page keeps to its room."""
+"""The points of pairs on the page: planted points and poses survive."""
 
 import json
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-import pytest
 from report_data import drawn_problem, inflated, row
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.page.problems import PAGE_POINTS, page_points
-from bpnp.report.points import ProblemPoints, thin
+from bpnp.report.page.problems import PROBLEMS, page_points
+from bpnp.report.points import MOST, ProblemPoints, thin
 from bpnp.report.results import Results
 
 
@@ -30,10 +29,10 @@ def planted(count: int) -> list[ProblemPoints]:
     return [drawn_problem(i, f"scene/{i:04d}", 10 + i % 50) for i in range(count)]
 
 
-def test_the_page_has_the_points_and_poses_of_every_pair_while_there_is_room() -> None:
+def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
     problems = planted(40)
     runs = {"a": results(problems), "b": results(problems)}
-    places, lines = read(page_points(runs, {"a": [thin(own) for own in problems], "b": problems}, room=10**6))
+    places, lines = read(page_points(runs, {"a": problems, "b": problems}))
     assert places["a"] == places["b"]
     assert sorted(places["a"]) == list(range(40))
     for place, original in zip(places["a"], problems, strict=True):
@@ -50,27 +49,20 @@ def test_the_page_has_the_points_and_poses_of_every_pair_while_there_is_room() -
         assert line["poses"]["a"]["pnp"] is None
 
 
-def test_assignments_are_those_of_the_solver_and_large_pairs_are_thinned() -> None:
+def test_assignments_are_those_of_the_solver() -> None:
     original = drawn_problem(0, "a", 500)
-    match = np.where(np.arange(500) % 4 == 0, original.match3d, -1).astype(np.int32)
-    own = replace(original, match3d=match)
-    _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}, room=10**6))
-    assert len(line["points2d"]) == len(line["points3d"]) == PAGE_POINTS
-    for j, (i, assigned) in enumerate(zip(line["match3d"], line["assigned"]["run"], strict=True)):
-        true = match[line["ids3d"][j]]
-        assert (line["ids2d"][i] if i >= 0 else -1) == true
-        partner = original.assigned3d[line["ids3d"][j]]
+    own = thin(replace(original, match3d=np.where(np.arange(500) % 4 == 0, original.match3d, -1).astype(np.int32)))
+    _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}))
+    assert len(line["points2d"]) == len(line["points3d"]) == MOST
+    for number, matched, assigned in zip(line["ids3d"], line["match3d"], line["assigned"]["run"], strict=True):
+        assert (line["ids2d"][matched] if matched >= 0 else -1) == (number if number % 4 == 0 else -1)
+        partner = original.assigned3d[number]
         assert assigned == (line["ids2d"].index(partner) if partner in line["ids2d"] else -1)
 
 
-@pytest.mark.parametrize("room", [0, 8_000, 30_000])
-def test_the_page_keeps_to_its_room_and_takes_the_worst_first(room: int) -> None:
-    error = np.random.default_rng(0).random(200)
-    problems = [thin(replace(own, error=float(error[own.index]))) for own in planted(200)]
-    text = page_points({"a": results(problems)}, {"a": problems}, room=room)
-    places, lines = read(text)
-    kept = np.flatnonzero(np.array(places["a"]) >= 0)
-    assert len(text) <= max(room, 500)
-    assert len(lines) == len(kept) >= room / 1000
-    assert len(kept) < 200
-    assert set(np.argsort(-error)[: len(kept) // 2]) <= set(kept.tolist())
+def test_the_page_takes_the_worst() -> None:
+    error = np.random.default_rng(0).random(PROBLEMS + 50)
+    problems = [replace(own, error=float(error[own.index])) for own in planted(len(error))]
+    places, lines = read(page_points({"a": results(problems)}, {"a": problems}))
+    assert len(lines) == PROBLEMS
+    assert set(np.flatnonzero(np.array(places["a"]) >= 0)) == set(np.argsort(-error)[:PROBLEMS])

@@ -1,21 +1,20 @@
-"""Numbers and points of problems in the form of the page: compressed JSON, as many points as there is room for."""
+"""Numbers and points of problems in the form of the page: compressed JSON."""
 
 import base64
 import gzip
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from itertools import chain
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.points import FEW, Array, ProblemPoints, spread_key, thin, utf8
+from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import CAUSES, ProblemRow, Results
 from bpnp.report.runs import lines_of
 
-PAGE_POINTS = 300  # most points a side of a problem
+PROBLEMS = 500  # whose points are on the page
 DIGITS = 5  # significant ones of errors; of points and poses, of their extent
 ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
 COUNTS = ("inliers", "m", "n", "matches", "iterations")
@@ -47,39 +46,32 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     return {"series": series, "columns": list(columns)}
 
 
-def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[ProblemPoints]], *, room: int) -> str:
-    """The points of problems in about `room` characters at most: compressed lines of JSON.
+def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[ProblemPoints]]) -> str:
+    """The points of the `PROBLEMS` worst problems of all runs: compressed lines of JSON.
 
     The first line has, by run, the number of the line after it for each of the run's problems, -1 for none. Runs on the
-    same points share lines. Where not all problems have room, half of those that have are the worst and half are spread
-    over the data set.
+    same points share lines.
     """
-    keys: dict[str, list[Hashable]] = {}  # of each run's problems, in the order of the page
+    keys = {name: {problem.index: _key(problem) for problem in points[name]} for name in runs}
     shared: dict[Hashable, dict[str, ProblemPoints]] = {}
-    for name, results in runs.items():
-        by_index = {problem.index: problem for problem in points.get(name, ())}
-        rows = results.of(next(iter(results.estimates)))
-        keys[name] = [_key(by_index[row.index], row) if row.index in by_index else None for row in rows]
-        for key, row in zip(keys[name], rows, strict=True):
-            if key is not None:
-                shared.setdefault(key, {})[name] = by_index[row.index]
+    for name in runs:
+        for problem in points[name]:
+            shared.setdefault(keys[name][problem.index], {})[name] = problem
     error = {key: max(problem.error for problem in by_run.values()) for key, by_run in shared.items()}
-    spread = [key for _, key in sorted(enumerate(shared), key=lambda numbered: spread_key(numbered[0]))]
-    order = list(dict.fromkeys(chain.from_iterable(zip(sorted(error, key=lambda k: -error[k]), spread, strict=True))))
-    lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in order]
-    count = len(order)
-    while True:
-        place = {key: k for k, key in enumerate(order[:count])}
-        places = {name: [place.get(key, -1) for key in run_keys] for name, run_keys in keys.items()}
-        text = compressed("\n".join([json.dumps(places), *lines[:count]]))
-        if len(text) <= room or not count:
-            return text
-        count = int(0.99 * count * max(room, 0) / len(text))
+    worst = sorted(error, key=lambda key: -error[key])[:PROBLEMS]
+    place = {key: number for number, key in enumerate(worst)}
+    places = {
+        name: [place.get(keys[name].get(row.index), -1) for row in results.of(next(iter(results.estimates)))]
+        for name, results in runs.items()
+    }
+    lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in worst]
+    return compressed("\n".join([json.dumps(places), *lines]))
 
 
-def _key(problem: ProblemPoints, row: ProblemRow) -> Hashable:
-    """The same for problems of the same points: the name, the numbers of points and the true pose."""
-    return problem.id, row.m, row.n, None if problem.pose is None else np.c_[problem.pose].tobytes()
+def _key(problem: ProblemPoints) -> Hashable:
+    """The same for problems of the same points: the name, the points that are there and the true pose."""
+    pose = None if problem.pose is None else np.c_[problem.pose].tobytes()
+    return problem.id, problem.points2d.tobytes(), problem.points3d.tobytes(), pose
 
 
 def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
@@ -99,17 +91,11 @@ def _shortened(value: float) -> float | str:
 
 
 def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
-    """Points, true matches and pose; of each run the poses and, where there are many points, the assigned matches."""
-    shown = thin(max(runs.values(), key=lambda problem: len(problem.points2d) + len(problem.points3d)), PAGE_POINTS)
+    """Points, true matches and pose; of each run the poses and the assigned matches."""
+    shown = next(iter(runs.values()))
     ids2d, ids3d = (ids.tolist() for ids in shown.numbers())
     decimals = _decimals(shown.points3d)
-    place = {number: i for i, number in enumerate(ids2d)}
-    assigned = {}
-    for name, problem in runs.items():
-        if len(problem.points3d) > FEW and (problem.assigned3d >= 0).any():
-            numbers2d, numbers3d = problem.numbers()
-            partner = {j: numbers2d[i] for j, i in zip(numbers3d.tolist(), problem.assigned3d, strict=True) if i >= 0}
-            assigned[name] = [place.get(partner.get(j), -1) for j in ids3d]
+    assigned = {name: problem.assigned3d.tolist() for name, problem in runs.items() if (problem.assigned3d >= 0).any()}
     return {
         "points2d": np.round(shown.points2d.astype(float), _decimals(shown.points2d)).tolist(),
         "points3d": np.round(shown.points3d.astype(float), decimals).tolist(),

@@ -18,7 +18,7 @@ from markupsafe import Markup
 
 from bpnp.files import write_text
 from bpnp.report.page.charts import CONFIG, SIZES, chart_text, figures, look, page_charts
-from bpnp.report.page.problems import compressed, page_numbers, page_points
+from bpnp.report.page.problems import PROBLEMS, compressed, page_numbers, page_points
 from bpnp.report.palette import DASHES, INKS
 from bpnp.report.points import read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
@@ -27,7 +27,6 @@ from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cel
 from bpnp.report.terminal import Paper
 
 SCRIPTS = ("page.js", "problem.js")
-MOST_BYTES = 19_850_000
 COLUMNS = {  # of the table of problems: head and hover text
     "rotation_error_deg": ("rot deg", "rotation error, degrees"),
     "translation_error": ("trans", "translation error, scene units"),
@@ -74,15 +73,15 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         "figures": {name: json.dumps(figure) for name, figure in figures().items()},
         "look": json.dumps(look()),
     }
-    data, plotly, lines = compressed(json.dumps(numbers)), plotly_script(), lines_of(runs)
+    lines = lines_of(runs)
     # Names are text, whatever is in them: what is not Markup is escaped, bytes that are no UTF-8 are replaced.
     page = Environment(autoescape=True, finalize=_utf8, trim_blocks=True, lstrip_blocks=True)
     return page.from_string(_asset("page.html")).render(
         style=Markup(_asset("page.css")),
         script=Markup("\n".join(map(_asset, SCRIPTS))),
-        data=data,
-        points=page_points(runs, points, room=MOST_BYTES - len(data) - len(plotly) - 200_000),
-        plotly=plotly,
+        data=compressed(json.dumps(numbers)),
+        points=page_points(runs, points),
+        plotly=plotly_script(),
         runs={name: (described(results), _facts(results)) for name, results in runs.items()},
         folders=", ".join(folders),
         inks=INKS,
@@ -99,6 +98,7 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         solved=f"{SOLVED_DEG:g} degrees",
         plausible=f"{100 * PLAUSIBLE_INLIERS:.0f} %",
         columns=COLUMNS,
+        drawn=PROBLEMS,
     )
 
 
