@@ -1,7 +1,6 @@
 """`bpnp report`, `view` and `wandb`: results as tables, as a page, as figures, and in Weights & Biases."""
 
 import re
-import webbrowser
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -20,7 +19,6 @@ def report(
     runs: list[Path],
     *,
     paper: Paper | None = None,
-    untrained: Path | None = None,
     html: Path | None = None,
     recall: Path | None = None,
 ) -> None:
@@ -29,7 +27,6 @@ def report(
     Args:
         runs: folders that `bpnp test` or `bpnp table` wrote, or their runs.
         paper: the paper's rows beneath, for orientation.
-        untrained: results of the untrained weights, to compare.
         html: write a page that needs no network.
         recall: write the recall curves as .png, .svg or .pdf.
     """
@@ -43,7 +40,7 @@ def report(
         say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths), recall)}")
-    print_tables(paths, paper=paper, untrained=untrained)
+    print_tables(paths, paper=paper)
 
 
 def view(
@@ -53,7 +50,6 @@ def view(
     output: Path | None = None,
     estimate: str | None = None,
     lines: Literal["true", "assigned", "none"] = "true",
-    open: bool = False,
 ) -> None:
     """Draw a problem of a test, or a solution: points and cameras in space, and what is seen in the image.
 
@@ -63,7 +59,6 @@ def view(
         output: .png, .svg or .pdf; RUN/views/PROBLEM.png by default.
         estimate: whose pose reprojects the 3D points; the first by default.
         lines: which matches to draw.
-        open: show the file with the system's viewer.
     """
     from bpnp.report.figures import plot_problem, save_figure
     from bpnp.report.runs import named_runs
@@ -85,10 +80,7 @@ def view(
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
         figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
-        written = save_figure(figure, output or folder / "views" / f"{name}.png")
-        say(f"wrote {written}")
-        if open:
-            webbrowser.open(written.absolute().as_uri())
+        say(f"wrote {save_figure(figure, output or folder / 'views' / f'{name}.png')}")
 
 
 def _solution(path: Path) -> "ProblemPoints":

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from rich.text import Text
 
-from bpnp.report.results import Results, read_results
+from bpnp.report.results import Results
 from bpnp.report.runs import lines_of, read_runs
 from bpnp.report.terminal import Paper, SplitTable, console, number
 
@@ -188,33 +188,15 @@ def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], ca
     return SplitTable(title, [column.header for column in columns], groups, caption)
 
 
-def learning_table(before: Results, after: Results) -> SplitTable:
-    """Correspondence loss and median rotation error of each estimate, untrained and trained, side by side.
-
-    Raises ValueError if the two are not of the same problems.
-    """
-    ids = [sorted({(row.index, row.id) for row in results.rows}) for results in (before, after)]
-    if ids[0] != ids[1]:
-        raise ValueError(f"expected the same problems untrained and trained, got {len(ids[0])} and {len(ids[1])}")
-    figures = {"correspondence loss": [results.correspondence_loss for results in (before, after)]} | {
-        f"{name}: median deg": [results.estimates.get(name, {}).get("rotation_q2_deg") for results in (before, after)]
-        for name in dict.fromkeys([*before.estimates, *after.estimates])
-    }
-    rows = [(Text(name), [Text(number(value)) for value in values]) for name, values in figures.items()]
-    return SplitTable(_title("Learning", {"": after}), ["untrained", "trained"], [rows])
-
-
-def report(paths: Sequence[Path], *, paper: Paper | None = None, untrained: Path | None = None) -> None:
+def report(paths: Sequence[Path], *, paper: Paper | None = None) -> None:
     """Print the tables of one or several results folders, named by what their paths do not share.
 
-    `untrained` is the folder of the last run's untrained weights. Raises ValueError if a folder cannot be read.
+    Raises ValueError if a folder cannot be read.
     """
     out = console()
     runs = read_runs(paths)
     out.print(results_table(runs, paper=paper))
     out.print(recall_table(runs))
-    if untrained is not None:
-        out.print(learning_table(read_results(untrained), list(runs.values())[-1]))
 
 
 def table_frame(rows: Sequence[Row]) -> "DataFrame":

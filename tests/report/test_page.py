@@ -9,7 +9,7 @@ from plotly.offline import get_plotlyjs
 from report_data import HOSTILE, inflated, rows, write_run
 
 from bpnp.report import write_page, write_results
-from bpnp.report.page.charts import chart_text, error_chart, recall_chart
+from bpnp.report.page.charts import chart_text, recall_chart
 from bpnp.report.page.write import page_html, plotly_script
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
@@ -57,18 +57,15 @@ def test_the_page_holds_the_numbers_of_the_results(tmp_path: Path) -> None:
     assert text.count("paper, MegaDepth: Lc Lp") == 2
 
 
-def test_charts_are_the_shares_and_medians_of_the_rows(tmp_path: Path) -> None:
+def test_recall_curves_are_the_shares_of_the_rows(tmp_path: Path) -> None:
     results = write_run(tmp_path, 200, 0)
     errors = np.array([row.rotation_error_deg for row in results.of("pnp")])
-    recall, size = recall_chart({"run": results}, "rotation_deg"), error_chart({"run": results}, "m")
+    recall = recall_chart({"run": results}, "rotation_deg")
     assert recall is not None
-    assert size is not None
     line = recall.data[1]
     assert line.name == "pnp"
     np.testing.assert_allclose(line.y, [(errors <= limit * (1 + 1e-6)).mean() for limit in line.x], atol=0.006)
     assert chart_text(recall).endswith(f"pnp ends at {100 * (errors <= 90).mean():.1f}%")
-    count = np.array([row.m for row in results.of("pnp")])
-    assert size.data[1].y[0] == pytest.approx(np.median(errors[count <= np.quantile(count, 1 / 16)]), rel=1e-6)
     # The same line and colour as in the table: one a series.
     assert len({(trace.line.color, trace.line.dash) for trace in recall.data}) == len(recall.data)
 

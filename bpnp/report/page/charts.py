@@ -1,9 +1,7 @@
-"""The charts of the page as plotly figures, for notebooks too: recall, errors against the size, time; and the figures
-that the page fills with a problem or with two runs.
+"""The recall curves of the page as plotly figures, and the figures that it fills with a problem or with two runs.
 
-Each chart takes results by name and returns a `plotly.graph_objects.Figure`, or None where there is nothing to draw:
-`recall_chart(results, "rotation_deg").show()`. Colours are those of the light scheme, which the page replaces where the
-dark one is asked for.
+In a notebook: `recall_chart({"mine": results}, "rotation_deg").show()`. Colours are those of the light
+scheme, which the page replaces where the dark one is asked for.
 """
 
 from collections.abc import Mapping
@@ -16,7 +14,7 @@ import torch
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.palette import DASHES, INKS, LIGHT
 from bpnp.report.results import Results
-from bpnp.report.runs import Line, lines_of
+from bpnp.report.runs import lines_of
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure
@@ -24,7 +22,6 @@ if TYPE_CHECKING:
 Error = Literal["rotation_deg", "translation", "joint", "reprojection_deg"]
 Array = npt.NDArray[Any]
 POINTS = 200  # of a curve
-GROUPS = 16  # of problems of similar size
 RECALLS: dict[Error, tuple[str, str, float]] = {
     "rotation_deg": ("Rotation", "rotation error, degrees", 90.0),
     "translation": ("Translation", "translation error, scene units", 10.0),
@@ -42,7 +39,6 @@ CONFIG = {  # of every figure
     "toImageButtonOptions": {"scale": 2, "filename": "bpnp"},
     "modeBarButtonsToRemove": HIDDEN,
 }
-SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
 
 
 def errors_of(results: Results, estimate: str, error: Error) -> torch.Tensor:
@@ -58,7 +54,12 @@ def recall_of(results: Results, estimate: str, error: Error, limits: Array) -> A
 
 
 def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
-    """Share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3)."""
+    """Share of problems with an error up to a threshold, on a logarithmic axis (paper Fig. 3).
+
+    runs: results by name. None if no problem has an error above zero.
+    """
+    from plotly.graph_objects import Figure
+
     title, unit, most = RECALLS[error]
     finite = np.concatenate([errors_of(runs[line.run], line.estimate, error).numpy() for line in lines_of(runs)])
     finite = finite[np.isfinite(finite) & (finite > 0)]
@@ -66,86 +67,26 @@ def recall_chart(runs: Mapping[str, Results], error: Error) -> "Figure | None":
         return None
     low = max(float(np.quantile(finite, 0.01)), most / 1e5)
     limits = np.geomspace(low, max(most, 2 * low), POINTS)
-    figure = _figure(title, unit, "problems up to this error", share=True)
+    figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
+    figure.update_yaxes(title={"text": "problems up to this error"}, range=[0, 1.01], tickformat=".0%")
+    # Of one to two decades plotly labels every digit, which overlap, unless it is asked for fewer: then 1, 2 and 5.
+    decades = float(np.log10(limits[-1] / limits[0]))
+    few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # more than 0.3 decades a label
+    figure.update_xaxes(title={"text": unit}, hoverformat=".3~g", type="log", tickformat="~g", **few)
     for place, line in enumerate(lines_of(runs)):
-        _add(figure, place, line, limits, recall_of(runs[line.run], line.estimate, error, limits), "%{y:.1%}")
-    return _logarithmic(figure)
-
-
-def error_chart(runs: Mapping[str, Results], size: str) -> "Figure | None":
-    """Median rotation error of groups of problems of similar `size` ("m", "n" or "matches")."""
-    figure = _figure(f"Median rotation error against {SIZES[size]}", SIZES[size], "degrees")
-    figure.update_yaxes(type="log")
-    for place, line in enumerate(lines_of(runs)):
-        frame = runs[line.run].frame().query("estimate == @line.estimate")
-        if frame[size].nunique() < 3:
-            continue
-        edges = np.unique(np.quantile(frame[size], np.linspace(0, 1, GROUPS + 1)[1:-1]))
-        groups = frame.groupby(np.searchsorted(edges, frame[size]))
-        medians = groups.rotation_error_deg.median().clip(lower=1e-6)
-        _add(figure, place, line, groups[size].median(), medians, "%{y:.3g} deg")
-    return _logarithmic(figure) if figure.data else None
-
-
-def time_chart(runs: Mapping[str, Results]) -> "Figure | None":
-    """Share of problems done within a time; the estimates of a run are made together and share it."""
-    first: dict[str, tuple[int, Line]] = {}
-    for place, line in enumerate(lines_of(runs)):
-        first.setdefault(line.run, (place, line._replace(label=line.run)))
-    times = [torch.tensor([row.seconds for row in runs[run].of(line.estimate)]) for run, (_, line) in first.items()]
-    positive = torch.cat([seconds[seconds > 0] for seconds in times])
-    if not len(positive):
-        return None
-    limits = np.geomspace(float(positive.min()) * 0.9, float(positive.max()) * 1.1, POINTS)
-    figure = _figure("Problems done within a time", "seconds per problem", "problems within", share=True)
-    for (place, line), seconds in zip(first.values(), times, strict=True):
-        _add(figure, place, line, limits, recall_curve(seconds, limits.tolist()), "%{y:.1%}")
-    return _logarithmic(figure)
+        dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
+        style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
+        shares = recall_of(runs[line.run], line.estimate, error, limits)
+        points = {"x": limits.astype(np.float32), "y": shares.astype(np.float32)}
+        # By the place of its estimate the page finds a line.
+        figure.add_scatter(**points, name=line.label, mode="lines", meta=place, line=style, hovertemplate="%{y:.1%}")
+    return figure
 
 
 def chart_text(figure: "Figure") -> str:
     """What a chart shows in words, for screen readers: the last value of each line."""
-    form = ".1%" if figure.layout.yaxis.tickformat else ".3g"
-    ends = [f"{trace.name} ends at {trace.y[-1]:{form}}" for trace in figure.data if len(trace.y)]
+    ends = [f"{trace.name} ends at {trace.y[-1]:.1%}" for trace in figure.data]
     return f"{figure.layout.title.text}: {'; '.join(ends)}"
-
-
-def page_charts(runs: Mapping[str, Results]) -> "dict[str, list[Figure]]":
-    """The charts of the page by heading; headings without one are left out."""
-    charts = {
-        "Recall": [recall_chart(runs, error) for error in RECALLS],
-        "Errors against size": [error_chart(runs, size) for size in SIZES],
-        "Time": [time_chart(runs)],
-    }
-    known = {name: [chart for chart in several if chart is not None] for name, several in charts.items()}
-    return {name: several for name, several in known.items() if several}
-
-
-def _figure(title: str, x: str, y: str, *, share: bool = False) -> "Figure":
-    from plotly.graph_objects import Figure
-
-    figure = Figure(layout={"title": {"text": title}, "hovermode": "x unified", "template": "none"})
-    figure.update_xaxes(title={"text": x}, hoverformat=".3~g")
-    return figure.update_yaxes(title={"text": y}, **({"range": [0, 1.01], "tickformat": ".0%"} if share else {}))
-
-
-def _logarithmic(figure: "Figure") -> "Figure":
-    """The figure with a logarithmic x axis.
-
-    Of one to two decades plotly labels every digit, which overlap, unless it is asked for fewer: then 1, 2 and 5.
-    """
-    x = np.concatenate([trace.x for trace in figure.data])
-    decades = float(np.log10(x.max() / x.min()))
-    few = {"nticks": int(decades / 0.31)} if 1 <= decades < 2.2 else {}  # more than 0.3 decades a label
-    return figure.update_xaxes(type="log", tickformat="~g", **few)
-
-
-def _add(figure: "Figure", place: int, line: Line, x: Any, y: Any, hover: str) -> None:
-    """Add a line; by the place of its estimate the page finds it."""
-    dash = ",".join(f"{length:g}px" for length in DASHES[line.dashes % len(DASHES)]) or "solid"
-    style = {"color": LIGHT[line.colour % len(LIGHT)], "dash": dash, "width": 2}
-    points = {"x": np.asarray(x, np.float32), "y": np.asarray(y, np.float32)}
-    figure.add_scatter(**points, name=line.label, mode="lines", meta=place, line=style, hovertemplate=hover)
 
 
 def look() -> dict[str, Any]:

@@ -17,7 +17,7 @@ from jinja2 import Environment
 from markupsafe import Markup
 
 from bpnp.files import write_text
-from bpnp.report.page.charts import CONFIG, SIZES, chart_text, figures, look, page_charts
+from bpnp.report.page.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.page.problems import PROBLEMS, compressed, page_numbers, page_points
 from bpnp.report.palette import DASHES, INKS
 from bpnp.report.points import read_points, utf8
@@ -27,6 +27,7 @@ from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cel
 from bpnp.report.terminal import Paper
 
 SCRIPTS = ("page.js", "problem.js")
+SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
 COLUMNS = {  # of the table of problems: head and hover text
     "rotation_error_deg": ("rot deg", "rotation error, degrees"),
     "translation_error": ("trans", "translation error, scene units"),
@@ -62,13 +63,12 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
     folders = named_runs(paths)
     runs = {name: read_results(path) for name, path in folders.items()}
     points = {name: read_points(path) for name, path in folders.items()}
-    charts = page_charts(runs)
-    drawn = [chart for section in charts.values() for chart in section]
+    charts = [chart for error in RECALLS if (chart := recall_chart(runs, error)) is not None]
     numbers = page_numbers(runs) | {
         "keys": list(COLUMNS),
         "causes": CAUSES,
         "inks": INKS,
-        "charts": [chart.to_json() for chart in drawn],
+        "charts": [chart.to_json() for chart in charts],
         "config": CONFIG,
         "figures": {name: json.dumps(figure) for name, figure in figures().items()},
         "look": json.dumps(look()),
@@ -90,9 +90,7 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         heads=[column.header for column in RESULT_COLUMNS],
         rows=quartile_rows(runs, paper),
         caption=CAPTION,
-        charts={
-            name: [(drawn.index(chart), chart_text(chart)) for chart in several] for name, several in charts.items()
-        },
+        charts=list(map(chart_text, charts)),
         causes=CAUSES,
         shares=[(line, *_shares(runs[line.run], line.estimate)) for line in lines],
         solved=f"{SOLVED_DEG:g} degrees",
