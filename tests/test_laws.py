@@ -57,12 +57,9 @@ def true_matches(batch: Batch) -> torch.Tensor:
     return (index == batch.match3d.unsqueeze(1)).double()
 
 
-def by_pnp(method: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
-    def solved(batch: Batch) -> tuple[torch.Tensor, ...]:
-        near = retract(torch.full((len(batch), 6), 0.03, dtype=torch.float64), batch.rotation, batch.translation)
-        return weighted_pnp(true_matches(batch), bearings(batch.points2d), batch.points3d, *near, method=method)[:2]
-
-    return solved
+def by_pnp(batch: Batch) -> tuple[torch.Tensor, ...]:
+    near = retract(torch.full((len(batch), 6), 0.03, dtype=torch.float64), batch.rotation, batch.translation)
+    return weighted_pnp(true_matches(batch), bearings(batch.points2d), batch.points3d, *near)[:2]
 
 
 def by_ransac(backend: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
@@ -88,7 +85,7 @@ def by_matcher(frame: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
 
 LAYERS = {
     "sinkhorn": by_sinkhorn,
-    **{f"pnp by {method}": by_pnp(method) for method in ("newton", "lbfgs")},
+    "pnp": by_pnp,
     **{f"ransac of {backend}": by_ransac(backend) for backend in ("poselib", "opencv", "torch")},
     **{f"matcher in {frame} frame": by_matcher(frame) for frame in ("any", "view")},
 }
