@@ -68,13 +68,6 @@ RECALLS = (
 )
 SECONDS = Column("seconds_mean", "sec")
 RESULT_COLUMNS = (*QUARTILES, *RECALLS, Column("found", "found\n%", share=True), SECONDS)
-RECALL_COLUMNS = tuple(
-    Column(f"recall_{error}_{limit:g}{unit.lstrip('_')}", f"{short}\n{limit:g}", share=True)
-    for (error, unit, short), limits in zip(
-        ERRORS, ((1, 2, 5, 10, 20), (0.05, 0.1, 0.2, 0.5, 1), (0.25, 0.5, 1, 2)), strict=True
-    )
-    for limit in limits
-)
 FILE_COLUMNS = (Column("problems", "problems", count=True), *RESULT_COLUMNS)
 HEADS = ("Rotation Error", "Translation Error", "Reproj. Error")
 LATEX_COLUMNS = {
@@ -170,12 +163,6 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
     return table_of_rows(_title("Pose errors", runs), RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
-def recall_table(runs: Mapping[str, Results]) -> SplitTable:
-    """Recall in % at standard errors of rotation (deg), translation (scene units) and reprojection (deg)."""
-    caption = "% of problems with an error up to the number in the head: rot, repr in degrees; trans in scene units."
-    return table_of_rows(_title("Recall", runs), RECALL_COLUMNS, run_rows(runs), caption)
-
-
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> SplitTable:
     """The rows on the terminal: ours with the best numbers bold, beneath them those of the paper."""
     best = best_texts(columns, rows)
@@ -189,14 +176,12 @@ def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], ca
 
 
 def report(paths: Sequence[Path], *, paper: Paper | None = None) -> None:
-    """Print the tables of one or several results folders, named by what their paths do not share.
+    """Print the table of one or several results folders, named by what their paths do not share.
 
     Raises ValueError if a folder cannot be read.
     """
     out = console()
-    runs = read_runs(paths)
-    out.print(results_table(runs, paper=paper))
-    out.print(recall_table(runs))
+    out.print(results_table(read_runs(paths), paper=paper))
 
 
 def table_frame(rows: Sequence[Row]) -> "DataFrame":
