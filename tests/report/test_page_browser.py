@@ -111,12 +111,10 @@ def floats(cells: list[str]) -> list[float]:
     return [float(cell) for cell in cells]
 
 
-def test_tables_sort_and_the_best_is_bold(page: Callable[..., Any], written: Any) -> None:
+def test_the_best_median_is_bold(page: Callable[..., Any], written: Any) -> None:
     medians = [v["rotation_q2_deg"] for r in written[1].values() for v in r.estimates.values()]
-    for order in (sorted(medians), sorted(medians, reverse=True)):
-        press(page, "#quartile-table th:nth-child(3) button")
-        column = "#quartile-table tbody tr:not(.paper) td:nth-child(3)"
-        assert texts(page, column) == [number(value) for value in order]
+    column = "#quartile-table tbody tr:not(.paper) td:nth-child(3)"
+    assert texts(page, column) == [number(value) for value in medians]
     assert texts(page, "#quartile-table td.best:nth-child(3)") == [number(min(medians))]
 
 
@@ -158,8 +156,7 @@ def test_the_worst_pairs_come_first_and_filters_narrow_them(
     assert f"{without} of {COUNT} problems" in texts(page, "#place")[0]
     choose(page, "cause", "")
     choose(page, "least", "12.5")
-    choose(page, "status", "1")
-    chosen = [r for r in results.of("ransac") if r.rotation_error_deg >= 12.5 and r.found and not r.converged]
+    chosen = [r for r in results.of("ransac") if r.rotation_error_deg >= 12.5]
     assert f"{len(chosen)} of {COUNT} problems" in texts(page, "#place")[0]
     opened(browser, page("return location.href"))
     assert f"{len(chosen)} of {COUNT} problems" in texts(page, "#place")[0]
@@ -225,8 +222,6 @@ def test_all_problems_open(browser: Any, tmp_path: Path) -> None:
         options = [option.text for option in browser.find_elements("css selector", "#pose option")]
         assert options == ["true pose", "ransac", "pnp", "refined"]
         assert "× 0 of" not in browser.find_element("id", "image-text").text
-    choose(browser.execute_script, "drawn", "true")
-    assert "30 of 30 problems" in texts(browser.execute_script, "#place")[0]
     assert severe(browser) == []
 
 

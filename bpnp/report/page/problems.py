@@ -79,7 +79,6 @@ def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
         **{key: [_shortened(getattr(row, key)) for row in rows] for key in ERRORS},
         **{key: [getattr(row, key) for row in rows] for key in COUNTS},
         "cause": [CAUSES.index(row.cause) for row in rows],
-        "status": [2 if not row.found else 0 if row.converged else 1 for row in rows],
     }
 
 

@@ -77,17 +77,6 @@ function drawSeries() {
   each(".js-plotly-plot[data-chart]", drawChart);
 }
 
-// A table whose heads sort its rows by the number in data-value; the published rows stay beneath.
-function sortTable(button) {
-  const [head, body] = [button.closest("th"), button.closest("table").tBodies[0]];
-  const down = head.ariaSort === "ascending";
-  [...head.parentNode.cells].forEach((cell) => { cell.ariaSort = null; });
-  head.ariaSort = down ? "descending" : "ascending";
-  const value = (row) => Number(row.cells[head.cellIndex].dataset.value ?? Infinity);
-  const sorted = [...body.querySelectorAll("[data-series]")].sort((a, b) => value(a) - value(b) || 0);
-  body.prepend(...(down ? sorted.reverse() : sorted));
-}
-
 // Run against run: the rotation errors of two series, of many problems those that differ most and others between.
 function drawComparison() {
   const [a, b] = ["a", "b"].map((id) => SERIES[byId(id).value]);
@@ -116,10 +105,10 @@ function drawComparison() {
 // Positions of the problems that pass the filters, sorted; undefined errors last.
 function selectProblems() {
   const series = listed();
-  const [cause, status, error] = ["cause", "status", "rotation_error_deg"].map((key) => column(series, key));
-  const passes = (id, value) => byId(id).value === "" || Number(byId(id).value) === value;
-  const found = [...series.ids.keys()].filter((i) => passes("cause", cause[i]) && passes("status", status[i]) &&
-    error[i] >= Number(byId("least").value) && (series.lines[i] >= 0 || !byId("drawn").checked) &&
+  const [cause, error] = ["cause", "rotation_error_deg"].map((key) => column(series, key));
+  const wanted = byId("cause").value;
+  const found = [...series.ids.keys()].filter((i) => (wanted === "" || Number(wanted) === cause[i]) &&
+    error[i] >= Number(byId("least").value) &&
     series.ids[i].toLowerCase().includes(byId("name").value.toLowerCase()));
   const [sort, sign] = [byId("sort").value, byId("up").checked ? 1 : -1];
   const values = sort === "id" ? series.ids : sort in series.numbers ? column(series, sort) : error;
@@ -163,7 +152,6 @@ async function start() {
     return target.matches("#series *") ? drawSeries() : target.matches("#versus-section *") ? drawComparison() : drawProblems();
   });
   each("nav a", (link) => { link.onclick = () => document.querySelector(link.hash).scrollIntoView() ?? false; });
-  each("#quartile-table button", (button) => { button.onclick = () => sortTable(button); });
   each("#problem-table [data-key]", (button) => { button.onclick = () => {
     const again = byId("sort").value === button.dataset.key;
     setState({ up: String(again && !byId("up").checked), sort: button.dataset.key });
