@@ -50,8 +50,8 @@ def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
 
 
 def test_assignments_are_those_of_the_solver() -> None:
-    original = drawn_problem(0, "a", 500)
-    own = thin(replace(original, match3d=np.where(np.arange(500) % 4 == 0, original.match3d, -1).astype(np.int32)))
+    original = drawn_problem(0, "a", 501)
+    own = thin(replace(original, match3d=np.where(np.arange(501) % 4 == 0, original.match3d, -1).astype(np.int32)))
     _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}))
     assert len(line["points2d"]) == len(line["points3d"]) == MOST
     for number, matched, assigned in zip(line["ids3d"], line["match3d"], line["assigned"]["run"], strict=True):
