@@ -1,6 +1,5 @@
 """The baselines of the benchmarks must be right, or a ratio to them says nothing; and the commands must run."""
 
-import importlib
 import json
 import subprocess
 import sys
@@ -9,8 +8,19 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import bench_city
+import bench_constellation
+import bench_layers
+import bench_search
+import descriptor_poses
 import numpy as np
+import paper_layers
+import problems
 import pytest
+import rebuilt_maps
+import record
+import reliability
+import results
 import roma
 import torch
 from planted_model import plant_model
@@ -25,26 +35,20 @@ from bpnp.layers import ransac_pnp, sinkhorn, weighted_pnp
 from bpnp.maps.views import View
 
 ROOT = Path(__file__).parents[1]
-MODULES = (
-    "bench_city", "bench_constellation", "bench_layers", "bench_search", "descriptor_poses",
-    "paper_layers", "problems", "rebuilt_maps", "record", "reliability", "results",
-)  # fmt: skip
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _threads() -> Iterator[None]:
+    """The commands set torch's."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="module")
-def bench() -> Iterator[SimpleNamespace]:
-    """The scripts' modules, which import each other as they do when one of them is run."""
-    sys.path.insert(0, str(ROOT / "benchmarks"))
-    threads = torch.get_num_threads()
-    yield SimpleNamespace(**{name: importlib.import_module(name) for name in MODULES})
-    torch.set_num_threads(threads)
-    sys.path.remove(str(ROOT / "benchmarks"))
-
-
-@pytest.fixture(scope="module")
-def problem(bench: SimpleNamespace) -> SimpleNamespace:
+def problem() -> SimpleNamespace:
     """40 points in float64: the plan at its optimum and the pose from which RANSAC starts the layer."""
-    planted = bench.problems.planted(2, 40, kind="independent", level=0.9, seed=3)
+    planted = problems.planted(2, 40, kind="independent", level=0.9, seed=3)
     batch, cost = planted.batch.to(torch.float64), planted.cost.double()
     plan, _ = sinkhorn(cost, tolerance=1e-13)
     rotation, translation, _ = ransac_pnp(plan, batch.points2d, batch.points3d)
@@ -58,25 +62,23 @@ def noise(*shape: int, seed: int = 0) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
-def test_paper_sinkhorn_has_the_optimum_and_its_gradient(bench: SimpleNamespace, problem: SimpleNamespace) -> None:
-    plan = bench.paper_layers.sinkhorn_forward(problem.cost, iterations=10_000, tolerance=1e-15)
+def test_paper_sinkhorn_has_the_optimum_and_its_gradient(problem: SimpleNamespace) -> None:
+    plan = paper_layers.sinkhorn_forward(problem.cost, iterations=10_000, tolerance=1e-15)
     torch.testing.assert_close(plan, problem.plan, atol=1e-13, rtol=0)
     incoming, direction, step = noise(*plan.shape), noise(*plan.shape, seed=1), 1e-6
     moved = [sinkhorn(problem.cost + sign * step * direction, tolerance=1e-13)[0] for sign in (1, -1)]
     slope = float(((moved[0] - moved[1]) * incoming).sum() / (2 * step))
-    gradient = bench.paper_layers.sinkhorn_backward(plan, incoming)
+    gradient = paper_layers.sinkhorn_backward(plan, incoming)
     assert float((gradient * direction).sum()) == pytest.approx(slope, rel=1e-6)
 
 
-def test_the_papers_pose_and_its_gradient_are_those_of_the_layer(
-    bench: SimpleNamespace, problem: SimpleNamespace
-) -> None:
+def test_the_papers_pose_and_its_gradient_are_those_of_the_layer(problem: SimpleNamespace) -> None:
     """Both by other means: L-BFGS and Lemma 1 with the Hessian from automatic differentiation."""
     points3d, rays = problem.batch.points3d, problem.rays
     plan = problem.plan.clone().requires_grad_()
     rotation, translation, stats = weighted_pnp(plan, rays, points3d, *problem.pose, tolerance=1e-11)
     assert stats.converged.all()
-    pose = bench.paper_layers.pnp_forward(problem.plan, rays, points3d, problem.start)
+    pose = paper_layers.pnp_forward(problem.plan, rays, points3d, problem.start)
     assert rotation_angle(rotation, roma.rotvec_to_rotmat(pose[:, :3])).max() < 1e-5
     assert (translation - pose[:, 3:]).abs().max() < 1e-5
 
@@ -85,24 +87,22 @@ def test_the_papers_pose_and_its_gradient_are_those_of_the_layer(
     optimum = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1).detach().requires_grad_()
     through = (roma.rotvec_to_rotmat(optimum[:, :3]) * by_rotation).sum() + (optimum[:, 3:] * by_translation).sum()
     (incoming,) = torch.autograd.grad(through, optimum)
-    papers = bench.paper_layers.pnp_backward(optimum, problem.plan, rays, points3d, incoming)
+    papers = paper_layers.pnp_backward(optimum, problem.plan, rays, points3d, incoming)
     assert float((ours - papers).norm() / papers.norm()) < 1e-7
 
 
-def test_paper_ransac_finds_the_pose(bench: SimpleNamespace) -> None:
-    problem = bench.problems.planted(2, 200, kind="smooth", level=10.0)
+def test_paper_ransac_finds_the_pose() -> None:
+    problem = problems.planted(2, 200, kind="smooth", level=10.0)
     plan = sinkhorn(problem.cost)[0]
-    rotation, translation = bench.paper_layers.ransac(plan, problem.batch.points2d, problem.batch.points3d)
+    rotation, translation = paper_layers.ransac(plan, problem.batch.points2d, problem.batch.points3d)
     assert torch.rad2deg(rotation_angle(rotation, problem.batch.rotation)).max() < 2
     assert (translation - problem.batch.translation).norm(dim=-1).max() < 0.1
 
 
-def test_layers_command_writes_what_it_measured(
-    bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_layers_command_writes_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "new" / "result.json"
     monkeypatch.setattr("sys.argv", f"layers --points 40 --rounds 1 --batch 2 --output {out}".split())
-    bench.bench_layers.main()
+    bench_layers.main()
     record = json.loads(out.read_text())
     assert record["points"] == 40
     assert record["machine"]["threads"] == 1
@@ -111,30 +111,28 @@ def test_layers_command_writes_what_it_measured(
     }  # fmt: skip
 
 
-def test_constellation_command_writes_what_it_measured(
-    bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_constellation_command_writes_what_it_measured(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out = tmp_path / "constellation.json"
     monkeypatch.setattr("sys.argv", ["constellation", "--only", "headset, 3", "--limit", "2", "--output", str(out)])
-    bench.bench_constellation.main()
+    bench_constellation.main()
     rows = json.loads(out.read_text())["rows"]
     assert rows.keys() == {f"headset, 3 lights{more}" for more in ("", ", fisheye", ", 1 px")}
     assert rows["headset, 3 lights"]["right"] == 1
     assert all(row["confident_and_wrong"] == 0 for row in rows.values())
 
 
-def test_shapes_are_seen_where_the_pose_puts_them(bench: SimpleNamespace) -> None:
+def test_shapes_are_seen_where_the_pose_puts_them() -> None:
     """Without outliers each image point lies within noise of a projected scene point."""
-    for _, points2d, points3d, rotation, translation in bench.bench_search.shapes(0.0, 3, 9):
+    for _, points2d, points3d, rotation, translation in bench_search.shapes(0.0, 3, 9):
         camera = points3d @ rotation.T + translation
         seen = camera[:, :2] / camera[:, 2:]
         nearest = np.linalg.norm(points2d[:, None] - seen, axis=-1).min(1)
-        assert nearest.max() < 6 * bench.bench_search.NOISE
-    (_, points2d, points3d, *_), *_ = bench.bench_search.shapes(0.5, 1, 9)
+        assert nearest.max() < 6 * bench_search.NOISE
+    (_, points2d, points3d, *_), *_ = bench_search.shapes(0.5, 1, 9)
     assert len(points2d) == len(points3d) == 600
 
 
-def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(bench: SimpleNamespace) -> None:
+def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says() -> None:
     """Errors drawn with the covariance that is claimed: once in a thousand for the rotation, once for the pose."""
     rng, root = np.random.default_rng(0), np.diag([0.01, 0.02, 0.01, 5.0, 3.0, 40.0])
     root[3:, :3] = 30 * rng.standard_normal((3, 3))
@@ -143,33 +141,33 @@ def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(bench: SimpleName
     beyond = []
     for error in rng.standard_normal((4000, 6)) @ root.T:
         true = (Rotation.from_rotvec(error[:3]) * turn).as_matrix()
-        beyond.append(bench.record.beyond_bound(found, true, shift + error[3:]))
+        beyond.append(record.beyond_bound(found, true, shift + error[3:]))
     assert 1 <= sum(beyond) <= 16
     found.covariance = (root @ root.T)[:3, :3]  # of directions at infinity
-    assert not bench.record.beyond_bound(found, found.rotation, shift)
+    assert not record.beyond_bound(found, found.rotation, shift)
     found.covariance = np.full((6, 6), np.nan)  # nothing is claimed
-    assert bench.record.beyond_bound(found, found.rotation, shift)
-    outcomes = [bench.record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
-    assert bench.record.summary(outcomes, 3.0)["confident_and_wrong"] == 1
+    assert record.beyond_bound(found, found.rotation, shift)
+    outcomes = [record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
+    assert record.summary(outcomes, 3.0)["confident_and_wrong"] == 1
 
 
-def test_reliability_goes_on_where_it_was(bench: SimpleNamespace, tmp_path: Path, monkeypatch, capsys) -> None:
+def test_reliability_goes_on_where_it_was(tmp_path: Path, monkeypatch, capsys) -> None:
     """One device of each setting; a second run solves none of them again, and finds the same."""
     out, told = tmp_path / "rows.jsonl", []
     for _ in range(2):
         words = f"reliability --families leds noise --limit 1 --time-limit 1 --output {out}"
         monkeypatch.setattr("sys.argv", words.split())
-        bench.reliability.main()
+        reliability.main()
         told.append((out.read_text(), capsys.readouterr().out))
     assert told[0] == told[1]
     rows = [json.loads(line) for line in told[0][0].splitlines()]
-    settings, noise = len(bench.bench_constellation.SETTINGS), [row for row in rows if row["family"] == "noise"]
-    assert (len(noise), len(rows)) == (len(bench.reliability.NOISE), len(noise) + settings)
+    settings, noise = len(bench_constellation.SETTINGS), [row for row in rows if row["family"] == "noise"]
+    assert (len(noise), len(rows)) == (len(reliability.NOISE), len(noise) + settings)
     assert all(row["wrong"] for row in noise)
     assert sum(row["verdict"] == "confident" and row["wrong"] for row in rows) == 0
     assert sum(not row["wrong"] for row in rows) > settings / 2
     monkeypatch.setattr("sys.argv", ["reliability", str(out), "--draw", str(tmp_path / "drawn.png")])
-    bench.reliability.main()
+    reliability.main()
     assert (tmp_path / "drawn.png").stat().st_size > 1000
 
 
@@ -208,14 +206,14 @@ FIGURES = {
         ({"seed": 8}, True),
     ],
 )
-def test_results_differ_beyond_the_tolerance(bench: SimpleNamespace, change: dict[str, object], differs: bool) -> None:
-    assert bool(bench.results.differences(FIGURES | change, FIGURES)) == differs
+def test_results_differ_beyond_the_tolerance(change: dict[str, object], differs: bool) -> None:
+    assert bool(results.differences(FIGURES | change, FIGURES)) == differs
 
 
-def test_tables_are_filled_and_checked(bench: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    here, guide, file = bench.results, tmp_path / "guide.md", tmp_path / "results.json"
-    rows = [here.Row("leds", "two rings", lambda *_: [bench.outcome] * 2, (2, 1), 3.0)]
-    bench.outcome = bench.record.Outcome("", 0.25, 0.0, "confident", 0.5)
+def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made, here, guide, file = SimpleNamespace(), results, tmp_path / "guide.md", tmp_path / "results.json"
+    rows = [here.Row("leds", "two rings", lambda *_: [made.outcome] * 2, (2, 1), 3.0)]
+    made.outcome = record.Outcome("", 0.25, 0.0, "confident", 0.5)
     monkeypatch.setattr(here, "ROWS", rows)
     monkeypatch.setattr(here, "DOCUMENTS", (guide,))
     monkeypatch.setattr(here, "warm_up", lambda: None)
@@ -231,22 +229,22 @@ def test_tables_are_filled_and_checked(bench: SimpleNamespace, tmp_path: Path, m
     assert text.startswith("before\n")
     assert text.endswith("after\n")
     assert "old" not in text
-    record = json.loads(file.read_text())
-    assert record["full"]["leds: two rings"]["seed"] == 9
-    assert record["commit"]
+    written = json.loads(file.read_text())
+    assert written["full"]["leds: two rings"]["seed"] == 9
+    assert written["commit"]
     run("--check")
     guide.write_text(text.replace("0.25 /", "0.24 /"))
     with pytest.raises(SystemExit, match=r"guide\.md: a table is not that of results\.json"):
         run("--check")
     guide.write_text(text)
-    bench.outcome = bench.record.Outcome("", 8.0, 0.0, "confident", 0.5)
+    made.outcome = record.Outcome("", 8.0, 0.0, "confident", 0.5)
     with pytest.raises(SystemExit, match="leds: two rings: 2 confident and wrong, not 0"):
         run("--check")
     with pytest.raises(SystemExit, match="leds: two rings: never measured"):
         run("--quick", "--check")
 
 
-def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:
+def test_models_of_the_same_views_are_aligned() -> None:
     """Another frame and unit, and views that only one of the models has."""
     rng, lens, seen = np.random.default_rng(0), camera_from(np.eye(3)), np.arange(4, dtype=np.int32)
     turn = Rotation.random(random_state=9).as_matrix()
@@ -258,31 +256,31 @@ def test_models_of_the_same_views_are_aligned(bench: SimpleNamespace) -> None:
         for v in views
     ]
     here, there = (SceneMap(np.zeros((4, 3)), np.arange(4), seen, tuple(v)) for v in (views[:5], moved[1:]))
-    found = bench.rebuilt_maps.aligned(here, there)
+    found = rebuilt_maps.aligned(here, there)
     rotation, centre = found.pose(views[0].rotation, views[0].translation)
     np.testing.assert_allclose(rotation, moved[0].rotation, atol=1e-12)
     np.testing.assert_allclose(centre, moved[0].centre, atol=1e-12)
 
 
-def test_descriptors_are_matched_to_points_seen_from_several_views(bench: SimpleNamespace) -> None:
+def test_descriptors_are_matched_to_points_seen_from_several_views() -> None:
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 64))
     seen = np.concatenate([points + 0.1 * rng.normal(size=points.shape) for _ in range(3)])
     photo = np.concatenate([points[:100] + 0.1 * rng.normal(size=(100, 64)), rng.normal(size=(500, 64))])
     theirs, own = ((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32) for rows in (seen, photo))
     ids = np.tile(np.arange(300) + 7, 3)
-    keypoints, matched = bench.descriptor_poses.descriptor_matches(own, theirs, ids)
+    keypoints, matched = descriptor_poses.descriptor_matches(own, theirs, ids)
     true = keypoints < 100
     assert true.sum() == 100
     np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
     assert (~true).sum() < 25
 
 
-def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNamespace, tmp_path: Path) -> None:
+def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) -> None:
     """A planted model without noise: also in its repeated place; changed copies keep what their views see in view."""
     plant_model(tmp_path / "planted", camera=("PINHOLE", [520.0, 500.0, 400.0, 300.0]), images=8, points=200, seen=150)
     model = read_reconstruction(tmp_path / "planted", name="planted")
-    scene, photos = bench.bench_city.city([model], {"planted": 2}, 0, 5, twice=0.2)
+    scene, photos = bench_city.city([model], {"planted": 2}, 0, 5, twice=0.2)
     assert len(photos) == 2
     assert len(scene.views) == 12
     for photo in photos:
@@ -293,7 +291,7 @@ def test_photos_of_a_city_are_seen_where_their_poses_put_them(bench: SimpleNames
             assert (off < 1e-6).mean() > 0.6
         first, second = (-rotation.T @ translation for rotation, translation in photo.poses)
         assert np.linalg.norm(first - second) > photo.distance
-    larger, _ = bench.bench_city.city([model], {"planted": 2}, 40, 5)
+    larger, _ = bench_city.city([model], {"planted": 2}, 40, 5)
     assert len(larger.views) == 40
     assert len({view.name for view in larger.views}) == 40
     for view in larger.views:
