@@ -1,25 +1,18 @@
 """The layers keep their digits whatever precision the user chose for products, and leave that choice as it was."""
 
-import traceback
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 from planted import plant
-from small_data import SMALL_MESHES, SMALL_NET
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 
-import bpnp
-from bpnp.cli import main
 from bpnp.layers import sinkhorn, weighted_pnp
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.precision import HALF, full_precision
+from bpnp.precision import full_precision
 
-PACKAGE = str(Path(bpnp.__file__).parent)
 PRODUCTS = {torch.ops.aten.mm, torch.ops.aten.bmm, torch.ops.aten.addmm, torch.ops.aten.baddbmm}
 
 
@@ -83,34 +76,6 @@ def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatc
     for value, exact in zip(found, expected, strict=True):
         assert (value - exact).abs().max() < 1e-6 * exact.abs().max()
     assert torch.get_float32_matmul_precision() == "high"
-
-
-class Halves(TorchDispatchMode):
-    """Notes the files of this package in which an operation has a result in half precision."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.files: set[str] = set()
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        result = function(*args, **(kwargs or {}))
-        if any(isinstance(x, Tensor) and x.dtype in HALF for x in tree_leaves(result)):
-            frames = [frame.filename for frame in traceback.extract_stack() if frame.filename.startswith(PACKAGE)]
-            self.files.add(frames[-1].removeprefix(PACKAGE))
-        return result
-
-
-@pytest.mark.parametrize("net", ["BPnPNet", "Matcher"])
-def test_mixed_precision_from_the_command_line_is_that_of_the_nets_alone(net: str, tmp_path: Path) -> None:
-    options = SMALL_NET if net == "BPnPNet" else ["--model.solver=Matcher", "--model.solver.channels=16"]
-    run = [f"--trainer.default_root_dir={tmp_path}", "--trainer.precision=bf16-mixed", "--trainer.max_epochs=1"]
-    data = ["--data=MeshDataModule", *SMALL_MESHES, f"--data.cache_dir={tmp_path}"]
-    with Halves() as halves:
-        main(["fit", *data, *options, "--model.pose_weight=1", *run, "--trainer.limit_train_batches=2"])
-    # Operations of a backward pass that are not ours are met below the command itself.
-    others = {file for file in halves.files if not file.startswith("/models/nets/")}
-    assert "/models/nets/normalisation.py" in halves.files
-    assert others <= {"/commands/training.py", "/models/matcher.py"}
 
 
 def test_half_precision_arguments_are_widened_and_autocast_is_off() -> None:
