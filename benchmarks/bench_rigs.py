@@ -3,7 +3,7 @@
     python -m benchmarks rigs --limit 60 --seed 54
 
 Each camera sees 4 to 6 of the LEDs, without normals, and a light that is not the headset's. one camera: the first of a
-rig alone. Right is a rotation within 3 degrees.
+rig alone. scale unknown: of 0.2 to 5, which is found. Right is a rotation within 3 degrees.
 """
 
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ def pose_matrix(rotation: Array, translation: Array) -> Array:
     return np.block([[rotation, np.reshape(translation, (3, 1))], [np.zeros((1, 3)), 1.0]])
 
 
-def problems(cameras: int, used: int, limit: int, seed: int) -> Iterator[Problem]:
+def problems(cameras: int, used: int, limit: int, seed: int, is_metric: bool = True) -> Iterator[Problem]:
     """A new device every fifth frame; so many cameras in random places that look at it, of which the first are used.
 
     The pose is rig_from_world, that of the first camera.
@@ -48,12 +48,15 @@ def problems(cameras: int, used: int, limit: int, seed: int) -> Iterator[Problem
         if min(map(len, pixels)) <= LEAST:
             continue
         known: dict[str, Any] = {"seed": seed, "time_limit": TIME_LIMIT}
+        scale = np.nan if is_metric else 0.2 * 25 ** rng.random()
         if used > 1:
             known["rig"] = [one @ np.linalg.inv(poses[0]) for one in poses[:used]]
-            search = partial(bpnp.solve, pixels[:used], shown.points3d, [PINHOLE.model] * used, **known)
+            points3d = shown.points3d if is_metric else shown.points3d / scale
+            models = [PINHOLE.model] * used
+            search = partial(bpnp.solve, pixels[:used], points3d, models, scale=not is_metric, **known)
         else:
             search = partial(bpnp.solve, pixels[0], shown.points3d, PINHOLE.model, **known)
-        yield Problem(f"{number}", search, [(poses[0][:3, :3], poses[0][:3, 3])], shown.points3d)
+        yield Problem(f"{number}", search, [(poses[0][:3, :3], poses[0][:3, 3])], shown.points3d, scale=scale)
         number += 1
 
 
@@ -61,8 +64,14 @@ def main() -> None:
     chosen = parser(__doc__).parse_args()
     bpnp.warm_up()
     rows = [
-        (f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed))
-        for name, cameras, used in (("2 cameras", 2, 2), ("4 cameras", 4, 4), ("one camera", 2, 1))
+        (f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, is_metric))
+        for name, cameras, used, is_metric in (
+            ("2 cameras", 2, 2, True),
+            ("4 cameras", 4, 4, True),
+            ("one camera", 2, 1, True),
+            ("2 cameras, scale unknown", 2, 2, False),
+            ("4 cameras, scale unknown", 4, 4, False),
+        )
     ]
     measured(rows, chosen, RIGHT_DEG)
 

@@ -48,7 +48,7 @@ class Problem:
     """Something to solve, and the poses of which any is right: none where points have no pose in common.
 
     points3d: of the scene, whose middle tells how far a pose is off. distance: unit of the error of the camera's
-    centre. focal: the true focal length in pixels, where it is to be found too.
+    centre. focal: the true focal length in pixels, scale: that of a rig's scene, where it is to be found too.
     """
 
     name: str
@@ -57,6 +57,7 @@ class Problem:
     points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))
     distance: float = 1.0
     focal: float = np.nan
+    scale: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -64,7 +65,8 @@ class Outcome:
     """Of one problem: error of the rotation, and of the camera's centre in units of the problem's distance.
 
     verdict: "" of a method that has none. outside: whether the true pose lies beyond the bound that the solution claims
-    (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where it was known.
+    (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where it was known. scale_sigmas: how
+    far the scale is off in its own standard deviations; None where it was known.
     """
 
     problem: str
@@ -74,6 +76,7 @@ class Outcome:
     cpu_seconds: float
     outside: bool = True
     focal: float = np.nan
+    scale_sigmas: float | None = None
 
 
 Rows = Iterable[tuple[str, Callable[[], Iterable[Problem | Outcome]]]]  # the name of each, and what draws its problems
@@ -92,7 +95,8 @@ def solved(problem: Problem) -> Outcome:
     shift = np.linalg.norm(found.rotation.T @ found.translation - rotation.T @ translation) / problem.distance
     outside = beyond_bound(found, rotation, translation)
     turn, ratio = degrees(found.rotation, rotation), float(found.focal_length / problem.focal)
-    return Outcome(problem.name, turn, float(shift), found.verdict, seconds, outside, ratio)
+    sigmas = abs(found.scale - problem.scale) / found.scale_std if np.isfinite(problem.scale) else None
+    return Outcome(problem.name, turn, float(shift), found.verdict, seconds, outside, ratio, sigmas)
 
 
 def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
@@ -128,7 +132,11 @@ def summary(found: Sequence[Outcome], right_deg: float, right_shift: float = np.
     right = (turn < right_deg) & ((shift < right_shift) | np.isinf(right_shift))
     sure = np.array([o.verdict == "confident" for o in found])
     focal = np.array([o.focal for o in found])
-    near = {"focal_near": round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)} if np.isfinite(focal).any() else {}
+    near: dict[str, Any] = (
+        {"focal_near": round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)} if np.isfinite(focal).any() else {}
+    )
+    if sigmas := [o.scale_sigmas for o in found if o.scale_sigmas is not None]:
+        near["scale_sigmas"] = [round(float((np.array(sigmas) < limit).mean()), 4) for limit in (1, 2, 3)]
     return near | {
         "problems": len(found),
         "rotation_q_deg": [round(float(q), 4) for q in np.percentile(turn, (25, 50, 75))],
@@ -149,6 +157,7 @@ def line(row: dict[str, Any]) -> str:
         f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s, "
         f"median {row['median_cpu_seconds']:.3g}"
         + (f", focal length within {NEAR_FOCAL:.0%}: {row['focal_near']:.0%}" if "focal_near" in row else "")
+        + (f", scale within 1, 2, 3 sigmas: {row['scale_sigmas']}" if "scale_sigmas" in row else "")
     )
 
 

@@ -127,7 +127,8 @@ def judged(
         return SearchResult(candidates, "failed", f"no pose fits better than chance: {chance}", batches, settled)
     unseen = -math.inf if exhaustive else missed(candidates, sets, looks, rule)
     # What costs more is asked only where the verdict depends on it.
-    against = [other_pose(candidates, sets, rule), rougher(candidates)]
+    seen = rig or [(candidates, sets)]
+    against = [*(other_pose(*each, rule) for each in seen), rougher(candidates)]
     certain = alarms <= rule.false_alarms and unseen <= rule.missed
     known = ""
     if certain and all(one is None or one.decades >= rule.lead for one in against):
@@ -143,7 +144,7 @@ def judged(
             )
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         known = f"; its rotation is known to {off:.1g} deg, but for one case in a thousand"
-        against += [misfit(linear, count, rule), contesting(rig or [(candidates, sets)], rule)]
+        against += [misfit(linear, count, rule), contesting(seen, rule)]
     doubts = [one for one in against if one is not None and one.decades < rule.lead]
     if certain and not doubts:
         return SearchResult(candidates, "confident", f"{chance}, and no alternative comes near{known}", batches, True)

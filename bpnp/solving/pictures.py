@@ -45,7 +45,7 @@ def solution_points(solution: "Solution", *, title: str | None = None) -> Proble
     lines = [*([] if title is None else [title]), f"{solution.verdict}: {shown}", textwrap.fill(solution.reason, LINE)]
     return ProblemPoints(
         0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
-        estimates={"solution": (solution.rotation, solution.translation)}, camera=solution.camera,
+        estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,
     )  # fmt: skip
 
 
@@ -94,10 +94,11 @@ def write_colmap(
     number = {int(i): k for k, i in enumerate(projected)}  # of the 2D points that the image has
     seen = [pycolmap.Point2D(pixel) for pixel in pixels[projected]]
     image = pycolmap.Image(name=name, image_id=1, camera_id=1, points2D=seen)
-    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(solution.rotation), solution.translation)
+    translation = solution.translation / solution.scale  # a camera does not see the unit
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(solution.rotation), translation)
     model.add_image_with_trivial_frame(image, pose)
     partner = {j: i for i, j in solution.match_places.tolist() if i in number}
-    reprojected = lens.project(solution.points3d @ solution.rotation.T + solution.translation)
+    reprojected = lens.project(solution.points3d @ solution.rotation.T + translation)
     for j, point in enumerate(solution.points3d):
         track = pycolmap.Track([pycolmap.TrackElement(1, number[partner[j]])] if j in partner else [])
         added = model.add_point3D(point, track, np.full(3, 128, np.uint8))

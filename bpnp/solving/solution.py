@@ -32,7 +32,7 @@ class Candidate:
     """A distinct pose that was found, camera = R p + t.
 
     score: mean log-likelihood of the bearings, nats; larger is better. inlier_count: one-to-one inliers (paper Eq. 1).
-    log10_false_alarms: how likely unrelated points fit as well, see `Solution`; smaller is better.
+    log10_false_alarms: how likely unrelated points fit as well, see `Solution`; smaller is better. scale: see there.
     """
 
     rotation: Array
@@ -40,11 +40,12 @@ class Candidate:
     score: float
     inlier_count: int
     log10_false_alarms: float
+    scale: float = 1.0
 
     @property
     def centre(self) -> Array:
-        """Centre of the camera in the scene, -R^T t."""
-        return -self.rotation.T @ self.translation
+        """Centre of the camera in the scene, -R^T t / scale."""
+        return -self.rotation.T @ self.translation / self.scale
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,9 @@ class Solution:
 
         with the gradients g_i of each image point's log-likelihood, its partner unknown (Louis 1982, White 1982;
         docs/verdict.md). NaN if the verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at
-        infinity; (7, 7) where the focal length was not known: the last row and column are its error, pixels.
+        infinity; (7, 7) where the focal length was not known: the last row and column are its error, pixels; or where
+        the scale of a rig's scene was not, for that.
+    scale: 1, or what was found with `scale=True`: rig = scale R p + t, with t in the unit of the rig.
     candidates: the distinct poses that were found, best first; the first is this one.
     verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits
         better than chance, and this one, if there is one, is a guess. reason: why, in words.
@@ -99,6 +102,7 @@ class Solution:
     reprojection_error_deg: float = math.nan
     unit: Unit
     covariance: Array = field(default_factory=lambda: np.full((6, 6), math.nan), repr=False)
+    scale: float = 1.0
     candidates: tuple[Candidate, ...] = ()
     verdict: Verdict
     reason: str
@@ -122,8 +126,8 @@ class Solution:
 
     @property
     def centre(self) -> Array:
-        """Centre of the camera in the scene, -R^T t."""
-        return -self.rotation.T @ self.translation
+        """Centre of the camera in the scene, -R^T t / scale."""
+        return -self.rotation.T @ self.translation / self.scale
 
     @property
     def rotation_std_deg(self) -> float:
@@ -135,7 +139,8 @@ class Solution:
         """Standard deviation of `centre` along its least certain axis, scene units; NaN for points at infinity."""
         if len(self.covariance) in (ROTATION, ROTATION + 1):
             return math.nan
-        return _largest(centre_covariance(self.covariance, self.translation))
+        scale = self.scale if self._has_scale else None
+        return _largest(centre_covariance(self.covariance, self.translation, scale))
 
     @property
     def focal_length(self) -> float:
@@ -145,7 +150,17 @@ class Solution:
     @property
     def focal_length_std(self) -> float:
         """Standard deviation of a focal length that was found, pixels; 0 for one that was given."""
-        return math.sqrt(self.covariance[-1, -1]) if len(self.covariance) in (ROTATION + 1, 7) else 0.0
+        has_focal = len(self.covariance) in (ROTATION + 1, 7) and not self._has_scale
+        return math.sqrt(self.covariance[-1, -1]) if has_focal else 0.0
+
+    @property
+    def scale_std(self) -> float:
+        """Standard deviation of a scale that was found; 0 for one that was not asked for."""
+        return math.sqrt(self.covariance[-1, -1]) if self._has_scale else 0.0
+
+    @property
+    def _has_scale(self) -> bool:
+        return len(self.covariance) == 7 and self.camera is None
 
     @property
     def found(self) -> bool:
@@ -205,6 +220,7 @@ class Solution:
         content = {"format": FORMAT} | vars(self) | pose
         content |= {"rotation_std_deg": self.rotation_std_deg, "centre_std": self.centre_std}
         content |= {"focal_length": self.focal_length, "focal_length_std": self.focal_length_std}
+        content |= {"scale_std": self.scale_std}
         content |= {"candidates": [vars(candidate) for candidate in self.candidates], "stats": vars(self.stats)}
         return json.dumps(_plain(content), allow_nan=False)
 
@@ -241,6 +257,7 @@ def with_pose(
         solution,
         rotation=candidates[0].rotation,
         translation=candidates[0].translation,
+        scale=candidates[0].scale,
         matches=matches,
         inlier_count=len(matches),
         inlier_ratio=len(matches) / most,
@@ -290,7 +307,7 @@ def _float(value: float | None, *, missing: float = math.nan) -> float:
     return missing if value is None else value
 
 
-LATER = {"covariance", "taken2d"}  # than version 0.1.0
+LATER = {"covariance", "scale", "taken2d"}  # than version 0.1.0
 READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in another form
     "rotation": partial(_array, shape=(3, 3)),
     "translation": partial(_array, shape=(3,)),
@@ -301,7 +318,7 @@ READERS: dict[str, Callable[[Any], Any]] = {  # of the fields that JSON holds in
     "camera": lambda value: None if value is None else camera_from(value),
     "point_ids": lambda values: None if values is None else np.array(values, np.int64),
     "log10_false_alarms": partial(_float, missing=math.inf),
-    **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual"), _float),
+    **dict.fromkeys(("inlier_threshold", "reprojection_error", "reprojection_error_deg", "residual", "scale"), _float),
     "candidates": lambda values: tuple(_read(Candidate, value) for value in values),
     "stats": lambda value: _read(SolutionStats, value),
 }

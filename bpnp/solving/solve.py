@@ -55,6 +55,7 @@ def solve(
     clutter: float | int | None = None,
     at_infinity: bool = False,
     rig: Sequence[Any] | None = None,
+    scale: bool = False,
     seed: int = 0,
     time_limit: float | int | None = None,
     device: str | torch.device | None = None,
@@ -96,6 +97,8 @@ def solve(
     rig: cam_from_rig, (3, 4), (4, 4) or (R, t), of each of several cameras that are fixed to each other. `points2d` and
         `labels2d` are then lists with one array each, `camera` too or one for all; the pose is rig_from_world, in the
         unit of the rig and of the scene, and `matches` count the 2D points of one camera after those of the other.
+    scale: whether the scene has a unit of its own, such as a COLMAP model's, while the rig's is known: `Solution.scale`
+        of it is found with the pose, rig = scale R p + t, t in the unit of the rig. Its cameras have to be apart.
     time_limit: seconds for all of it, 10 by default, math.inf for no limit. At the limit each stage of the search ends
         with the poses that it has, and the best of them is returned.
     device: where a module computes, on a copy; by default where it is. The search always runs on the CPU.
@@ -129,6 +132,8 @@ def solve(
         "prior": prior,
         "device": device,
     }
+    if scale and rig is None:
+        raise ValueError("expected a `rig` with `scale=True`, got none: one camera does not see the unit of a scene")
     if at_infinity:
         beside |= {"distortion": distortion or None, "scores3d": scores3d, "clutter": clutter, "rig": rig}
         _refuse(normals_and_labels | beside, "at_infinity")
@@ -138,7 +143,7 @@ def solve(
     if rig is not None:
         lens = {"image_size": image_size, "focal_error": focal_error, "distortion": distortion or None}
         _refuse(scores | beside | lens, "rig")
-        return solve_rig(points2d, points3d, camera, rig, normals_and_labels, options)
+        return solve_rig(points2d, points3d, camera, rig, normals_and_labels, options, scale=scale)
     arrays: dict[str, Any] = {name: [values] for name, values in (normals_and_labels | scores).items()}
     return solve_many(
         [points2d],

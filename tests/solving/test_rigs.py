@@ -80,3 +80,38 @@ def test_a_rig_is_judged_at_the_scale_of_its_residuals() -> None:
         assert solution.verdict == "confident"
         assert solution.log10_false_alarms < -80
         assert degrees_between(solution.rotation, pose[0]) < 0.5
+
+
+@pytest.mark.parametrize("scale", [0.2, 5.0])
+def test_cameras_that_are_apart_tell_the_scale_of_the_scene(scale: float) -> None:
+    errors = []
+    for seed in range(4):
+        images, scene, mounts, pose, _ = planted_rig(seed, (5, 6, 5))
+        origin = np.array([300.0, 0, 0]) / scale  # far away, so that it matters about what the pose is known
+        solution = bpnp.solve(images, scene / scale + origin, [CAMERA] * 3, rig=mounts, scale=True, time_limit=60)
+        translation = pose[1] - scale * pose[0] @ origin
+        assert solution.verdict == "confident"
+        turn = Rotation.from_matrix(pose[0] @ solution.rotation.T).as_rotvec()
+        step = np.r_[turn, translation - solution.translation, scale - solution.scale]
+        unit = np.diag(solution.covariance) ** -0.5
+        errors.append(step * unit @ np.linalg.pinv(solution.covariance * np.outer(unit, unit)) @ (step * unit))
+        assert abs(solution.scale - scale) < 4 * solution.scale_std < 0.1 * scale
+        assert solution.scale_std == pytest.approx(np.sqrt(solution.covariance[6, 6]))
+        assert (solution.focal_length_std, solution.candidates[0].scale) == (0, solution.scale)
+        centre = -pose[0].T @ translation / scale
+        assert np.linalg.norm(solution.centre - centre) < 4 * solution.centre_std < 0.4 / scale
+        again = bpnp.Solution.from_json(solution.to_json())
+        assert (again.scale, again.scale_std) == (solution.scale, solution.scale_std)
+    assert 1 < np.mean(errors) < 20  # seven
+
+
+def test_a_scale_that_two_near_cameras_do_not_tell_is_not_claimed() -> None:
+    images, scene, mounts, _, _ = planted_rig(1, (60, 60), points=120)
+    turns = [turn for turn, _ in mounts]
+    near = [(turns[0], np.zeros(3)), (turns[1], turns[1] @ [1e-4, 0, 0])]
+    points = scene @ Rotation.random(rng=np.random.default_rng(1)).as_matrix().T + [0, 0, 3]
+    rays = [points @ turn.T for turn in turns]
+    images = [500 * ray[:60, :2] / ray[:60, 2:] + [320, 240] for ray in rays]
+    solution = bpnp.solve(images, scene, [CAMERA] * 2, rig=near, scale=True, time_limit=60)
+    assert solution.verdict == "ambiguous"
+    assert "scale" in solution.reason

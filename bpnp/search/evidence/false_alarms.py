@@ -199,7 +199,8 @@ def _log_evidence(sets: PointSets, seen: Array, finest: int, left_out: int | Non
     points seen in directions (n, 3); -inf at the scales before the finest one, which are not looked at."""
     image, terms = sets.image, _terms(sets, seen, finest)
     count = _fixing(sets) if left_out is None else left_out
-    fixing = np.partition(terms * image.together[:, finest:, None], len(terms) - _fixing(sets), 0)[len(terms) - count :]
+    largest = len(terms) - max(count, 1)
+    fixing = np.partition(terms * image.together[:, finest:, None], largest, 0)[len(terms) - count :]
     evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
     total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
     return np.r_[np.full(finest, -math.inf), total]

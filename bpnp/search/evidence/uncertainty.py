@@ -55,7 +55,13 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
 def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
     """Share by which the focal length may be wrong, exceeded once in a thousand; see `_bound`."""
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else math.expm1(_bound(covariance[POSE:, POSE:], 2 * count - sets.fitted))
+    return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - sets.fitted)
+
+
+def share_bound(covariance: Array, free: float) -> float:
+    """Share by which a number may be wrong of whose logarithm this is the variance (1, 1), exceeded once in a
+    thousand."""
+    return math.expm1(_bound(covariance, free))
 
 
 def _bound(covariance: Array, free: float) -> float:
@@ -88,14 +94,18 @@ def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, 
     return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
 
 
-def centre_covariance(covariance: Array, translation: Array) -> Array:
+def centre_covariance(covariance: Array, translation: Array, scale: float | None = None) -> Array:
     """Covariance (3, 3), in the camera's axes, of the centre of the camera, -R' (v + t x w) for a pose's (w, v); what
     else is in `covariance` is left aside.
 
-    translation: of the point about which the pose turns: t for the scene's origin.
+    translation: of the point about which the pose turns: t for the scene's origin. scale: where the centre is -R^T t /
+    scale, of which `covariance` has the error too.
     """
     moved = np.concatenate([_crossed(translation), np.eye(3)], 1)
-    return np.asarray(moved @ covariance[:POSE, :POSE] @ moved.T)
+    if scale is not None:
+        moved = np.column_stack([moved, -translation / scale]) / scale
+    known = covariance[: moved.shape[1], : moved.shape[1]]
+    return np.asarray(moved @ known @ moved.T)
 
 
 def local_covariance(linear: "Linearised | None") -> Array | None:
