@@ -43,7 +43,8 @@ Pose = tuple[Array, Array]
 PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all cameras that are refined
 WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
 STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the last of them that are weighed
-AGREE_DEG, AGREE, PAIRS = 6.0, 0.1, 50_000  # of poses of two cameras that tell a scale: turn, shift in distances, most
+AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # of poses of two cameras that tell a scale: turn, shift in distances, most
+LEAST_APART = 0.01  # of two cameras, in distances of the scene: a scale with which they are nearer cannot be told
 SAME_CENTRE = 1e-6  # of the farthest centre from the origin of the rig
 
 
@@ -228,11 +229,9 @@ def search_rig(rig: Rig, options: Options) -> SearchResult:
         rule=rule,
         rig=[(rig.seen(k, found), sets) for k, sets in enumerate(rig.sets)],
     )
-    if result.verdict == "confident" and rig.unknowns == 7:
-        share = _scale_bound(rig, found)
-        if share > rule.focal:
-            reason = f"the scale of the scene cannot be told: it may be {100 * share:.0f} % off"
-            result = replace(result, verdict="ambiguous", reason=reason)
+    if result.verdict == "confident" and rig.unknowns == 7 and _scale_bound(rig, found) > rule.focal:
+        reason = f"the scale of the scene cannot be told: it may be more than {100 * rule.focal:.0f} % off"
+        result = replace(result, verdict="ambiguous", reason=reason)
     return replace(
         result, candidates=replace(result.candidates, rotation=found.rotation, translation=found.translation)
     )
@@ -265,14 +264,16 @@ def _told_by(
     traces = turns.astype(np.float32) @ others.T.astype(np.float32)
     near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
     i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[:PAIRS]], max(len(others), 1))
-    seen = np.concatenate([first[0][i] @ middle + first[1][i], second[0][j] @ middle + second[1][j]], -1)
-    cameras = np.block([[turn, shift[:, None]], [other, moved[:, None]]])
-    places = seen @ np.linalg.pinv(cameras).T
-    off = np.linalg.norm(places @ cameras.T - seen, axis=-1)
-    agree = (places[:, 3] > 0) & (off < AGREE * np.linalg.norm(seen, axis=-1))
-    rotation, translation = turn.T @ first[0][i[agree]], places[agree]
-    translation[:, :3] -= rotation @ middle
-    return rotation, translation, np.minimum(first[2][i], second[2][j])[agree]
+    rotation = turn.T @ first[0][i]
+    seen = (first[0][i] @ middle + first[1][i]) @ turn  # from the first camera, in the axes of the rig
+    way, apart = seen - (second[0][j] @ middle + second[1][j]) @ other, shift @ turn - moved @ other
+    distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
+    unit = np.maximum(way @ apart / length, LEAST_APART * distance)[:, None] / length
+    translation = np.concatenate(
+        [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ middle, unit], -1
+    )
+    agree = np.linalg.norm(way - unit * apart, axis=-1) < AGREE * distance
+    return rotation[agree], translation[agree], np.minimum(first[2][i], second[2][j])[agree]
 
 
 def _screened(rig: Rig, rotations: Array, translations: Array) -> Labels:

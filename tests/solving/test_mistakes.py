@@ -115,6 +115,8 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("rig", {"solver": "matcher-sfm"}, "expected no `solver` with `rig`"),
         ("rig", {"points2d": [np.zeros((3, 2)), np.zeros((5, 2))]}, "camera 0: .* points in `points2d`, got 3"),
         ("rig", {"labels2d": [np.zeros(6, int)]}, "expected 2 of `labels2d`"),
+        ("rig", {"scale": True}, "expected cameras that are apart in `rig` with `scale=True`, got one centre for all"),
+        ("rig", {"scale": True, "rig": None}, "expected a `rig` with `scale=True`, got none"),
         # Several problems.
         ("many", {"points2d": [X, X[:3]], "points3d": [P, P]}, "problem 1: .* points in `points2d`, got 3"),
         ("many", {"points2d": [X], "points3d": [P, P]}, "1 of `points3d`, one a problem, got 2"),

@@ -1,4 +1,4 @@
-"""Rigs: planted poses of two and three cameras, none of which sees enough alone; bad rigs are named."""
+"""Rigs: planted poses of two and three cameras, none of which sees enough alone."""
 
 from typing import Any
 
