@@ -18,6 +18,7 @@ from bpnp.datamodules.colmap.model_files import ColmapError
 from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
+from bpnp.maps import index
 from bpnp.maps.localize import (
     BRIEF,
     LIKELY,
@@ -76,9 +77,15 @@ class SceneMap:
         """The map in a folder of cameras, images and points3D, all .bin or all .txt.
 
         Not used, and logged as a warning: images with a broken pose, and points that are not finite. A view without
-        points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB.
+        points stays in the map. Keypoints are not kept: 10^6 points and 10^4 views of 1,000 points take 80 MB. The
+        first time that a large map is opened, an index is written beside the model (`bpnp.maps.index`).
         Raises ColmapError, a ValueError, for a model that cannot be read or has no view that sees a point.
         """
+        known = index.read_index(Path(path))
+        if known is not None:
+            scene = cls(*known[:4])
+            vars(scene).update(pictures=known.pictures, cones=known.cones)
+            return scene
         model = read_reconstruction(path, keypoints=False)
         views = tuple(
             View(image.name, image.camera, image.rotation, image.translation, image.observed.astype(np.int32))
@@ -89,7 +96,11 @@ class SceneMap:
                 f"expected a map with views that see points in {path}, got {len(views)} views and "
                 f"{len(model.point_ids)} points; try a model with registered images"
             )
-        return cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
+        scene = cls(model.points3d, model.point_ids, np.zeros(len(model.point_ids), np.int32), views).seen_by(1)
+        if len(scene.points3d) >= index.LARGE:
+            parts = scene.points3d, scene.point_ids, scene.track_lengths, scene.views
+            index.write_index(Path(path), index.Index(*parts, scene.pictures, scene.cones))
+        return scene
 
     def __repr__(self) -> str:
         return f"SceneMap({len(self.views):,} views, {len(self.points3d):,} points)"

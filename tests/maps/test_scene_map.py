@@ -8,6 +8,7 @@ import pytest
 from planted_model import OPENCV, Planted, plant_model
 
 from bpnp import SceneMap
+from bpnp.maps import index, scene_map
 from bpnp.maps.many_photos import read_views
 
 
@@ -35,6 +36,35 @@ def test_the_planted_map_comes_back(tmp_path: Path, text: bool) -> None:
         pixels = view.camera.project(truth.points3d[points] @ rotation.T + translation)
         assert np.isfinite(pixels).all()
         assert view.camera.focal == pytest.approx(np.mean(OPENCV[1][:2]))
+
+
+def test_a_large_map_is_indexed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth = plant_model(tmp_path, images=4, points=60, seen=25)
+    SceneMap.from_colmap(tmp_path)
+    assert not (tmp_path / index.FILE).exists()
+    monkeypatch.setattr(index, "LARGE", 10)
+    first = SceneMap.from_colmap(tmp_path)
+    with monkeypatch.context() as without_model:
+        without_model.setattr(scene_map, "read_reconstruction", None)
+        again = SceneMap.from_colmap(tmp_path)
+    for name in ("points3d", "point_ids", "track_lengths"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(first, name))
+    for one, other in ((again.pictures, first.pictures), (again.cones, first.cones)):
+        for x, y in zip(one, other, strict=True):
+            np.testing.assert_array_equal(x, y)
+    for k, (view, as_read) in enumerate(zip(again.views, first.views, strict=True)):
+        np.testing.assert_array_equal(view.points, as_read.points)
+        np.testing.assert_allclose(view.rotation, truth.rotations[k], atol=1e-12)
+        np.testing.assert_allclose(view.translation, truth.translations[k])
+        assert (view.name, view.camera.focal) == (as_read.name, as_read.camera.focal)
+    plant_model(tmp_path, images=3, points=50, seen=20)  # another model in its place
+    assert len(SceneMap.from_colmap(tmp_path).views) == 3
+    (tmp_path / index.FILE).write_bytes((tmp_path / index.FILE).read_bytes()[:500])
+    assert len(SceneMap.from_colmap(tmp_path).views) == 3
+    (tmp_path / index.FILE).unlink()
+    (tmp_path / index.FILE).mkdir()  # where nothing can be written
+    (tmp_path / index.FILE / "file").touch()
+    assert len(SceneMap.from_colmap(tmp_path).views) == 3
 
 
 def test_without_a_view_its_own_points_are_gone(planted: tuple[Path, Planted]) -> None:
