@@ -118,6 +118,17 @@ def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
     )
 
 
+def sigmas(found: Solution, rotation: Any, translation: Any) -> list[float]:
+    """The error of a pose along six independent directions, in the standard deviations that its covariance claims."""
+    covariance = found.covariance[:6, :6]
+    if not np.isfinite(covariance).all():
+        return []
+    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), translation - found.translation]
+    unit = 1 / np.sqrt(np.diag(covariance))
+    root = np.linalg.cholesky(covariance * np.outer(unit, unit) + 1e-9 * np.eye(len(covariance)))
+    return np.linalg.solve(root, error[: len(unit)] * unit).tolist()
+
+
 def degrees(one: Any, other: Any) -> float:
     """Angle between two rotations (3, 3), 180 where one is not there."""
     if not (np.isfinite(one).all() and np.isfinite(other).all()):

@@ -6,12 +6,15 @@
 Families: leds (the settings of `constellation`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
 the points of one view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard
 (`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong), noise (image and
-scene points drawn independently), shuffled (keypoints of one photo, points that another one sees). --limit: problems of
-each setting. Photos are of scenes on which no constant was chosen (`--scenes`).
+scene points drawn independently), shuffled (keypoints of one photo, points that another one sees), labels (LEDs of
+three colours that a classifier of Gaussian noise sees: without labels, with its likeliest class, and with its
+probabilities). --limit: problems of each setting. Photos are of scenes on which no constant was chosen (`--scenes`).
 
 Wrong: more than 3 degrees off, or the middle of the scene moved by more than a tenth of its distance, and beyond the
 bound that the solution claims (`record.beyond_bound`); with a wrong focal length: the camera's centre more than a
-twentieth of the distance off. A row is written as soon as it is known; those that the file has are not solved again.
+twentieth of the distance off. sigmas: shares of the errors of the right poses, six numbers each, within 1, 2 and 3 of
+their standard deviations, and the factors of these with which they would be 68, 95 and 99.7 %. A row is written as soon
+as it is known; those that the file has are not solved again.
 """
 
 import json
@@ -29,7 +32,8 @@ import numpy as np
 import pandas as pd
 from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, Drawn, wrong_focal_plane
 from matplotlib.figure import Figure
-from record import TIME_LIMIT, Array, Problem, beyond_bound, degrees, parser
+from record import TIME_LIMIT, Array, Problem, beyond_bound, degrees, parser, sigmas
+from scipy.special import softmax
 from scipy.stats import binomtest
 from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, ViewProblem, scene_problems
 
@@ -47,6 +51,8 @@ NOISE = ((6, 6), (8, 8), (10, 17), (30, 30), (20, 100), (100, 100), (400, 400))
 SHUFFLED = (15, 40, 120, 400)
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 WRONG_DEG, WRONG_SHIFT, WRONG_CENTRE = 3.0, 0.1, 0.05
+COLOURS, BLUR = 3, 0.8  # classes of LEDs, and the noise of what a classifier sees of them
+NORMAL = (0.6827, 0.9545, 0.9973)  # shares within 1, 2 and 3 standard deviations
 GROUPS = {"right, confident": "tab:green", "right": "tab:olive", "wrong": "0.8", "wrong, confident": "tab:red"}
 
 
@@ -88,6 +94,24 @@ def hard(options: Any) -> Iterator[Problem]:
         yield from with_lens(draw.__name__, (draw(rng) for _ in range(options.limit)), options)
 
 
+def labels(options: Any) -> Iterator[Problem]:
+    for kind in ("none", "likeliest", "probabilities"):
+        for k in range(options.limit):
+            rng = np.random.default_rng([options.seed, k])
+            shape = ("ring", "headset", "drone", "marker")[k % 4]
+            setting = bench_constellation.Setting("labels", shape, background=3, missing=0.1, least=5, normals=False)  # type: ignore[arg-type]
+            shown = bench_constellation.picture(setting, 1000 * options.seed + k, rng)
+            scene = rng.permutation(np.arange(len(shown.device.points3d)) % COLOURS)
+            image = np.where(shown.led >= 0, scene[shown.led], rng.integers(COLOURS, size=len(shown.led)))
+            score = (np.eye(COLOURS)[image] + BLUR * rng.standard_normal((len(image), COLOURS))) / BLUR**2
+            known: dict[str, Any] = {"likeliest": {"labels2d": score.argmax(1), "labels3d": scene}}.get(kind, {})
+            if kind == "probabilities":
+                known = {"labels2d": softmax(score, 1), "labels3d": np.eye(COLOURS)[scene]}
+            points = shown.pixels, shown.device.points3d, shown.camera.model
+            run = partial(solve, *points, **known, seed=options.seed, time_limit=options.time_limit)
+            yield Problem(f"{kind}/{k}", run, [(shown.rotation, shown.translation)], points[1])
+
+
 def noise(options: Any) -> Iterator[Problem]:
     for m, n in NOISE:
         rng = np.random.default_rng([options.seed, m, n])
@@ -112,7 +136,7 @@ def shuffled(options: Any) -> Iterator[Problem]:
 
 
 FAMILIES = {
-    family.__name__: family for family in (leds, shapes, photos, maps, hard, focal, noise, shuffled)
+    family.__name__: family for family in (leds, shapes, photos, maps, hard, focal, noise, shuffled, labels)
 }  # fmt: skip
 
 
@@ -179,6 +203,9 @@ def row_of(family: str, problem: Problem) -> dict[str, Any]:
         wrong, outside = not centre <= WRONG_CENTRE, True
     row |= {"deg": deg, "shift": shift, "centre": centre, "outside": outside, "wrong": wrong and outside}
     row |= {"verdict": found.verdict, "reason": found.reason, "alarms": found.log10_false_alarms}
+    row["sigmas"] = (
+        [] if is_far(deg, shift) else min((sigmas(found, *pose) for pose in problem.poses), key=np.linalg.norm)
+    )
     return row | {"claims": list({int(claim // 1): (claim, far) for claim, far in claims}.values())}
 
 
@@ -188,9 +215,17 @@ def summary(rows: pd.DataFrame) -> str:
     for (family, setting), part in rows.groupby(["family", rows.name.str.split("/").str[0]], sort=False):
         sure, wrong = part.verdict == "confident", part.wrong
         believed = (sure & ~wrong).sum() / max((~wrong).sum(), 1)
+        off = np.abs([one for each in part.get("sigmas", []) if isinstance(each, list) for one in each])
+        known = ""
+        if len(off):
+            shares = " / ".join(f"{(off <= limit).mean():.1%}" for limit in (1, 2, 3))
+            known = f"; sigmas {shares}, x " + " / ".join(
+                f"{np.quantile(off, share) / limit:.2f}" for limit, share in enumerate(NORMAL, 1)
+            )
         lines.append(
             f"{family:7} {setting:30} {len(part):5} problems, right {1 - wrong.mean():4.0%}, confident {sure.sum():5}, "
             f"of these wrong {(sure & wrong).sum()}; {believed:4.0%} of the right, median {part.cpu.median():.3g} CPU s"
+            f"{known}"
         )
     sure = rows.verdict == "confident"
     return "\n".join([*lines, f"confident {sure.sum()}, of these wrong {(sure & rows.wrong).sum()}"])
