@@ -19,6 +19,7 @@ from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps import index
+from bpnp.maps.all_points import on_all_points
 from bpnp.maps.localize import (
     BRIEF,
     LIKELY,
@@ -268,10 +269,13 @@ class SceneMap:
             region = self._region(place.view, place.points)
             solution = near(place.lens, options, region, prior)
             if solution.verdict == "confident":
-                if prior is None:  # which would tell twins apart
-                    every = self._region(place.view, np.arange(len(self.points3d))) if views is None else region
+                every = self._region(place.view, np.arange(len(self.points3d)))
+                if isinstance(lens, Camera):
+                    solution = counted(on_all_points(solution, every, used, seed, deadline), tries)
+                if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
                     regions = partial(self._regions, views, solution.camera)
-                    photo = Photo(used, solution.camera, every, regions, seed, deadline)
+                    among = every if views is None else region
+                    photo = Photo(used, solution.camera, among, regions, seed, deadline)
                     search = partial(near, solution.camera, options)
                     solution = without_twins(photo, solution, met, search)
                 best = [(place, solution)]

@@ -17,10 +17,11 @@ from numpy.typing import NDArray
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.alternatives import Seen, contesting, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, linearised, rotation_bound
 from bpnp.search.evidence.unseen import log10_missed
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import DEFAULT, Evidence
+from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 

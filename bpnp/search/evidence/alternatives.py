@@ -17,9 +17,9 @@ from bpnp.distinct_poses import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.image_statistics import label_groups
+from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import Linearised, Misfit, systematic_misfit
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Evidence
 
 Array = NDArray[np.float64]
 

@@ -24,10 +24,11 @@ from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.false_alarms import directions_of, likeliest_scale, log10_tests
 from bpnp.search.evidence.partners import facing, partners
 from bpnp.search.evidence.rivals import against_rivals
+from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.point_sets import SIGMAS, PointSets
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT, Evidence, SearchSettings
+from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.sources.multistart import multistart
 from bpnp.search.sources.raster import search_beside
 from bpnp.search.starts import PosePrior

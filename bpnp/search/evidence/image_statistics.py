@@ -5,8 +5,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.evidence.settings import ImagePoints
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.settings import ImagePoints
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -7,9 +7,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
+from bpnp.search.evidence.settings import Evidence, Repetitions
 from bpnp.search.kernels.neighbours import HashedPoints, hashed
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import Evidence, Repetitions
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]

@@ -14,10 +14,10 @@ from bpnp.search.evidence.alternatives import of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.partners import Zoomed, with_focal_length
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
+from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.scene import Scene
-from bpnp.search.settings import Evidence
 from bpnp.search.verdict import SearchResult, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]

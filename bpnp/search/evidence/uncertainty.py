@@ -10,8 +10,9 @@ from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.distinct_poses import turned_by
 from bpnp.search.evidence.partners import Zoomed, across, by_focal_length, facing, partners, with_focal_length
+from bpnp.search.evidence.settings import Evidence
 from bpnp.search.point_sets import PointSets
-from bpnp.search.settings import DEFAULT, Evidence
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]

@@ -22,7 +22,7 @@ Math. Programming 1987.
 
 import math
 
-from bpnp.search.settings import Evidence
+from bpnp.search.evidence.settings import Evidence
 
 
 def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) -> float:

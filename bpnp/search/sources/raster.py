@@ -34,12 +34,16 @@ WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 
 
 def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Candidates:
-    """Distinct poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
+    """Poses from starts drawn from a prior with a translation: the likeliest of them by a raster, annealed.
 
-    rule: None for that of the settings.
+    rule: None for those of the settings, one after the other.
     """
-    rule = rule or scene.settings.near
-    return raster_search(scene, drawn_around(scene, prior, starts_of(scene, prior, rule)), rule)
+    rules = scene.settings.near if rule is None else (rule,)
+    starts = [starts_of(scene, prior, one) for one in rules]
+    parts = [
+        raster_search(scene, drawn_around(scene, prior, count), one) for count, one in zip(starts, rules, strict=True)
+    ]
+    return Candidates.concatenated(parts)
 
 
 def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
@@ -91,7 +95,9 @@ def search_beside(scene: Scene, pose: Candidates, rule: RasterSearch) -> Candida
 
 def is_near(scene: Scene, prior: PosePrior) -> bool:
     """Whether a prior is narrow enough for starts around it to meet the basin of the right pose."""
-    return prior.translation is not None and _volume(scene, prior, scene.settings.near) <= scene.settings.most_volumes
+    return (
+        prior.translation is not None and _volume(scene, prior, scene.settings.near[0]) <= scene.settings.most_volumes
+    )
 
 
 def starts_of(scene: Scene, prior: PosePrior, rule: RasterSearch) -> int:

@@ -1,0 +1,48 @@
+"""The pose of a photo from all points of the map that its camera sees, not from those of one view alone."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from bpnp.loops.parallel import Deadline, one_blas_thread
+from bpnp.maps.localize import Region, problem_near
+from bpnp.maps.views import Array, Cones
+from bpnp.search.annealing import polished
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
+from bpnp.search.verdict import judged
+from bpnp.solving.matches import finished
+from bpnp.solving.solution import Solution
+
+
+@one_blas_thread
+def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int, deadline: Deadline) -> Solution:
+    """A confident solution fitted to all points of a region that its camera sees, and judged by them; the solution
+    itself where they explain the keypoints no better."""
+    whole = problem_near(every, keypoints, solution.camera, None)
+    rotation, shift = solution.rotation, solution.translation + solution.rotation @ whole.origin
+    image = whole.view(rotation, shift)
+    seen = ((image >= whole.image.min(0)) & (image <= whole.image.max(0))).all(-1)  # not NaN
+    cones = Cones(every.cones.axes[seen], every.cones.cosines[seen])
+    region = replace(every, points3d=every.points3d[seen], point_ids=every.point_ids[seen], cones=cones)
+    if len(region.points3d) < len(solution.points3d[solution.match_places[:, 1]]):
+        return solution
+    problem = problem_near(region, keypoints, solution.camera, None)
+    scene = Scene(problem.sets, seed, DEFAULT, deadline)
+    shift = solution.translation + rotation @ problem.origin
+    scale = max(solution.stats.residual, problem.sets.image.scales[0])
+    ends = polished(scene, rotation[None], shift[None], scale)
+    # That no better pose was missed is known of the one that is refined.
+    result = judged(ends, problem.sets, batches=1, exhaustive=True)
+    better = result.log10_false_alarms < solution.log10_false_alarms
+    poses = (np.stack(pair) for pair in zip((rotation, shift), result.best, strict=True))
+    same = problem.sets.same_pose(*poses, DEFAULT.evidence.other_deg, DEFAULT.evidence.other_shift)[1]
+    if deadline.passed() or not (better and same):
+        return solution
+    fitted = finished(problem, result, solution.seconds, None)
+    matches = np.column_stack([fitted.matches[:, 0], region.point_ids[fitted.matches[:, 1]]])
+    stats = replace(fitted.stats, iterations=solution.stats.iterations)
+    candidates = (*fitted.candidates, *solution.candidates[1:])
+    return replace(
+        fitted, matches=matches, stats=stats, candidates=candidates, view=solution.view, point_ids=region.point_ids
+    )
