@@ -35,8 +35,9 @@ def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int
     # That no better pose was missed is known of the one that is refined.
     result = judged(ends, problem.sets, batches=1, exhaustive=True)
     better = result.log10_false_alarms < solution.log10_false_alarms
-    poses = (np.stack(pair) for pair in zip((rotation, shift), result.best, strict=True))
-    same = problem.sets.same_pose(*poses, DEFAULT.evidence.other_deg, DEFAULT.evidence.other_shift)[1]
+    rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
+    rule = DEFAULT.evidence
+    same = problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]
     if deadline.passed() or not (better and same):
         return solution
     fitted = finished(problem, result, solution.seconds, None)
