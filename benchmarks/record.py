@@ -118,15 +118,19 @@ def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
     )
 
 
-def sigmas(found: Solution, rotation: Any, translation: Any) -> list[float]:
-    """The error of a pose along six independent directions, in the standard deviations that its covariance claims."""
-    covariance = found.covariance[:6, :6]
-    if not np.isfinite(covariance).all():
+def sigmas(found: Solution, rotation: Any, translation: Any, middle: Array) -> list[float]:
+    """The error of a pose along six independent directions, in the standard deviations that its covariance claims; that
+    of the shift at the middle of the scene (3,), since far from it a turn moves points by more than the first order."""
+    if found.covariance.shape != (6, 6) or not np.isfinite(found.covariance).all():
         return []
-    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), translation - found.translation]
+    seen = found.rotation @ middle
+    moved = np.eye(6)
+    moved[3:, :3] = np.cross(np.eye(3), seen).T  # w x (R m)
+    covariance = moved @ found.covariance @ moved.T
+    shift = rotation @ middle + translation - seen - found.translation
+    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift]
     unit = 1 / np.sqrt(np.diag(covariance))
-    root = np.linalg.cholesky(covariance * np.outer(unit, unit) + 1e-9 * np.eye(len(covariance)))
-    return np.linalg.solve(root, error[: len(unit)] * unit).tolist()
+    return np.linalg.solve(np.linalg.cholesky(covariance * np.outer(unit, unit)), error * unit).tolist()
 
 
 def degrees(one: Any, other: Any) -> float:

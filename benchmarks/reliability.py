@@ -204,7 +204,7 @@ def row_of(family: str, problem: Problem) -> dict[str, Any]:
     row |= {"deg": deg, "shift": shift, "centre": centre, "outside": outside, "wrong": wrong and outside}
     row |= {"verdict": found.verdict, "reason": found.reason, "alarms": found.log10_false_alarms}
     row["sigmas"] = (
-        [] if is_far(deg, shift) else min((sigmas(found, *pose) for pose in problem.poses), key=np.linalg.norm)
+        [] if is_far(deg, shift) else min((sigmas(found, *pose, middle) for pose in problem.poses), key=np.linalg.norm)
     )
     return row | {"claims": list({int(claim // 1): (claim, far) for claim, far in claims}.values())}
 
