@@ -1,9 +1,10 @@
-"""The focal length unknown: photos in whole maps, or against one view; beside it with the focal length known.
+"""The focal length unknown: photos in whole maps, or against one view, beside it with the focal length known; and LEDs.
 
     python -m benchmarks focal maps --limit 6 --seed 42
 
-What: maps (photos left out of their map, which view is not told), views (photos against the points of one view).
-Right is within 1.5 degrees. A line says for how many the focal length is within 3 %. --limit: problems a scene.
+What: maps (photos left out of their map, which view is not told), views (photos against the points of one view), leds
+(10 or more of them seen). Right is within 1.5 degrees, of LEDs within 3. A line says for how many the focal length is
+within 3 %, and how many are confident and more than 3 degrees off. --limit: problems a scene, or a setting of LEDs.
 """
 
 import argparse
@@ -12,14 +13,16 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from bench_constellation import Setting, picture
 from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
 from view_problems import REPORTED, ViewProblem, median_distance, scene_problems
 
 from bpnp import solve, warm_up
 from bpnp.cameras import image_size
 
-RIGHT_DEG = 1.5
+RIGHT_DEG = {"maps": 1.5, "views": 1.5, "leds": 3.0}
 SCENES = (*REPORTED, "statue_of_liberty")
+LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in ("ring", "headset") for n in (0, 3)]
 
 
 def of_photos(photos: list[ViewProblem], known: bool, in_map: bool, seed: int) -> Iterator[Problem]:
@@ -44,7 +47,25 @@ def image_of(photo: ViewProblem) -> tuple[Array, tuple[int, int]]:
     return pixels + np.array([width / 2, height / 2]), (width, height)
 
 
+def of_leds(setting: Setting, k: int, limit: int, seed: int) -> Iterator[Problem]:
+    """Frames with the image's size alone; every fifth has a new device."""
+    rng = np.random.default_rng([seed, k])
+    for i in range(limit):
+        shown = picture(setting, 1000 * seed + i // 5, rng)
+        known: dict[str, Any] = {
+            "normals3d": shown.device.normals3d,
+            "image_size": (shown.camera.size,) * 2,
+            "seed": seed,
+        }
+        search = partial(solve, shown.pixels, shown.device.points3d, **known)
+        pose, distance = (shown.rotation, shown.translation), float(np.linalg.norm(shown.translation))
+        yield Problem(f"{i}", search, [pose], distance=distance, focal=shown.camera.focal)
+
+
 def rows(options: argparse.Namespace) -> Rows:
+    if options.what == "leds":
+        yield from ((one.name, partial(of_leds, one, k, options.limit, options.seed)) for k, one in enumerate(LEDS))
+        return
     in_map = options.what == "maps"
     chosen = {"views": 0, "outliers": 1.0, "most": None} if in_map else {"views": 1, "outliers": 0.5}
     chosen |= {"limit": options.limit, "seed": options.seed}
@@ -56,11 +77,11 @@ def rows(options: argparse.Namespace) -> Rows:
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("what", choices=("maps", "views"))
+    options.add_argument("what", choices=RIGHT_DEG)
     options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
     chosen = options.parse_args()
     warm_up()
-    measured(rows(chosen), chosen, RIGHT_DEG)
+    measured(rows(chosen), chosen, RIGHT_DEG[chosen.what])
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Methods: views (the three views that share most points are named), map (none is); views-sift and map-sift, the same
-with SIFT descriptors, a ratio test and PoseLib.
+with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words retrieves.
 pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of all
 photos, aligned by the views that both models have.
 """
@@ -25,7 +25,7 @@ from bpnp.maps.photos import detected_keypoints
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 FEATURES = 2048  # of a photo in the maps, the largest
 VIEWS = 3
-METHODS = ("views", "map", "views-sift", "map-sift")
+METHODS = ("views", "map", "views-sift", "map-sift", "words-sift")
 RIGHT_DEG = 1.0
 
 
@@ -45,6 +45,9 @@ def problems_of(
 
     def search(method: str) -> Callable[[], Solution]:
         named = views if method.startswith("views") else None
+        if described is not None and method == "words-sift":
+            _ = described.words  # made before the first photo
+            return lambda: described.localize(photo, scene.camera, described.retrieved(photo))
         if described is not None and method.endswith("-sift"):
             return lambda: described.localize(photo, scene.camera, named)
         return lambda: place.localize(

@@ -1,19 +1,24 @@
-"""Rigs: several cameras fixed to each other around a headset, against one of them alone.
+"""Rigs: several cameras fixed to each other against one of them alone; around a headset, and photos of COLMAP models.
 
-    python -m benchmarks rigs --limit 60 --seed 54
+    python -m benchmarks rigs --limit 60 --seed 54 --only LEDs
+    python -m benchmarks rigs --limit 8 --only photos
 
-Each camera sees 4 to 6 of the LEDs, without normals, and a light that is not the headset's. one camera: the first of a
-rig alone. scale unknown: of 0.2 to 5, which is found. Right is a rotation within 3 degrees.
+LEDs: each camera sees 4 to 6 of them, without normals, and a light that is not the headset's. photos: one, and three
+that overlap as one rig, against the points of one view with all keypoints and points that have no partner; --limit of
+each scene. one camera: the first of a rig alone. scale unknown: of 0.2 to 5, which is found. Right is a rotation within
+3 degrees.
 """
 
-from collections.abc import Iterator
+import argparse
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 from bench_constellation import Camera, device
-from record import TIME_LIMIT, Array, Problem, measured, parser
+from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
 from scipy.spatial.transform import Rotation
+from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, model_of, overlapping, photos, view_problem
 
 import bpnp
 
@@ -47,23 +52,51 @@ def problems(cameras: int, used: int, limit: int, seed: int, is_metric: bool = T
             pixels.append(rng.permutation(np.concatenate([image, rng.uniform(0, PINHOLE.size, (1, 2))])))
         if min(map(len, pixels)) <= LEAST:
             continue
-        known: dict[str, Any] = {"seed": seed, "time_limit": TIME_LIMIT}
         scale = np.nan if is_metric else 0.2 * 25 ** rng.random()
-        if used > 1:
-            known["rig"] = [one @ np.linalg.inv(poses[0]) for one in poses[:used]]
-            points3d = shown.points3d if is_metric else shown.points3d / scale
-            models = [PINHOLE.model] * used
-            search = partial(bpnp.solve, pixels[:used], points3d, models, scale=not is_metric, **known)
-        else:
-            search = partial(bpnp.solve, pixels[0], shown.points3d, PINHOLE.model, **known)
+        points3d = shown.points3d if is_metric else shown.points3d / scale
+        cameras_of = [PINHOLE.model] * used
+        search = rig_search(pixels[:used], points3d, cameras_of, poses, seed=seed, scale=not is_metric)
         yield Problem(f"{number}", search, [(poses[0][:3, :3], poses[0][:3, 3])], shown.points3d, scale=scale)
         number += 1
 
 
+def of_photos(used: int, options: argparse.Namespace) -> Iterator[Problem]:
+    """A photo and the two others that overlap with it most, against the points of a fourth image."""
+    for name in options.scenes:
+        scene = model_of(options.data, name)
+        for query in photos(scene, options.limit):
+            shown = view_problem(scene, query, views=1, outliers=1.0, seed=options.seed)
+            beside = [view for _, view in overlapping(scene, query) if view.name not in shown.views][:2]
+            if len(beside) < 2 or shown.matches < LEAST_MATCHES:
+                continue
+            rng, pixels = np.random.default_rng([options.seed, query.image_id]), [shown.pixels[0]]
+            for view in beside:
+                keypoints = rng.permutation(np.concatenate([view.points2d, view.clutter2d]))[:MOST_POINTS]
+                pixels.append(view.camera.focal * keypoints.astype(np.float64))
+            rig = [query, *beside][:used]
+            poses = [pose_matrix(each.rotation, each.translation) for each in rig]
+            matrices = [np.diag([each.camera.focal] * 2 + [1.0]) for each in rig]
+            search = rig_search(pixels[:used], shown.points3d, matrices, poses, seed=options.seed)
+            yield Problem(shown.name, search, [shown.pose], shown.points3d, shown.distance)
+
+
+def rig_search(
+    pixels: Sequence[Array], points3d: Array, cameras: Sequence[Any], poses: Sequence[Array], **known: Any
+) -> partial[bpnp.Solution]:
+    """Of cameras with the poses camera_from_world, in the frame of the first; one alone is no rig."""
+    known["time_limit"] = TIME_LIMIT
+    if len(pixels) == 1:
+        return partial(bpnp.solve, pixels[0], points3d, cameras[0], **known)
+    rig = [one @ np.linalg.inv(poses[0]) for one in poses[: len(pixels)]]
+    return partial(bpnp.solve, list(pixels), points3d, list(cameras), rig=rig, **known)
+
+
 def main() -> None:
-    chosen = parser(__doc__).parse_args()
+    options = parser(__doc__)
+    options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
+    chosen = options.parse_args()
     bpnp.warm_up()
-    rows = [
+    rows: Rows = [
         (f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, is_metric))
         for name, cameras, used, is_metric in (
             ("2 cameras", 2, 2, True),
@@ -72,7 +105,7 @@ def main() -> None:
             ("2 cameras, scale unknown", 2, 2, False),
             ("4 cameras, scale unknown", 4, 4, False),
         )
-    ]
+    ] + [(f"photos, {name}", partial(of_photos, used, chosen)) for name, used in (("one camera", 1), ("3 cameras", 3))]
     measured(rows, chosen, RIGHT_DEG)
 
 

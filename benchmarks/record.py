@@ -26,6 +26,7 @@ DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
 TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also on a busy machine
 NO_POSE_DEG = 180.0
 NEAR_FOCAL = 0.03  # of a focal length that counts as right
+FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
 BOUND = 0.999  # share of the confident poses that are within their bound
 
 Array = NDArray[np.float64]
@@ -142,14 +143,16 @@ def degrees(one: Any, other: Any) -> float:
 
 def summary(found: Sequence[Outcome], right_deg: float, right_shift: float = np.inf) -> dict[str, Any]:
     """Quartiles of the rotation's error, shares right and confident, how many are confident, wrong and beyond their own
-    bound, CPU seconds; the share of the focal lengths that are near, where they were not known."""
+    bound, CPU seconds; where focal lengths were not known the share that are near, and how many are confident and far.
+    """
     turn, shift = (np.array([getattr(o, name) for o in found]) for name in ("rotation_deg", "shift"))
     right = (turn < right_deg) & ((shift < right_shift) | np.isinf(right_shift))
     sure = np.array([o.verdict == "confident" for o in found])
     focal = np.array([o.focal for o in found])
-    near: dict[str, Any] = (
-        {"focal_near": round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)} if np.isfinite(focal).any() else {}
-    )
+    near: dict[str, Any] = {}
+    if np.isfinite(focal).any():
+        near["focal_near"] = round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)
+        near["confident_and_far"] = int((sure & (turn > FAR_DEG)).sum())
     if sigmas := [o.scale_sigmas for o in found if o.scale_sigmas is not None]:
         near["scale_sigmas"] = [round(float((np.array(sigmas) < limit).mean()), 4) for limit in (1, 2, 3)]
     return near | {
@@ -171,7 +174,12 @@ def line(row: dict[str, Any]) -> str:
         f"{row['problems']} problems, rotation {quartiles} deg, right {row['right']:.0%}, confident {confident}, "
         f"of them wrong {row['confident_and_wrong']}, {row['cpu_seconds']:.3g} CPU s, "
         f"median {row['median_cpu_seconds']:.3g}"
-        + (f", focal length within {NEAR_FOCAL:.0%}: {row['focal_near']:.0%}" if "focal_near" in row else "")
+        + (
+            f", focal length within {NEAR_FOCAL:.0%}: {row['focal_near']:.0%}, "
+            f"confident and beyond {FAR_DEG:g} deg {row['confident_and_far']}"
+            if "focal_near" in row
+            else ""
+        )
         + (f", scale within 1, 2, 3 sigmas: {row['scale_sigmas']}" if "scale_sigmas" in row else "")
     )
 
