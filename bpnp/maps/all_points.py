@@ -7,9 +7,11 @@ import numpy as np
 from bpnp.loops.parallel import Deadline, one_blas_thread
 from bpnp.maps.localize import Region, problem_near
 from bpnp.maps.views import Array, Cones
-from bpnp.search.annealing import polished
+from bpnp.search.annealing import finish, polished
+from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
+from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import judged
 from bpnp.solving.matches import finished
 from bpnp.solving.solution import Solution
@@ -32,6 +34,10 @@ def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int
     shift = solution.translation + rotation @ problem.origin
     scale = max(solution.stats.residual, problem.sets.image.scales[0])
     ends = polished(scene, rotation[None], shift[None], scale)
+    if ends.scale[0] > solution.stats.residual:  # a coarse optimum: a finer one may be beside it
+        start = Candidates.unscored(*scene.enter(rotation[None], shift[None]))
+        beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
+        ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
     # That no better pose was missed is known of the one that is refined.
     result = judged(ends, problem.sets, batches=1, exhaustive=True)
     better = result.log10_false_alarms < solution.log10_false_alarms
