@@ -159,7 +159,9 @@ def looked_up(
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
-    best = best[np.argsort(-score[best], kind="stable")[:kept]]
+    if len(best) > kept:  # much faster than to sort all of them
+        best = best[np.sort(np.argpartition(-score[best], kept)[:kept])]
+    best = best[np.argsort(-score[best], kind="stable")]
     return poses[best], best
 
 
