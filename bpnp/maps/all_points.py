@@ -18,9 +18,11 @@ from bpnp.solving.solution import Solution
 
 
 @one_blas_thread
-def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int, deadline: Deadline) -> Solution:
-    """A confident solution fitted to all points of a region that its camera sees, and judged by them; the solution
-    itself where they explain the keypoints no better."""
+def on_all_points(
+    solution: Solution, every: Region, keypoints: Array, seed: int, deadline: Deadline
+) -> Solution | None:
+    """A confident solution fitted to all points of a region that its camera sees, and judged by them; None where they
+    explain the keypoints no better."""
     whole = problem_near(every, keypoints, solution.camera, None)
     rotation, shift = solution.rotation, solution.translation + solution.rotation @ whole.origin
     image = whole.view(rotation, shift)
@@ -28,7 +30,7 @@ def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int
     cones = Cones(every.cones.axes[seen], every.cones.cosines[seen])
     region = replace(every, points3d=every.points3d[seen], point_ids=every.point_ids[seen], cones=cones)
     if len(region.points3d) < len(solution.points3d[solution.match_places[:, 1]]):
-        return solution
+        return None
     problem = problem_near(region, keypoints, solution.camera, None)
     scene = Scene(problem.sets, seed, DEFAULT, deadline)
     shift = solution.translation + rotation @ problem.origin
@@ -45,7 +47,7 @@ def on_all_points(solution: Solution, every: Region, keypoints: Array, seed: int
     rule = DEFAULT.evidence
     same = problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]
     if deadline.passed() or not (better and same):
-        return solution
+        return None
     fitted = finished(problem, result, solution.seconds, None)
     matches = np.column_stack([fitted.matches[:, 0], region.point_ids[fitted.matches[:, 1]]])
     stats = replace(fitted.stats, iterations=solution.stats.iterations)

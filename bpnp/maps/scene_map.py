@@ -271,7 +271,8 @@ class SceneMap:
             if solution.verdict == "confident":
                 every = self._region(place.view, np.arange(len(self.points3d)))
                 if isinstance(lens, Camera):
-                    solution = counted(on_all_points(solution, every, used, seed, deadline), tries)
+                    fitted = on_all_points(solution, every, used, seed, deadline)
+                    solution = solution if fitted is None else counted(fitted, tries)
                 if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
                     regions = partial(self._regions, views, solution.camera)
                     among = every if views is None else region
