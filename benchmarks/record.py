@@ -16,10 +16,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
+from scipy.special import fdtri, stdtrit
 
 from bpnp import Solution
 from bpnp.files import written_whole
+from bpnp.search.evidence.uncertainty import ONE_SIGMA
 
 ROOT = Path(__file__).parents[1]
 DATA = Path(os.environ.get("BPNP_SHARED_DATA", ROOT.parent / "shared" / "data"))
@@ -102,7 +103,8 @@ def solved(problem: Problem) -> Outcome:
 
 def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
     """Whether the true rotation, or the true pose, lies outside the region that the solution claims to hold it with a
-    probability of 99.9 %: of errors e with e^T C^-1 e below the quantile of chi square, C the covariance.
+    probability of 99.9 %, as the bound in `reason` does: of errors e with e^T C^-1 e / d below the quantile of F with
+    d and the degrees of freedom of the residuals, C the covariance less what widens it for few residuals.
 
     The promise of a confident pose is broken by one that is wrong (some degrees off) and beyond its bound.
     """
@@ -112,9 +114,11 @@ def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
     size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
     error, covariance = error[:size], found.covariance[:size, :size]
     unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
+    free = max(2 * len(found.matches) - len(found.covariance), 1)
+    widened = stdtrit(free, ONE_SIGMA) ** 2
     return any(
         (error * unit)[:d] @ np.linalg.pinv((covariance * np.outer(unit, unit))[:d, :d]) @ (error * unit)[:d]
-        > chi2.ppf(BOUND, d)
+        > d * fdtri(d, free, BOUND) / widened
         for d in (3, size)
     )
 

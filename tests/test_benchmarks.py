@@ -24,6 +24,7 @@ import results
 import roma
 import torch
 from planted_model import plant_model
+from scipy import stats
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -132,14 +133,18 @@ def test_shapes_are_seen_where_the_pose_puts_them() -> None:
     assert len(points2d) == len(points3d) == 600
 
 
-def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says() -> None:
-    """Errors drawn with the covariance that is claimed: once in a thousand for the rotation, once for the pose."""
+@pytest.mark.parametrize("matches", [7, 1000])
+def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(matches: int) -> None:
+    """Errors drawn as claimed, of a scale that is estimated from the matches: once in a thousand for the rotation, once
+    for the pose. The covariance is widened so that one sigma holds 68 %."""
     rng, root = np.random.default_rng(0), np.diag([0.01, 0.02, 0.01, 5.0, 3.0, 40.0])
     root[3:, :3] = 30 * rng.standard_normal((3, 3))
     turn, shift = Rotation.from_euler("xyz", [50, 20, -70], degrees=True), np.array([100.0, 20, 900])
-    found = SimpleNamespace(rotation=turn.as_matrix(), translation=shift, covariance=root @ root.T)
-    beyond = []
-    for error in rng.standard_normal((4000, 6)) @ root.T:
+    pairs, free = np.zeros((matches, 2)), 2 * matches - 6
+    found = SimpleNamespace(rotation=turn.as_matrix(), translation=shift, covariance=root @ root.T, matches=pairs)
+    beyond, one_sigma = [], stats.t(free).ppf(stats.norm.cdf(1))
+    scales = np.sqrt(free / rng.chisquare(free, (4000, 1))) / one_sigma
+    for error in scales * rng.standard_normal((4000, 6)) @ root.T:
         true = (Rotation.from_rotvec(error[:3]) * turn).as_matrix()
         beyond.append(record.beyond_bound(found, true, shift + error[3:]))
     assert 1 <= sum(beyond) <= 16
