@@ -268,6 +268,7 @@ def test_models_of_the_same_views_are_aligned() -> None:
 
 
 def test_descriptors_are_matched_to_points_seen_from_several_views() -> None:
+    """And the views that see the photo's points are retrieved before those of another place."""
     rng = np.random.default_rng(0)
     points = rng.normal(size=(300, 64))
     seen = np.concatenate([points + 0.1 * rng.normal(size=points.shape) for _ in range(3)])
@@ -279,6 +280,10 @@ def test_descriptors_are_matched_to_points_seen_from_several_views() -> None:
     assert true.sum() == 100
     np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
     assert (~true).sum() < 25
+    described = object.__new__(descriptor_poses.DescribedMap)
+    described._views = {f"{k}": (theirs[ids // 20 == k % 15], ids[ids // 20 == k % 15]) for k in range(30)}
+    described._features = lambda _: (None, own[:100])  # of the points 7 to 106: views 0 to 5, and 15 to 20
+    assert {int(name) % 15 for name in described.retrieved("photo")} <= set(range(6))
 
 
 def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) -> None:
