@@ -9,6 +9,7 @@ from bpnp.maps.localize import Region, problem_near
 from bpnp.maps.views import Array, Cones
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.sources.raster import search_beside
@@ -42,6 +43,7 @@ def on_all_points(
         ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
     # That no better pose was missed is known of the one that is refined.
     result = judged(ends, problem.sets, batches=1, exhaustive=True)
+    result = against_rivals(result, problem.sets, lambda: scene, DEFAULT.evidence, exhaustive=True)
     better = result.log10_false_alarms < solution.log10_false_alarms
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     rule = DEFAULT.evidence
