@@ -210,7 +210,8 @@ def write(path: Path, record: dict[str, Any]) -> None:
     commit = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
-    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(sys.argv), "machine": machine()}
+    command = ["python", "-m", "benchmarks", Path(sys.argv[0]).stem.removeprefix("bench_"), *sys.argv[1:]]
+    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(command), "machine": machine()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(head | record, indent=1) + "\n")

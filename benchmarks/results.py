@@ -38,6 +38,7 @@ COLUMNS = ("data", "problems", "rotation, deg (quartiles)", "right", "confident"
 # What may differ between two runs of a row, on another machine and with other libraries: problems that are right or
 # confident, and the ratio of the median errors where one exceeds FLOOR_DEG.
 PROBLEMS, MEDIAN, FLOOR_DEG = 1, 1.5, 0.05
+NAMED = {"maps": "photo ", "leds": "LEDs: "}  # what the README's rows of a table begin with
 TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 
 
@@ -186,7 +187,8 @@ def table(name: str, results: dict[str, Any]) -> str | None:
         right = f"{result['right']:.1%} ({where})" if row.right_deg else "none can be"
         sure = "" if result["confident"] is None else f"{result['confident']:.1%}"
         wrong = "" if result["confident"] is None else str(result["confident_and_wrong"])
-        lines.append((row.name, str(result["problems"]), quartiles if row.right_deg else "", right, sure, wrong,
+        of = NAMED.get(row.table, "") if name == "readme" else ""
+        lines.append((of + row.name, str(result["problems"]), quartiles if row.right_deg else "", right, sure, wrong,
                       f"{result['cpu_seconds']:.2g}"))  # fmt: skip
     return "".join(f"| {' | '.join(cells)} |\n" for cells in lines)
 
