@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.maps.localize import Region, problem_near
+from bpnp.maps.localize import Region, in_picture, problem_near, with_ids
 from bpnp.maps.views import Array, Cones
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
@@ -24,17 +24,14 @@ def on_all_points(
 ) -> Solution | None:
     """A confident solution fitted to all points of a region that its camera sees, and judged by them; None where they
     explain the keypoints no better."""
-    whole = problem_near(every, keypoints, solution.camera, None)
-    rotation, shift = solution.rotation, solution.translation + solution.rotation @ whole.origin
-    image = whole.view(rotation, shift)
-    seen = ((image >= whole.image.min(0)) & (image <= whole.image.max(0))).all(-1)  # not NaN
+    seen = in_picture(problem_near(every, keypoints, solution.camera, None), solution)
     cones = Cones(every.cones.axes[seen], every.cones.cosines[seen])
     region = replace(every, points3d=every.points3d[seen], point_ids=every.point_ids[seen], cones=cones)
-    if len(region.points3d) < len(solution.points3d[solution.match_places[:, 1]]):
+    if len(region.points3d) < len(solution.matches):
         return None
     problem = problem_near(region, keypoints, solution.camera, None)
     scene = Scene(problem.sets, seed, DEFAULT, deadline)
-    shift = solution.translation + rotation @ problem.origin
+    rotation, shift = solution.rotation, solution.translation + solution.rotation @ problem.origin
     scale = max(solution.stats.residual, problem.sets.image.scales[0])
     ends = polished(scene, rotation[None], shift[None], scale)
     if ends.scale[0] > solution.stats.residual:  # a coarse optimum: a finer one may be beside it
@@ -51,9 +48,6 @@ def on_all_points(
     if deadline.passed() or not (better and same):
         return None
     fitted = finished(problem, result, solution.seconds, None)
-    matches = np.column_stack([fitted.matches[:, 0], region.point_ids[fitted.matches[:, 1]]])
     stats = replace(fitted.stats, iterations=solution.stats.iterations)
     candidates = (*fitted.candidates, *solution.candidates[1:])
-    return replace(
-        fitted, matches=matches, stats=stats, candidates=candidates, view=solution.view, point_ids=region.point_ids
-    )
+    return with_ids(replace(fitted, stats=stats, candidates=candidates), region)

@@ -15,7 +15,7 @@ from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import checked_prior
 from bpnp.solving.focal_length import UnknownCamera, solved_with_focal_length
 from bpnp.solving.problem import Problem, problem_from
-from bpnp.solving.solution import Solution
+from bpnp.solving.solution import Candidate, Solution
 from bpnp.solving.sources import Options, solutions_of
 
 Array = NDArray[np.float64]
@@ -65,8 +65,20 @@ def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | No
         solution = solved_with_focal_length(problem_at, camera, options)
     else:
         solution = solutions_of({0: problem_near(region, keypoints, camera, expected)}, options)[0]
+    return with_ids(solution, region)
+
+
+def with_ids(solution: Solution, region: Region) -> Solution:
+    """A solution among the points of a region, with the ids of these in its matches."""
     matches = np.column_stack([solution.matches[:, 0], region.point_ids[solution.matches[:, 1]]])
     return replace(solution, matches=matches, view=region.view.name, point_ids=region.point_ids)
+
+
+def in_picture(problem: Problem, pose: Solution | Candidate) -> NDArray[np.bool_]:
+    """Which points (n,) of a problem a pose sees where the image points are."""
+    image = problem.view(pose.rotation, pose.translation + pose.rotation @ problem.origin)
+    inside = (image >= problem.image.min(0)) & (image <= problem.image.max(0))  # not NaN
+    return np.asarray(inside.all(-1))
 
 
 def strongest_of(scores: Any, shape: tuple[int, ...]) -> NDArray[np.int64]:

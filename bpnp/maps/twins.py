@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose, turned_by
 from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.maps.localize import Region, problem_near
+from bpnp.maps.localize import Region, in_picture, problem_near
 from bpnp.maps.views import Array
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
@@ -175,6 +175,4 @@ def without_twins(
 
 def _seen(photo: Photo, problem: Problem, pose: Solution | Candidate) -> NDArray[np.int64]:
     """Ids of the points that a pose sees where the image points are."""
-    image = problem.view(pose.rotation, pose.translation + pose.rotation @ problem.origin)
-    inside = (image >= problem.image.min(0)) & (image <= problem.image.max(0))  # not NaN
-    return photo.place.point_ids[inside.all(-1)]
+    return photo.place.point_ids[in_picture(problem, pose)]
