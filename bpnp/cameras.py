@@ -26,7 +26,7 @@ FISHEYE = {  # models with the radius t (1 + k1 t^2 + ...) at the angle t from t
     "RADIAL_FISHEYE": (1, 2),
     "OPENCV_FISHEYE": (2, 4),
 }
-BISECTIONS = 54  # of an angle, to the last digit
+EDGES, STEPS = 1024, 5  # of a fisheye's angles, between which Newton's steps find one to the last digit
 CENTRE = 0.5  # of the first pixel in COLMAP's coordinates; OpenCV and hloc count from 0
 MOST_PIXELS = 2**31  # of a side of an image; more is a file that is none
 
@@ -101,16 +101,19 @@ class Lens:
         # t (1 + k1 t^2 + ...) rises up to the first root of its derivative, or to the angle of a full turn.
         radial = np.zeros(2 * count + 2)
         radial[1::2] = np.r_[1.0, params[focals + 2 : focals + 2 + count]]
-        distance = np.polynomial.Polynomial(radial)
-        roots = distance.deriv().roots()
+        distance = np.polynomial.Polynomial(radial).trim()
+        slope = distance.deriv()
+        roots = slope.roots()
         turns = roots.real[(abs(roots.imag) < 1e-9) & (roots.real > 0)]
         widest = min([np.pi, *turns.tolist()])
-        low, high = np.zeros(len(radius)), np.full(len(radius), widest)
-        for _ in range(BISECTIONS):
-            middle = (low + high) / 2
-            below = distance(middle) < radius
-            low, high = np.where(below, middle, low), np.where(below, high, middle)
-        angle = np.where(radius <= distance(widest), high, np.nan)
+        edges = np.linspace(0, widest, EDGES)
+        rising = distance(edges)
+        k = np.clip(np.searchsorted(rising, radius) - 1, 0, EDGES - 2)
+        angle = edges[k]
+        for _ in range(STEPS):  # Newton's, between two edges
+            angle += (radius - distance(angle)) / np.maximum(slope(angle), np.finfo(float).tiny)
+            angle = np.clip(angle, edges[k], edges[k + 1])
+        angle = np.where(radius <= rising[-1], angle, np.nan)
         aside = seen * (np.sin(angle) / np.maximum(radius, np.finfo(float).tiny))[:, None]
         return np.column_stack([aside, np.cos(angle)])
 

@@ -12,7 +12,7 @@ from scipy.special import stdtrit
 from bpnp.cameras import Camera, camera_from, in_front, zoomed_camera
 from bpnp.loops.parallel import Clock, Deadline, one_blas_thread
 from bpnp.search.evidence.uncertainty import ONE_SIGMA
-from bpnp.search.infinity.evidence import Known, how_well_known
+from bpnp.search.infinity.evidence import how_well_known, noise_of
 from bpnp.search.infinity.kernels import Image
 from bpnp.search.infinity.search import search_rotation
 from bpnp.search.infinity.settings import DEFAULT, InfinitySettings
@@ -89,7 +89,7 @@ def _fitted(camera: Camera, image: Array, scene: Array, solution: Solution) -> C
     return zoomed_camera(camera, math.exp(least_squares(residuals, np.zeros(4), loss="soft_l1", x_scale=0.01).x[3]))
 
 
-def _with_focal_length(camera: Camera, pixels: Array, seen: Array, known: Known) -> Array:
+def _with_focal_length(camera: Camera, pixels: Array, seen: Array, noise: float) -> Array:
     """Covariance (4, 4) of the turn and of the focal length, pixels, of matches with directions `seen` (k, 3)."""
     step = 1e-5
     ends = [_bearings(pixels, zoomed_camera(camera, math.exp(sign * step))) for sign in (1, -1)]
@@ -97,7 +97,7 @@ def _with_focal_length(camera: Camera, pixels: Array, seen: Array, known: Known)
     rows = np.concatenate([turned, (ends[1][0] - ends[0][0])[:, :, None] / (2 * step)], -1) / ends[0][2][:, None, None]
     rows = rows.reshape(-1, 4) * [1, 1, 1, 1 / camera.focal]
     free = max(2 * len(seen) - 4, 1)
-    return np.asarray((known.noise * stdtrit(free, ONE_SIGMA)) ** 2 * np.linalg.pinv(rows.T @ rows, rcond=1e-15))
+    return np.asarray((noise * stdtrit(free, ONE_SIGMA)) ** 2 * np.linalg.pinv(rows.T @ rows, rcond=1e-15))
 
 
 def _seen_by(
@@ -144,14 +144,19 @@ def _seen_by(
         return solution
     best, seen = result.found[0], [scene @ one.rotation.T for one in result.found]
     hit = np.flatnonzero(best.match >= 0)
-    residual = how_well_known(seen[0][best.match[hit]], bearings[hit], pixel[hit], bearings).noise
+    residual = noise_of(seen[0][best.match[hit]], bearings[hit], pixel[hit])
     threshold = inlier_threshold or SCALES * residual * middle * per_radian
-    i, j = one_to_one(bearings, seen[0], threshold / per_radian).T
-    counts = [len(i), *(count_one_to_one(bearings, each, threshold / per_radian) for each in seen[1:])]
-    known = how_well_known(seen[0][j], bearings[i], pixel[i], bearings)
-    covariance = known.covariance
+    radius, towards = threshold / per_radian, bearings.mean(0)
+    least = float((bearings @ towards).min()) - radius
+    in_view = [np.flatnonzero(each @ towards > least) for each in seen]
+    i, j = one_to_one(bearings, seen[0][in_view[0]], radius).T
+    j = in_view[0][j]
+    others = (each[places] for each, places in zip(seen[1:], in_view[1:], strict=True))
+    counts = [len(i), *(count_one_to_one(bearings, each, radius) for each in others)]
+    matched = seen[0][j], bearings[i], pixel[i]
+    covariance = how_well_known(*matched).covariance
     if unknown is not None and lens is not None:
-        covariance = _with_focal_length(lens, image[usable[i]], seen[0][j], known)
+        covariance = _with_focal_length(lens, image[usable[i]], seen[0][j], noise_of(*matched))
     angles = angles_between(bearings[i], seen[0][j])
     return with_pose(
         solution,

@@ -132,18 +132,21 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
     more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
     """
     matches, distance = _near(image, projected, radius, allowed)
-    # Only points that are near another take part. Column `count + i` stands for leaving row i out.
+    alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
+    if alone.all():
+        return matches
+    # Only points that have a choice take part. Column `count + i` stands for leaving row i out.
+    sure, matches, distance = matches[alone], matches[~alone], distance[~alone]
     rows, row = np.unique(matches[:, 0], return_inverse=True)
     columns, column = np.unique(matches[:, 1], return_inverse=True)
-    if len(rows) == len(matches) == len(columns):
-        return matches  # no point has a choice
     count, every = len(columns), np.arange(len(rows))
     cost = (distance / radius) ** 2 + 1e-9  # zero would be no edge
     out = np.full(len(rows), float(min(len(rows), count) + 2))
     graph = csr_array((np.r_[cost, out], (np.r_[row, every], np.r_[column, count + every])))
     i, j = min_weight_full_bipartite_matching(graph)
     real = j < count
-    return np.stack([rows[i[real]], columns[j[real]]], -1)
+    chosen = np.concatenate([sure, np.stack([rows[i[real]], columns[j[real]]], -1)])
+    return np.asarray(chosen[np.argsort(chosen[:, 0])])
 
 
 def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:

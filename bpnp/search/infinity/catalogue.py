@@ -1,4 +1,4 @@
-"""Directions as a search for a rotation looks them up: pairs by their angle, and those near a place of the sphere."""
+"""Directions as a search for a rotation looks them up: each one's neighbours, and those near a place of the sphere."""
 
 import math
 from functools import lru_cache
@@ -8,22 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.search.infinity.kernels import Pairs, Sky
+from bpnp.search.infinity.kernels import TURN, Neighbours, Sky
 from bpnp.search.kernels.neighbours import hashed
 
 Array = NDArray[np.float64]
 DENSITIES = (8, 32)  # neighbours from whose distance the density around a direction is taken; the larger one counts
-KEPT = 4  # catalogues whose pairs are remembered: a camera looks at one sky again and again
-SAMPLED = 200  # directions from which it is estimated up to which angle there are so many pairs
+KEPT = 4  # catalogues that are remembered: a camera looks at one sky again and again
+MOST = 600_000  # neighbours of all directions, 7 megabytes
 
 
 class Catalogue(NamedTuple):
-    """Unit directions (n, 3), their density (n,) a steradian, and all pairs of them up to the chord `widest`."""
+    """Unit directions (n, 3), their density (n,) a steradian, and the nearest neighbours of each."""
 
     directions: Array
     density: Array
-    pairs: Pairs
-    widest: float
+    neighbours: Neighbours
 
     def sky(self, reach: float) -> Sky:
         """The directions in cells, to be looked up within a chord of `reach`."""
@@ -31,29 +30,31 @@ class Catalogue(NamedTuple):
         return Sky(hashed(self.directions.copy(), reach), self.density)
 
 
-def catalogue_of(directions: Array, most_pairs: int) -> Catalogue:
+def catalogue_of(directions: Array) -> Catalogue:
     """What is looked up of unit directions (n, 3); the last ones are remembered."""
-    return _catalogue(directions.tobytes(), most_pairs)
+    return _catalogue(directions.tobytes())
 
 
 @lru_cache(KEPT)
-def _catalogue(content: bytes, most_pairs: int) -> Catalogue:
+def _catalogue(content: bytes) -> Catalogue:
     """Of n directions k - 1 more lie within the chord d of one: their density is k / (pi d^2), for a cap of the sphere
     has the area pi d^2. With the direction itself among the k the mean of its inverse is that of an even spread."""
     directions = np.frombuffer(content).reshape(-1, 3)
-    tree, count = cKDTree(directions), len(directions)
+    count = len(directions)
+    nearest = min(max(MOST // count, DENSITIES[-1]), count - 1)
+    chord, place = (x[:, 1:] for x in cKDTree(directions).query(directions, nearest + 1))
     density = np.full(count, count / (4 * math.pi))
     for k in DENSITIES:
-        k = min(k, count - 1)
-        distance = np.maximum(tree.query(directions, [k + 1])[0][:, 0], 1e-9)
-        density = np.maximum(density, k / (math.pi * distance**2))
-    some = directions[:: max(count // SAMPLED, 1)]
-    chords = np.sqrt(np.maximum(2 - 2 * some @ directions.T, 0.0))
-    widest = float(np.quantile(chords, min(2 * most_pairs / count**2, 1.0)))
-    pairs = tree.query_pairs(widest, output_type="ndarray")
-    pairs = pairs[np.lexsort(pairs.T[::-1])]
-    chord = np.linalg.norm(directions[pairs[:, 0]] - directions[pairs[:, 1]], axis=-1)
-    order = np.argsort(chord, kind="stable")
-    order = order[chord[order] > 0]
-    first, second = np.ascontiguousarray(pairs[order].T.astype(np.int64))
-    return Catalogue(directions, density, Pairs(chord[order], first, second), widest)
+        k = min(k, nearest)
+        density = np.maximum(density, k / (math.pi * np.maximum(chord[:, k - 1], 1e-9) ** 2))
+    azimuth = azimuths(directions, directions[place])
+    return Catalogue(directions, density, Neighbours(place.astype(np.int32), chord.astype(np.float32), azimuth))
+
+
+def azimuths(centres: Array, others: Array) -> NDArray[np.int32]:
+    """Directions (c, k) in which unit vectors (c, k, 3) lie from others (c, 3), in `TURN` steps a turn, from a zero of
+    each centre."""
+    across = np.cross(centres, np.eye(3)[np.abs(centres).argmin(-1)])
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    x, y = (np.einsum("cka,ca->ck", others, axis) for axis in (across, np.cross(centres, across)))
+    return np.asarray(np.arctan2(y, x) * (TURN / (2 * math.pi)), np.int32) & (TURN - 1)

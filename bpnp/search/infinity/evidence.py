@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS
+from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -57,9 +57,9 @@ def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms
         zooms * spread / (scales * np.median(pixel)), 1.0
     )  # focal lengths that can be told apart
     tests = np.log(np.maximum(np.minimum(cells, m * (m - 1) / 2 * count * (count - 1)), 1.0))
-    tree, reach = cKDTree(bearings), 2 * scales * np.median(pixel)
-    together = np.stack([tree.query_ball_point(bearings, r, return_length=True) for r in reach], -1)
-    return Background(scales, tests, together.astype(np.float64), bearings, pixel)
+    axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
+    together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
+    return Background(scales, tests, together[:, ::-1], bearings, pixel)
 
 
 def log10_false_alarms(squared: Array, density: Array, known: Background) -> tuple[float, Array]:
@@ -71,53 +71,63 @@ def log10_false_alarms(squared: Array, density: Array, known: Background) -> tup
     width = known.scales * known.pixel[:, None]
     ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
     terms = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
-    fixing = np.sort(terms, 0)[-FIXING:]
-    evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0) - known.log_tests[:, None]
+    evidence, rest = terms.sum(0) - known.log_tests[:, None], terms.copy()
+    for _ in range(FIXING):
+        largest = rest.argmax(0)[None]
+        evidence -= np.maximum(np.take_along_axis(rest, largest, 0)[0], 0)
+        np.put_along_axis(rest, largest, -math.inf, 0)
     best = np.unravel_index(evidence.argmax(), evidence.shape)
     mean = np.logaddexp.reduce(evidence, None) - math.log(evidence.size)
     return -float(mean) / math.log(10), terms[:, best[0], best[1]] / math.log(10)
 
 
 class Known(NamedTuple):
-    """Covariance (3, 3) of the turn w, R' = exp([w]x) R, radians squared; the angle that its error exceeds once in a
-    thousand, radians; noise of the matches, pixels; and how far the strain of the image that the residuals show moves
-    a point of it, pixels, 0 where none is significant."""
+    """Covariance (3, 3) of the turn w, R' = exp([w]x) R, radians squared, and the angle that its error exceeds once in
+    a thousand, radians."""
 
     covariance: Array
     bound: float
-    noise: float
-    strain: float
 
 
-def how_well_known(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> Known:
-    """Of matches between directions `seen` (k, 3) in the camera and bearings (k, 3), whose pixels have the angles
-    `pixel`. A strain, f ~ (I + S) f, is another focal length or a camera that is not as given."""
-    weight = np.repeat(1 / pixel, 3)[:, None]
-    cross = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2).reshape(-1, 3) * weight  # w x v
-    residual = (bearings - seen).ravel() * weight[:, 0]
+def noise_of(seen: Array, bearings: Array, pixel: Array) -> float:
+    """Standard deviation, pixels, of matches between directions `seen` (k, 3) in the camera and bearings (k, 3), whose
+    pixels have the angles `pixel`; NaN if they do not tell one."""
+    free = 2 * len(seen) - 3
+    return float(np.linalg.norm((bearings - seen) / pixel[:, None])) / math.sqrt(free) if free > 0 else math.nan
+
+
+def how_well_known(seen: Array, bearings: Array, pixel: Array) -> Known:
+    """Of matches as for `noise_of`. For the turn w of a direction v the normal matrix is that of I - v v^T."""
     free = 2 * len(seen) - 3
     if free <= 0:
-        return Known(np.full((3, 3), math.nan), math.inf, math.nan, 0.0)
-    before = float(residual @ residual)
-    noise = math.sqrt(before / free)
-    inverse = np.linalg.pinv(cross.T @ cross, rcond=1e-12)
+        return Known(np.full((3, 3), math.nan), math.inf)
+    noise, weight = noise_of(seen, bearings, pixel), pixel**-2
+    inverse = np.linalg.pinv(weight.sum() * np.eye(3) - (weight[:, None] * seen).T @ seen, rcond=1e-12)
     covariance = np.asarray(noise**2 * float(stdtrit(free, ONE_SIGMA)) ** 2 * inverse, np.float64)
     total, axes = float(np.trace(inverse)), float((inverse**2).sum())
-    bound = noise * math.sqrt(total * float(fdtri(total**2 / axes, free, 1 - EXCEEDED)))
+    return Known(covariance, noise * math.sqrt(total * float(fdtri(total**2 / axes, free, 1 - EXCEEDED))))
+
+
+def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:
+    """How far the strain of the image that the residuals of matches show moves a point of it, pixels; 0 where none is
+    significant. A strain, f ~ (I + S) f, is another focal length or a camera that is not as given."""
+    weight = np.repeat(1 / pixel, 3)[:, None]
+    cross = np.cross(np.eye(3)[None], seen[:, None]).swapaxes(1, 2).reshape(-1, 3)  # w x v
+    residual = (bearings - seen).ravel() * weight[:, 0]
 
     def moved(points: Array) -> Array:
         """(k, 3, 5) by each strain."""
         stretched = np.einsum("sab,kb->kas", STRAINS, points)
         return stretched - points[:, :, None] * np.einsum("ka,kas->ks", points, stretched)[:, None]
 
-    design = np.concatenate([cross, moved(seen).reshape(-1, len(STRAINS)) * weight], 1)
+    design = np.concatenate([cross, moved(seen).reshape(-1, len(STRAINS))], 1) * weight
     size = np.linalg.norm(design, axis=0)
     solution, _, rank, _ = np.linalg.lstsq(design / size, residual, 1e-6)
-    after, added = float(((residual - design / size @ solution) ** 2).sum()), int(rank) - 3
-    strain = 0.0
-    if added > 0 and free > added and after > 0:
-        ratio = (before - after) / added / (after / (free - added))
-        if fdtrc(added, free - added, ratio) < EXCEEDED:
-            change = moved(all_bearings) @ (solution[3:] / size[3:]) + np.cross(solution[:3] / size[:3], all_bearings)
-            strain = float(np.linalg.norm(change, axis=-1).max() / np.median(pixel))
-    return Known(covariance, bound, noise, strain)
+    before, after = float(residual @ residual), float(((residual - design / size @ solution) ** 2).sum())
+    added, free = int(rank) - 3, 2 * len(seen) - int(rank)
+    if not (added > 0 and free > 0 and after > 0):
+        return 0.0
+    if fdtrc(added, free, (before - after) / added / (after / free)) >= EXCEEDED:
+        return 0.0
+    change = moved(all_bearings) @ (solution[3:] / size[3:]) + np.cross(solution[:3] / size[:3], all_bearings)
+    return float(np.linalg.norm(change, axis=-1).max() / np.median(pixel))

@@ -1,4 +1,4 @@
-"""The compiled loops: rotations from pairs of directions with one angle, tested on their surroundings and fitted."""
+"""The compiled loops: directions whose neighbours lie as those of an image point do, and rotations that are fitted."""
 
 import math
 from typing import Any, NamedTuple
@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.vectors import compiled, cross, part, rotated, turn
+from bpnp.loops.vectors import F, compiled, cross, part, rotated, turn
 from bpnp.search.kernels.neighbours import HashedPoints, entry
 
 Array = NDArray[np.float64]
 LOG_HALF = math.log(0.5)  # of a point that the true rotation explains
+TURN = 1 << 16  # steps of an azimuth
 CROWDED = 0.45  # probability that chance puts a direction within reach of a point; beyond, a match says nothing
 
 
@@ -22,20 +23,27 @@ class Sky(NamedTuple):
     density: Array
 
 
-class Pairs(NamedTuple):
-    """Pairs of catalogue directions, by ascending angle: its chord, and both places."""
+class Neighbours(NamedTuple):
+    """The nearest directions of each, by ascending distance: place (n, k), chord (n, k), and azimuth (n, k) in `TURN`
+    steps a turn, from a zero of each."""
 
-    chord: Array
-    first: NDArray[np.int64]
-    second: NDArray[np.int64]
+    place: NDArray[np.int32]
+    chord: NDArray[np.float32]
+    azimuth: NDArray[np.int32]
 
 
-class Patch(NamedTuple):
-    """Image points around a pair (k, 3) in the frame of its sum and difference, and the squared chord (k,) within which
-    each has its match."""
+class Rays(NamedTuple):
+    """The image points around one, by ascending distance: between which chords each may lie (k,), its azimuth (k,), and
+    the nats by which a neighbour there is likelier under the true rotation than by chance (k,)."""
 
-    points: Array
-    squared: Array
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    azimuth: NDArray[np.int32]
+    nats: NDArray[np.float32]
+
+    def nearest(self, count: int) -> "Rays":
+        """The first ones."""
+        return Rays(self.low[:count], self.high[:count], self.azimuth[:count], self.nats[:count])
 
 
 class Image(NamedTuple):
@@ -72,45 +80,30 @@ def _nearest(sky: Any, x: Any, y: Any, z: Any, squared: Any) -> Any:
 
 
 @compiled
-def propose(sky: Any, pairs: Any, low: int, high: int, patch: Any, abandoned: float, kept: Any, value: Any) -> None:
-    """Test the rotations that take the pairs low to high, either way round, to an image pair; keep the best.
+def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: Any, bin_of: Any) -> None:
+    """How well an image point agrees with directions: each ray votes for the turns that take it to a neighbour.
 
-    kept (b, 3, 3): axes of the catalogue's pair, as rows; value (b,): nats by which the matches of the patch are
-    likelier than by chance, descending; -inf for an empty place.
+    places (p,): of the directions. shift: of an azimuth to its place in bins (2^s,), of which two that lie side by side
+    count together. value, bin_of (p,): the most nats, and the second of the bins that have them.
     """
-    last, directions = len(value) - 1, sky.table.points
-    for t in range(low, high):
-        a, b = pairs.first[t], pairs.second[t]
-        ax, ay, az = directions[a, 0], directions[a, 1], directions[a, 2]
-        bx, by, bz = directions[b, 0], directions[b, 1], directions[b, 2]
-        sx, sy, sz = ax + bx, ay + by, az + bz
-        scale = 1 / math.sqrt(sx * sx + sy * sy + sz * sz)
-        sx, sy, sz = scale * sx, scale * sy, scale * sz
-        scale = 1 / pairs.chord[t]
-        dx, dy, dz = scale * (ax - bx), scale * (ay - by), scale * (az - bz)
-        nx, ny, nz = cross(sx, sy, sz, dx, dy, dz)
-        chance = math.pi * max(sky.density[a], sky.density[b])
-        for sign in (1.0, -1.0):
-            total = 0.0
-            for k in range(len(patch.squared)):
-                p, q, r = patch.points[k, 0], sign * patch.points[k, 1], sign * patch.points[k, 2]
-                x, y, z = p * sx + q * dx + r * nx, p * sy + q * dy + r * ny, p * sz + q * dz + r * nz
-                place, _ = _nearest(sky, x, y, z, patch.squared[k])
-                likely = min(CROWDED, chance * patch.squared[k])
-                total += LOG_HALF - math.log(1 - likely if place < 0 else likely)
-                if total < -abandoned:
-                    break
-            if total > value[last]:
-                c = last
-                while c > 0 and value[c - 1] < total:
-                    value[c] = value[c - 1]
-                    for e in range(9):
-                        kept[c, e // 3, e % 3] = kept[c - 1, e // 3, e % 3]
-                    c -= 1
-                value[c] = total
-                kept[c, 0, 0], kept[c, 0, 1], kept[c, 0, 2] = sx, sy, sz
-                kept[c, 1, 0], kept[c, 1, 1], kept[c, 1, 2] = sign * dx, sign * dy, sign * dz
-                kept[c, 2, 0], kept[c, 2, 1], kept[c, 2, 2] = sign * nx, sign * ny, sign * nz
+    count, mask = neighbours.chord.shape[1], len(bins) - 1
+    for p in range(len(places)):
+        a = places[p]
+        for c in range(len(bins)):
+            bins[c] = 0
+        first, best, where = 0, F(0), 0
+        for k in range(len(rays.low)):
+            while first < count and neighbours.chord[a, first] < rays.low[k]:
+                first += 1
+            e = first
+            while e < count and neighbours.chord[a, e] <= rays.high[k]:
+                turned = ((neighbours.azimuth[a, e] - rays.azimuth[k]) & (TURN - 1)) >> shift
+                for c in (turned, (turned + 1) & mask):
+                    bins[c] += rays.nats[k]
+                    if bins[c] > best:
+                        best, where = bins[c], c
+                e += 1
+        value[p], bin_of[p] = best, where
 
 
 @part

@@ -10,33 +10,33 @@ class InfinitySettings:
     noise: standard deviations of image points, pixels, for which it is searched, one after the other.
     reach: standard deviations within which a point is a match. cell: of the hash table, in reaches; what is less
         certain is no match yet.
-    table: pairs of catalogue directions that are kept, those with the smallest angles.
-    together: image points up to which every pair of the first ones is tried; of more, one partner of each.
-    patch: image points around a pair that test its rotations. narrowest: least angle of a pair, in those of its patch.
-    abandoned: nats by which chance has to explain the points of the patch better for a rotation to be left.
-    refined: rotations of a pair that are fitted: in `rounds` steps to the points of the patch and `sample` others, and
-        in `last_rounds` to all.
-    margin: nats by which a rotation may be worse than the best one without being dropped before it is weighed.
-    power: share of the pairs of true matches that give their rotation. turns: pairs, at most.
-    least_share: of the image points that a rotation explains, for which the pairs have to be enough where chance
-        explains all that was found.
+    around: image points around one whose turn about it has to agree. narrowest: least distance of them, in those by
+        which a chord may be off, so that their azimuths are known to a tenth.
+    first, promising: of these, how many nearest ones choose how many directions, which all of them look at.
+    refined: rotations of a point that are fitted: in `rounds` steps to the points around it, then in `last_rounds` to
+        `sample` others too, and to all.
+    contests: share of the nats of the best rotation that one of a sample of the points has to have to be fitted to all.
+    power: share of the true matches that give their rotation. turns: image points that are tried, at most.
+    rougher: of the noise that is searched for, how much more matches may show before a larger one is.
+    least_share: of the image points that a rotation explains, for which those that were tried have to be enough
+        where chance explains all that was found.
     """
 
     noise: tuple[float, ...] = (0.35, 1.4)
     reach: float = 3.2
-    cell: float = 6.0
-    table: int = 300_000
-    together: int = 100
-    patch: int = 20
-    narrowest: float = 0.4
-    abandoned: float = 2.5
+    cell: float = 4.0
+    around: int = 20
+    narrowest: float = 10.0
+    first: int = 8
+    promising: int = 256
     refined: int = 6
     sample: int = 200
     rounds: int = 6
     last_rounds: int = 3
-    margin: float = 20.0
+    contests: float = 0.7
     power: float = 0.9
-    turns: int = 400
+    turns: int = 200
+    rougher: float = 1.2
     least_share: float = 0.25
     zoom: float = 1.02
     zoom_noise: float = 3.0
