@@ -1,10 +1,7 @@
-"""Wheel, sdist and editable install are complete: each is built, unpacked elsewhere, and used from outside the
-checkout."""
+"""Wheel and sdist are complete; `make wheel` installs the wheel and uses it outside the checkout."""
 
-import os
 import subprocess
 import sys
-import sysconfig
 import tarfile
 import zipfile
 from pathlib import Path
@@ -33,7 +30,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
             else:
                 copy.write_bytes(file.read_bytes())
     found = {}
-    for kind in ("sdist", "wheel", "editable"):
+    for kind in ("sdist", "wheel"):
         (folder / "built").mkdir()
         command = [sys.executable, "-c", BUILD, f"build_{kind}"]
         done = subprocess.run(command, cwd=folder / "source", capture_output=True, text=True, check=False)
@@ -63,43 +60,3 @@ def test_wheel_and_sdist_hold_the_same_configurations_as_the_checkout(built: dic
             if member.name.endswith(".yaml") and (content := sdist.extractfile(member)) is not None:
                 in_sdist[member.name.partition("/")[2]] = content.read()
     assert {name: content for name, content in in_sdist.items() if name.startswith("bpnp/")} == in_wheel
-
-
-def test_an_editable_install_sees_the_configurations_of_the_checkout(built: dict[str, Path], tmp_path: Path) -> None:
-    zipfile.ZipFile(built["editable"]).extractall(tmp_path / "site")
-    script = f"""
-import site, sys
-site.addsitedir({str(tmp_path / "site")!r})
-sys.path.append({sysconfig.get_paths()["purelib"]!r})
-from bpnp.files import config_names, packaged_config
-sys.stdout.write(" ".join([packaged_config("quickstart"), *config_names()]))
-"""
-    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | {"PYTHONSAFEPATH": "1"}
-    # With the libraries of the site-packages, but without their .pth files, and so their installation of the package.
-    command = [sys.executable, "-S", "-c", script]
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
-    file, *names = done.stdout.split()
-    assert file == str(built["editable"].parent / "source/bpnp/configs/quickstart.yaml")
-    assert [f"configs/{name}.yaml" for name in names] == sorted(CONFIGS)
-
-
-def test_it_works_outside_the_checkout(built: dict[str, Path], tmp_path: Path) -> None:
-    zipfile.ZipFile(built["wheel"]).extractall(tmp_path / "site")
-    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site"), "PYTHONSAFEPATH": "1"}
-
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        done = subprocess.run(
-            [sys.executable, *arguments], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        return done
-
-    where = run("-c", "import bpnp; print(bpnp.__file__); bpnp.BPnPNet.from_pretrained('procedural-so3')").stdout
-    assert where.startswith(str(tmp_path / "site"))
-    assert run("-m", "bpnp", "--version").stdout.startswith("bpnp 0.")
-    by_name = run("-m", "bpnp", "fit", "--config", "quickstart", "--print_config")
-    assert "rounds: 8" in by_name.stdout
-    assert "is used" not in by_name.stderr
-    by_file = run("-m", "bpnp", "fit", "--config", "configs/quickstart.yaml", "--print_config")
-    assert by_file.stdout == by_name.stdout
-    assert f"the packaged {tmp_path}/site/bpnp/configs/quickstart.yaml is used" in by_file.stderr

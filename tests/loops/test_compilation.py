@@ -27,6 +27,11 @@ from bpnp.factor import factor
 def double(x):
     return factor() * x
 """
+CALL = """
+from bpnp.loop import double
+from bpnp.loops.parallel import Clock
+print(double(4), double(5), Clock.compiling > 0)
+"""
 
 
 @pytest.fixture
@@ -41,51 +46,23 @@ def package(tmp_path: Path) -> Path:
     return folder.parent
 
 
-def started(package: Path, cache: str, before: str = "") -> "subprocess.Popen[str]":
-    """A process that calls the loop of the package after the statements `before`."""
+def doubled(package: Path, cache: str) -> tuple[str, str]:
+    """What a new process that calls the loop prints, with whether the clock of limits stood still, and what it logs."""
     environment = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
     environment |= {"PYTHONPATH": str(package), "XDG_CACHE_HOME": cache, "HOME": cache}
-    ask = [sys.executable, "-c", f"from bpnp.loop import double\n{before}print(double(4), double(5))"]
-    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    return subprocess.Popen(ask, env=environment, cwd=package, **streams)  # type: ignore[call-overload,no-any-return]
+    ask = [sys.executable, "-c", CALL]
+    done = subprocess.run(ask, env=environment, cwd=package, capture_output=True, text=True, check=True)
+    return done.stdout, done.stderr
 
 
-def doubled(package: Path, cache: str) -> tuple[str, str]:
-    """What such a process prints and logs."""
-    return started(package, cache).communicate(timeout=120)
-
-
-def test_a_package_that_cannot_be_written_to_compiles_once_into_the_users_cache(package: Path, tmp_path: Path) -> None:
-    cache = tmp_path / "cache"
-    first, second = doubled(package, str(cache)), doubled(package, str(cache))
-    assert first[0] == second[0] == "8 10\n"
-    assert first[1].count("compiling") == 1
-    assert second[1] == ""
-    assert list(cache.rglob("*.nbi"))
-
-
-def test_a_change_of_a_file_that_a_loop_reads_compiles_again(package: Path, tmp_path: Path) -> None:
+def test_a_loop_is_compiled_once_into_the_users_cache_and_again_after_a_change(package: Path, tmp_path: Path) -> None:
+    """Of its package, which cannot be written to, and of a file that the loop reads."""
     cache = str(tmp_path / "cache")
-    assert doubled(package, cache)[0] == "8 10\n"
+    first, second = doubled(package, cache), doubled(package, cache)
+    assert (first[0], second[0]) == ("8 10 True\n", "8 10 False\n")
+    assert (first[1].count("compiling"), second[1]) == (1, "")
     (package / "bpnp" / "factor.py").write_text(FACTOR.replace("2", "30"))
-    assert doubled(package, cache)[0] == "120 150\n"
-    with (package / "bpnp" / "loops" / "compilation.py").open("a") as source:
-        source.write("# compiles in another way\n")
-    assert doubled(package, cache)[1].count("compiling") == 1
-
-
-def test_processes_that_compile_at_once_do_not_break_each_other(package: Path, tmp_path: Path) -> None:
-    """All find the loop's value, and what they leave in the cache is whole: the next one compiles nothing."""
-    cache, gate = str(tmp_path / "cache"), tmp_path / "gate"
-    gate.mkdir()
-    wait = (
-        f"import os, time\nopen(f'{gate}/{{os.getpid()}}', 'w').close()\n"
-        f"while len(os.listdir('{gate}')) < 3: time.sleep(0.001)\n"
-    )
-    for process in [started(package, cache, wait) for _ in range(3)]:
-        printed, logged = process.communicate(timeout=120)
-        assert (process.returncode, printed) == (0, "8 10\n"), logged
-    assert doubled(package, cache) == ("8 10\n", "")
+    assert doubled(package, cache)[0] == "120 150 True\n"
 
 
 SIGNATURES = """
@@ -125,23 +102,3 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
     assert {"explore", "descend", "descend_sparse", "add_shifted", "add_up"} <= set(versions)
     assert set(versions.values()) == {"1"}
     assert used == warm
-
-
-def test_the_time_of_compilation_is_in_no_limit(tmp_path: Path) -> None:
-    """The clock of deadlines stands still while a loop is compiled, and only then."""
-    script = (
-        "from bpnp.loops.parallel import Clock\n"
-        "from bpnp.search.kernels.neighbours import hashed\n"
-        "import numpy as np\n"
-        "hashed(np.eye(3), 0.1).count_on(np.eye(3), np.zeros((1, 3)), 1)\n"
-        "print(Clock.compiling)\n"
-    )
-    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
-    seconds = []
-    for _ in range(2):
-        run = subprocess.run(
-            [sys.executable, "-c", script], capture_output=True, text=True, check=True, env=environment
-        )
-        seconds.append(float(run.stdout))
-    assert seconds[0] > 0.01
-    assert seconds[1] == 0

@@ -11,14 +11,13 @@ from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
-from bpnp.robust.minimal_solvers import p3p, solve_p2p
+from bpnp.robust.minimal_solvers import p3p
 from bpnp.search import search, settings
 from bpnp.search.candidates import Candidates
-from bpnp.search.enumeration.poses import EnumeratedPoses, Enumeration, enumerate_poses
+from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses
 from bpnp.search.enumeration.search import Enumerated
 from bpnp.search.enumeration.settings import DEFAULT
 from bpnp.search.point_sets import PointSets
-from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 RADIUS = 2e-3
@@ -84,29 +83,6 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
     assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
-
-
-def unit(rng: np.random.Generator) -> Array:
-    return directions(rng.standard_normal(3))
-
-
-@pytest.mark.parametrize("kind", ["gravity", "rotation"])
-def test_two_matches_and_a_direction_give_the_pose(entry: Any, kind: str) -> None:
-    rng = np.random.default_rng(11)
-    for _ in range(100):
-        rays, points, rotation, translation, match = planted(rng, 5, noise=0.0)
-        up = unit(rng)
-        prior = GravityPrior(rotation @ up, up, 1.0) if kind == "gravity" else PosePrior(rotation, None, 1.0)
-        sets = PointSets(rays, points, prior=prior)
-        run, poses = Enumeration(sets, RADIUS, DEFAULT), np.empty((4, 4, 3))
-        seen = run.image.arrays.rays, run.scene.arrays.points
-        count = entry(solve_p2p)(0, 1, match[0], match[1], run.problem.heading, *seen, poses)
-        assert 0 < count <= 2
-        rotations, translations = run.leave(poses[:count])
-        off = np.abs(rotations - rotation).max((1, 2)) + np.abs(translations - translation).max(1)
-        assert off.min() < 1e-6
-        for r, t in zip(rotations, translations, strict=True):
-            np.testing.assert_allclose(directions(points[match[:2]] @ r.T + t), rays[:2], atol=1e-7)
 
 
 def test_the_deadline_ends_the_enumeration() -> None:
