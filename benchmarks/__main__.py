@@ -1,21 +1,21 @@
 """`python -m benchmarks` lists what can be measured; `python -m benchmarks NAME --help` tells the options of one."""
 
 import ast
-import runpy
+import importlib
 import sys
 from pathlib import Path
 
 FOLDER = Path(__file__).parent
 
 
-def programs() -> dict[str, tuple[Path, str]]:
-    """Name, file and first sentence of every module that has a `main`."""
+def programs() -> dict[str, tuple[str, str]]:
+    """Name, module and first sentence of every other module that has a `main`."""
     found = {}
-    for file in sorted(FOLDER.glob("*.py")):
+    for file in sorted(FOLDER.glob("[a-z]*.py")):
         tree = ast.parse(file.read_text(encoding="utf-8"))
-        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body) and file.stem[0] != "_":
+        if any(isinstance(node, ast.FunctionDef) and node.name == "main" for node in tree.body):
             sentence = (ast.get_docstring(tree) or "").split("\n\n")[0].replace("\n", " ")
-            found[file.stem.removeprefix("bench_")] = file, sentence
+            found[file.stem.removeprefix("bench_")] = file.stem, sentence
     return found
 
 
@@ -31,7 +31,7 @@ def main() -> None:
         return
     sys.path.insert(0, str(FOLDER))
     sys.argv = [f"python -m benchmarks {name}", *sys.argv[2:]]
-    runpy.run_path(str(known[name][0]), run_name="__main__")
+    importlib.import_module(known[name][0]).main()
 
 
 if __name__ == "__main__":

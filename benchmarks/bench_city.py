@@ -21,11 +21,11 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from record import TIME_LIMIT, Array, Outcome, Pose, Problem, Rows, degrees, measured, outcomes, parser
+from record import TIME_LIMIT, Array, Outcome, Pose, Problem, Rows, Similarity, degrees, measured, outcomes, parser
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED, median_distance, model_of
 
-from bpnp import SceneMap, warm_up
+from bpnp import SceneMap
 from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction
 from bpnp.maps.views import View
@@ -68,13 +68,11 @@ def place_of(scene: Reconstruction, left_out: Sequence[ImagePoints] = ()) -> Sce
     return SceneMap(scene.points3d, scene.point_ids, NONE, views).seen_by(2)
 
 
-def moved(place: SceneMap, scale: float, turn: Array, shift: Array) -> SceneMap:
-    """The place with every point p at scale * turn p + shift."""
-    views = []
-    for view in place.views:
-        rotation = view.rotation @ turn.T
-        views.append(replace(view, rotation=rotation, translation=scale * view.translation - rotation @ shift))
-    return replace(place, points3d=scale * place.points3d @ turn.T + shift, views=tuple(views))
+def moved(place: SceneMap, to: Similarity) -> SceneMap:
+    """The place in another frame."""
+    poses = [to.pose(view.rotation, view.translation) for view in place.views]
+    views = (replace(view, rotation=r, translation=t) for view, (r, t) in zip(place.views, poses, strict=True))
+    return replace(place, points3d=to.points(place.points3d), views=tuple(views))
 
 
 def part_of(place: SceneMap, chosen: NDArray[np.bool_], name: str = "") -> SceneMap:
@@ -110,11 +108,11 @@ def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
     return part_of(turned, rng.random(len(points)) > DROPPED, name)
 
 
-def anywhere(rng: np.random.Generator, places: int, unit: float) -> tuple[float, Array, Array]:
-    """A similarity: to scene units of 0.5 to 2 distances of a view, any rotation, a place in the city."""
+def anywhere(rng: np.random.Generator, places: int, unit: float) -> Similarity:
+    """To scene units of 0.5 to 2 distances of a view, any rotation, a place in the city."""
     scale = float(np.exp(rng.uniform(-1, 1) * np.log(2))) / unit
     side = APART * (places / 10) ** (1 / 3)
-    return scale, Rotation.random(rng=rng).as_matrix(), rng.uniform(0, side, 3)
+    return Similarity(scale, Rotation.random(rng=rng).as_matrix(), rng.uniform(0, side, 3))
 
 
 def photos_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
@@ -140,16 +138,16 @@ def city(
     for place, scene in zip(first, scenes, strict=True):
         unit = distance_of(place)
         moves = [anywhere(rng, len(scenes), unit) for _ in range(1 if twice is None else 2)]
-        places.append(moved(place, *moves[0]))
+        places.append(moved(place, moves[0]))
         if twice is not None:
             again = part_of(place, rng.random(len(place.points3d)) >= twice, "again/")
-            places.append(moved(again, *moves[1]))
+            places.append(moved(again, moves[1]))
         for image in left_out[scene.name]:
-            poses = tuple((image.rotation @ q.T, s * image.translation - image.rotation @ q.T @ c) for s, q, c in moves)
+            poses = tuple(move.pose(image.rotation, image.translation) for move in moves)
             keypoints = np.concatenate([image.points2d, image.clutter2d]).astype(np.float64)
             far = median_distance(scene.points3d[image.seen], (image.rotation, image.translation))
             name, keypoints = f"{scene.name}/{image.name}", rng.permutation(keypoints)
-            found.append(CityPhoto(name, keypoints, image.camera.focal, poses, moves[0][0] * far))
+            found.append(CityPhoto(name, keypoints, image.camera.focal, poses, moves[0].scale * far))
     if twice is None:
         places += copies(first, views - sum(len(place.views) for place in places), views, rng)
     return merged(places), found
@@ -161,7 +159,7 @@ def copies(first: Sequence[SceneMap], more: int, views: int, rng: np.random.Gene
     while more > 0:
         place = changed(first[number % len(first)], rng, f"copy {number // len(first) + 1}/")
         place = replace(place, views=place.views[:more])
-        yield moved(place, *anywhere(rng, len(first) * max(views // 500, 1), distance_of(place)))
+        yield moved(place, anywhere(rng, len(first) * max(views // 500, 1), distance_of(place)))
         more, number = more - len(place.views), number + 1
 
 
@@ -240,9 +238,4 @@ def main() -> None:
     options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
     options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds a photo (default: %(default)s)")
     chosen = options.parse_args()
-    warm_up()
     measured(rows(chosen), chosen, RIGHT_DEG, RIGHT_SHIFT)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,10 +1,10 @@
-"""The focal length unknown: photos in whole maps, or against one view, beside it with the focal length known; and LEDs.
+"""The focal length unknown: photos in whole maps, beside it with the focal length known; and LEDs.
 
     python -m benchmarks focal maps --limit 6 --seed 42
 
-What: maps (photos left out of their map, which view is not told), views (photos against the points of one view), leds
-(10 or more of them seen). Right is within 1.5 degrees, of LEDs within 3. A line says for how many the focal length is
-within 3 %, and how many are confident and more than 3 degrees off. --limit: problems a scene, or a setting of LEDs.
+What: maps (photos left out of their map, which view is not told), leds (10 or more of them seen). Right is within 1.5
+degrees, of LEDs within 3. A line says for how many the focal length is within 3 %, and how many are confident and more
+than 3 degrees off. --limit: problems a scene, or a setting of LEDs.
 """
 
 import argparse
@@ -13,27 +13,26 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from bench_constellation import Setting, picture
+from leds import Setting, picture
 from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
 from view_problems import REPORTED, ViewProblem, median_distance, scene_problems
 
-from bpnp import solve, warm_up
+from bpnp import solve
 from bpnp.cameras import image_size
 
-RIGHT_DEG = {"maps": 1.5, "views": 1.5, "leds": 3.0}
+RIGHT_DEG = {"maps": 1.5, "leds": 3.0}
 SCENES = (*REPORTED, "statue_of_liberty")
 LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in ("ring", "headset") for n in (0, 3)]
 
 
-def of_photos(photos: list[ViewProblem], known: bool, in_map: bool, seed: int) -> Iterator[Problem]:
+def of_photos(photos: list[ViewProblem], known: bool, seed: int) -> Iterator[Problem]:
     """With their camera, or with the image's size alone."""
     for photo in photos:
         pixels, size = image_of(photo)
         matrix = np.array([[photo.focal, 0, size[0] / 2], [0, photo.focal, size[1] / 2], [0, 0, 1]])
         camera: dict[str, Any] = {"camera": matrix} if known else {"image_size": size}
-        search = photo.scene.localize if in_map else partial(solve, points3d=photo.points3d)
         yield Problem(
-            photo.name, partial(search, pixels, **camera, seed=seed, time_limit=TIME_LIMIT), [photo.pose],
+            photo.name, partial(photo.scene.localize, pixels, **camera, seed=seed, time_limit=TIME_LIMIT), [photo.pose],
             distance=median_distance(photo.seen, photo.pose), focal=np.nan if known else photo.focal,
         )  # fmt: skip
 
@@ -52,12 +51,9 @@ def of_leds(setting: Setting, k: int, limit: int, seed: int) -> Iterator[Problem
     rng = np.random.default_rng([seed, k])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
-        known: dict[str, Any] = {
-            "normals3d": shown.device.normals3d,
-            "image_size": (shown.camera.size,) * 2,
-            "seed": seed,
-        }
-        search = partial(solve, shown.pixels, shown.device.points3d, **known)
+        points = shown.pixels, shown.device.points3d
+        size = (shown.camera.size, shown.camera.size)
+        search = partial(solve, *points, normals3d=shown.device.normals3d, image_size=size, seed=seed)
         pose, distance = (shown.rotation, shown.translation), float(np.linalg.norm(shown.translation))
         yield Problem(f"{i}", search, [pose], distance=distance, focal=shown.camera.focal)
 
@@ -66,13 +62,10 @@ def rows(options: argparse.Namespace) -> Rows:
     if options.what == "leds":
         yield from ((one.name, partial(of_leds, one, k, options.limit, options.seed)) for k, one in enumerate(LEDS))
         return
-    in_map = options.what == "maps"
-    chosen = {"views": 0, "outliers": 1.0, "most": None} if in_map else {"views": 1, "outliers": 0.5}
-    chosen |= {"limit": options.limit, "seed": options.seed}
+    chosen = {"against": "map", "outliers": 1.0, "limit": options.limit, "seed": options.seed}
     photos = [photo for name in options.scenes for photo in scene_problems(options.data, name, **chosen)]
     for known in (True, False):
-        name = f"{'whole map' if in_map else 'one view'}, {'known' if known else 'unknown'}"
-        yield name, partial(of_photos, photos, known, in_map, options.seed)
+        yield f"whole map, {'known' if known else 'unknown'}", partial(of_photos, photos, known, options.seed)
 
 
 def main() -> None:
@@ -80,9 +73,4 @@ def main() -> None:
     options.add_argument("what", choices=RIGHT_DEG)
     options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
     chosen = options.parse_args()
-    warm_up()
     measured(rows(chosen), chosen, RIGHT_DEG[chosen.what])
-
-
-if __name__ == "__main__":
-    main()

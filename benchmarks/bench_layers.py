@@ -13,22 +13,14 @@ import time
 from collections.abc import Callable, Iterator
 from copy import deepcopy
 from functools import partial
+from typing import Any
 
 import numpy as np
 import roma
 import torch
-from paper_layers import (
-    SINKHORN_TOLERANCE,
-    paper_losses,
-    pnp_backward,
-    pnp_forward,
-    sinkhorn_backward,
-    sinkhorn_forward,
-)
+from paper_layers import SINKHORN_TOLERANCE, PaperPnP, PaperSinkhorn, paper_losses
 from problems import Kind, diagonal_mass, planted, planted_network, training_losses, training_step
 from record import parser, write
-from rich.console import Console
-from rich.table import Table
 from torch import Tensor
 
 from bpnp.cli import keep_freed_memory
@@ -74,18 +66,17 @@ def rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]
     yield from pnp_rows(points, batch, rounds)
     for kind, level, mu, iterations in FORWARD:
         cost = planted(batch, points, kind=kind, level=level).cost
-        ours, tolerance = partial(sinkhorn, cost, mu=mu), SINKHORN_TOLERANCE if iterations == MANY else 0
-        papers = partial(sinkhorn_forward, cost, mu=mu, iterations=iterations, tolerance=tolerance)
+        tolerance = SINKHORN_TOLERANCE if iterations == MANY else 0
+        ours, papers = partial(sinkhorn, cost, mu=mu), partial(PaperSinkhorn.apply, cost, mu, iterations, tolerance)
         ends = "to its tolerance" if tolerance else f"{iterations} iterations"
         inputs = f"{kind}, {diagonal_mass(ours()[0]):.0%}"
         yield f"Sinkhorn forward, mu {mu}, the paper's {ends}", inputs, race(ours, papers, rounds=rounds)
     for kind, level in BACKWARD:
         cost = planted(batch, points, kind=kind, level=level).cost.requires_grad_()
         plan = sinkhorn(cost, mu=MU)[0]
-        by_loss = 1 - 2 * torch.eye(points).expand_as(plan)
-        back = partial(torch.autograd.grad, plan, cost, by_loss, retain_graph=True)
-        papers = partial(sinkhorn_backward, plan.detach(), by_loss, mu=MU)
-        yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", race(back, papers, rounds=rounds)
+        back = [gradient_of(each, cost, 1 - 2 * torch.eye(points).expand_as(plan))
+                for each in (plan, PaperSinkhorn.apply(cost, MU))]  # fmt: skip
+        yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", race(*back, rounds=rounds)
     problem = planted(batch, points, kind="smooth", level=10)
     net = planted_network(problem)
     for poses, what in ((False, "correspondence loss"), (True, "with pose loss")):
@@ -102,21 +93,19 @@ def pnp_rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, R
     start = ransac_pnp(plan, problem.batch.points2d, points3d)[:2]
     inputs, vector = f"smooth, {diagonal_mass(plan):.0%}", torch.cat([roma.rotmat_to_rotvec(start[0]), start[1]], -1)
     ours = partial(weighted_pnp, plan, rays, points3d, *start)
-    papers = partial(pnp_forward, *(x.double() for x in (plan, rays, points3d, vector)))
+    papers = partial(PaperPnP.apply, *(x.double() for x in (plan, rays, points3d, vector)))
     yield "PnP forward, from RANSAC", inputs, race(ours, papers, rounds=rounds)
 
     leaf = plan.clone().requires_grad_()
-    solved = weighted_pnp(leaf, rays, points3d, *start)[:2]
-    incoming = [noise(x.shape, seed) for seed, x in enumerate(solved)]
-    pose = torch.cat([roma.rotmat_to_rotvec(solved[0]), solved[1]], -1).detach().requires_grad_()
-    through = (roma.rotvec_to_rotmat(pose[:, :3]) * incoming[0]).sum() + (pose[:, 3:] * incoming[1]).sum()
-    back = partial(torch.autograd.grad, solved, leaf, incoming, retain_graph=True)
-    papers_back = partial(pnp_backward, pose, plan, rays, points3d, torch.autograd.grad(through, pose)[0])
-    yield "PnP backward", inputs, race(back, papers_back, rounds=rounds)
+    solved, pose = weighted_pnp(leaf, rays, points3d, *start)[:2], PaperPnP.apply(leaf, rays, points3d, vector)
+    incoming = [torch.randn(x.shape, generator=torch.Generator().manual_seed(0)) for x in solved]
+    papers_pose = roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:]
+    back = [gradient_of(each, leaf, incoming) for each in (solved, papers_pose)]
+    yield "PnP backward", inputs, race(*back, rounds=rounds)
 
 
-def noise(shape: torch.Size, seed: int) -> Tensor:
-    return torch.randn(shape, generator=torch.Generator().manual_seed(seed))
+def gradient_of(outputs: Any, inputs: Tensor, incoming: Any) -> Callable[[], object]:
+    return partial(torch.autograd.grad, outputs, inputs, incoming, retain_graph=True)
 
 
 def main() -> None:
@@ -126,12 +115,12 @@ def main() -> None:
     options.add_argument("--batch", type=int, default=4, help="problems in a batch (default: 4)")
     options.add_argument("--threads", type=int, default=1)
     chosen = options.parse_args()
+    restart_with_settings()
     torch.set_num_threads(chosen.threads)
-    table, found = Table("what", "inputs", "ours, CPU ms", "paper's, CPU ms", "ratio"), []
-    for what, inputs, result in rows(chosen.points, chosen.batch, chosen.rounds):
-        table.add_row(what, inputs, *(f"{value:.3g}" for value in result))
-        found.append({"what": what, "inputs": inputs, "ms": result[:2], "ratio": result[2]})
-    Console(width=None if Console().is_terminal else 120).print(table)
+    found = []
+    for what, inputs, (ours, papers, ratio) in rows(chosen.points, chosen.batch, chosen.rounds):
+        print(f"{what}; {inputs}: ours {ours:.3g} CPU ms, the paper's {papers:.3g}, ratio {ratio:.3g}", flush=True)
+        found.append({"what": what, "inputs": inputs, "ms": [ours, papers], "ratio": ratio})
     if chosen.output:
         write(chosen.output, {"points": chosen.points, "batch": chosen.batch, "rows": found})
 
@@ -147,8 +136,3 @@ def restart_with_settings() -> None:
     if not settings.keys() <= os.environ.keys():
         os.execve(sys.executable, sys.orig_argv, settings | dict(os.environ))
     keep_freed_memory()
-
-
-if __name__ == "__main__":
-    restart_with_settings()
-    main()

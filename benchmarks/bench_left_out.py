@@ -2,16 +2,16 @@
 
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
-Methods: views (the three views that share most points are named), map (none is); views-sift and map-sift, the same
-with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words retrieves.
-pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of all
-photos, aligned by the views that both models have.
+Rows of a scene: views (the three views that share most points are named), map (none is); views-sift and map-sift, the
+same with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each photo on the first run and keeps it
+in --maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from descriptor_poses import DescribedMap
@@ -25,13 +25,10 @@ from bpnp.maps.photos import detected_keypoints
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 FEATURES = 2048  # of a photo in the maps, the largest
 VIEWS = 3
-METHODS = ("views", "map", "views-sift", "map-sift", "words-sift")
 RIGHT_DEG = 1.0
 
 
-def problems_of(
-    scene: PhotoScene, photo: str, full: SceneMap, methods: Sequence[str], seed: int
-) -> dict[str, Problem]:  # fmt: skip
+def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dict[str, Problem]:
     """By method, of one photo that is left out of its map; reading and detecting is done before."""
     place, found = SceneMap.from_colmap(scene.without(photo)), detected_keypoints(scene.photos / photo)
     (true,) = full.named([photo])
@@ -40,33 +37,27 @@ def problems_of(
     views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
     far = median_distance(full.points3d[true.points], (true.rotation, true.translation))
     alignment = aligned(full, place)
-    rotation, centre = alignment.pose(true.rotation, true.translation)
-    described = DescribedMap(scene.without(photo), scene.database) if any("sift" in m for m in methods) else None
-
-    def search(method: str) -> Callable[[], Solution]:
-        named = views if method.startswith("views") else None
-        if described is not None and method == "words-sift":
-            _ = described.words  # made before the first photo
-            return lambda: described.localize(photo, scene.camera, described.retrieved(photo))
-        if described is not None and method.endswith("-sift"):
-            return lambda: described.localize(photo, scene.camera, named)
-        return lambda: place.localize(
-            found.pixels, ("PINHOLE", scene.camera), views=named, scores=found.scores, seed=seed, time_limit=TIME_LIMIT
-        )
-
-    name, pose = f"{scene.photos.name}/{photo}", (rotation, -rotation @ centre)
-    return {method: Problem(name, search(method), [pose], distance=far * alignment.scale) for method in methods}
+    described = DescribedMap(scene.without(photo), scene.database)
+    known: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": TIME_LIMIT}
+    searches: dict[str, Callable[[], Solution]] = {}
+    for method, named in (("views", views), ("map", None)):
+        searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **known)
+        searches[f"{method}-sift"] = partial(described.localize, photo, CAMERA, named)
+    name, pose = f"{scene.photos.name}/{photo}", alignment.pose(true.rotation, true.translation)
+    return {
+        method: Problem(name, search, [pose], distance=far * alignment.scale) for method, search in searches.items()
+    }
 
 
 def rows(options: argparse.Namespace) -> Rows:
     for name in options.scenes:
         kept = options.maps / f"{name}-{FEATURES}"
-        scene = PhotoScene(options.data / "photos" / name, kept, tuple(options.camera), FEATURES)
+        scene = PhotoScene(options.data / "photos" / name, kept, CAMERA, FEATURES)
         full = SceneMap.from_colmap(scene.full())
         photos = [photo for photo in scene.names() if photo in full.view_numbers]
         chosen = [photos[i] for i in sorted({int(k * len(photos) / options.limit) for k in range(options.limit)})]
-        drawn = [problems_of(scene, photo, full, options.methods, options.seed) for photo in chosen]
-        for method in options.methods:
+        drawn = [problems_of(scene, photo, full, options.seed) for photo in chosen]
+        for method in drawn[0]:
             yield f"{name}, {method}", partial(list, [one[method] for one in drawn])
 
 
@@ -74,11 +65,5 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("scenes", nargs="+", metavar="SCENE")
     options.add_argument("--maps", type=Path, default=Path("runs/left-out"), help="folder of the maps that are built")
-    options.add_argument("--camera", type=float, nargs=4, default=CAMERA, metavar=("FX", "FY", "CX", "CY"))
-    options.add_argument("--methods", nargs="+", choices=METHODS, default=METHODS)
     chosen = options.parse_args()
     measured(rows(chosen), chosen, RIGHT_DEG)
-
-
-if __name__ == "__main__":
-    main()

@@ -6,16 +6,17 @@ Maps are drawn: places of 1,000 points that ten views see, as COLMAP's binary fi
 row is a process of its own; opening counts what the first photo would compute.
 """
 
-import argparse
+import multiprocessing
 import resource
 import shutil
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import numpy as np
+from record import parser
 from scipy.spatial.transform import Rotation
+
+import bpnp
 
 SEEN, TRACK = 1000, 10  # points of a place, views that see them
 FOCAL, WIDTH, HEIGHT = 700.0, 800, 600
@@ -52,44 +53,37 @@ def write_map(folder: Path, count: int) -> None:
     np.save(folder / "photo.npy", keypoints["xy"][chosen] + 0.5 * rng.standard_normal((len(chosen), 2)))
 
 
-def opened(folder: Path) -> str:
-    """Seconds and memory of this process."""
-    import bpnp
-
+def opened(folder: Path) -> None:
+    """Print seconds and memory of this process."""
     bpnp.warm_up()
     begun = time.process_time()
     scene = bpnp.SceneMap.from_colmap(folder)
     known = len(scene.cones.axes), len(scene.pictures.reaches)  # what the first photo would compute
     assert known == (len(scene.points3d), len(scene.views))
-    middle, memory = time.process_time(), _peak()
-    camera = "SIMPLE_PINHOLE", (FOCAL, WIDTH / 2, HEIGHT / 2)
-    found = scene.localize(np.load(folder / "photo.npy"), camera)
-    return (
-        f"{scene}: opened in {middle - begun:.2f} CPU s, {memory:.2f} GB; first photo "
-        f"{time.process_time() - middle:.2f} CPU s, {_peak():.2f} GB, {found.verdict}"
+    middle, memory = time.process_time(), peak()
+    found = scene.localize(np.load(folder / "photo.npy"), ("SIMPLE_PINHOLE", (FOCAL, WIDTH / 2, HEIGHT / 2)))
+    after = time.process_time()
+    print(
+        f"{scene}: opened in {middle - begun:.2f} CPU s, {memory:.2f} GB; first photo {after - middle:.2f} CPU s, "
+        f"{peak():.2f} GB, {found.verdict}",
+        flush=True,
     )
 
 
-def _peak() -> float:
+def peak() -> float:
     """Memory of this process, GB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
 def main() -> None:
-    options = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    options = parser(__doc__)
     options.add_argument("--points", type=int, nargs="+", default=[10**4, 10**5, 10**6])
     options.add_argument("--folder", type=Path, default=Path("runs/opening"))
-    options.add_argument("--only", type=Path, help=argparse.SUPPRESS)
     chosen = options.parse_args()
-    if chosen.only is not None:
-        print(opened(chosen.only), flush=True)
-        return
     for count in chosen.points:
         shutil.rmtree(chosen.folder, ignore_errors=True)
         write_map(chosen.folder, count)
         for _ in range(2):
-            subprocess.run([sys.executable, "-m", "benchmarks", "opening", "--only", chosen.folder], check=True)
-
-
-if __name__ == "__main__":
-    main()
+            process = multiprocessing.get_context("spawn").Process(target=opened, args=(chosen.folder,))
+            process.start()
+            process.join()

@@ -15,10 +15,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from bench_constellation import Camera, device
+from leds import Camera, device
 from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
 from scipy.spatial.transform import Rotation
-from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, model_of, overlapping, photos, view_problem
+from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, images_of, model_of, overlapping, view_problem
 
 import bpnp
 
@@ -64,9 +64,9 @@ def of_photos(used: int, options: argparse.Namespace) -> Iterator[Problem]:
     """A photo and the two others that overlap with it most, against the points of a fourth image."""
     for name in options.scenes:
         scene = model_of(options.data, name)
-        for query in photos(scene, options.limit):
-            shown = view_problem(scene, query, views=1, outliers=1.0, seed=options.seed)
-            beside = [view for _, view in overlapping(scene, query) if view.name not in shown.views][:2]
+        for query in images_of(scene, options.limit):
+            shown = view_problem(scene, query, against="view", outliers=1.0, seed=options.seed)
+            beside = [view for _, view in overlapping(scene, query) if view.name != shown.view][:2]
             if len(beside) < 2 or shown.matches < LEAST_MATCHES:
                 continue
             rng, pixels = np.random.default_rng([options.seed, query.image_id]), [shown.pixels[0]]
@@ -95,7 +95,6 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
     chosen = options.parse_args()
-    bpnp.warm_up()
     rows: Rows = [
         (f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, is_metric))
         for name, cameras, used, is_metric in (
@@ -107,7 +106,3 @@ def main() -> None:
         )
     ] + [(f"photos, {name}", partial(of_photos, used, chosen)) for name, used in (("one camera", 1), ("3 cameras", 3))]
     measured(rows, chosen, RIGHT_DEG)
-
-
-if __name__ == "__main__":
-    main()

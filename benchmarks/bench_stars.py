@@ -15,7 +15,7 @@ from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
-from bench_constellation import Camera
+from leds import Camera
 from numpy.typing import NDArray
 from record import TIME_LIMIT, Array, Outcome, Problem, Rows, degrees, measured, parser
 from scipy.spatial.transform import Rotation
@@ -135,7 +135,3 @@ def main() -> None:
     options.add_argument("--peers", action="store_true", help="tetra3rs too")
     chosen = options.parse_args()
     measured(rows(chosen.limit, chosen.seed, peers=chosen.peers), chosen, RIGHT_DEG)
-
-
-if __name__ == "__main__":
-    main()

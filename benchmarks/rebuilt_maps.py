@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from record import Array
+from record import Similarity
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
@@ -80,22 +80,9 @@ class PhotoScene:
         return folder
 
 
-@dataclass(frozen=True, eq=False)
-class Alignment:
-    """A similarity between the frames of two models of the same views: p in `there` is scale * turn p + shift."""
-
-    scale: float
-    turn: Array
-    shift: Array
-
-    def pose(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
-        """A pose of the first frame, and its camera's centre, in the second one."""
-        centre = -rotation.T @ translation
-        return rotation @ self.turn.T, self.scale * self.turn @ centre + self.shift
-
-
-def aligned(here: SceneMap, there: SceneMap) -> Alignment:
-    """From the poses of the views that both have: mean rotation between their cameras, then their centres."""
+def aligned(here: SceneMap, there: SceneMap) -> Similarity:
+    """The frame of `there` in that of `here`, from the poses of the views that both have: the mean rotation between
+    their cameras, then their centres."""
     names = [view.name for view in here.views if view.name in there.view_numbers]
     ours, theirs = here.named(names), there.named(names)
     turns = [b.rotation.T @ a.rotation for a, b in zip(ours, theirs, strict=True)]
@@ -103,4 +90,4 @@ def aligned(here: SceneMap, there: SceneMap) -> Alignment:
     a, b = (np.array([view.centre for view in views]) for views in (ours, theirs))
     a0, b0 = a - a.mean(0), b - b.mean(0)
     scale = float(((a0 @ turn.T) * b0).sum() / (a0**2).sum())
-    return Alignment(scale, turn, b.mean(0) - scale * turn @ a.mean(0))
+    return Similarity(scale, turn, b.mean(0) - scale * turn @ a.mean(0))

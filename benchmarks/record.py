@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import fdtri, stdtrit
 
-from bpnp import Solution
+from bpnp import Solution, warm_up
 from bpnp.files import written_whole
 from bpnp.search.evidence.uncertainty import ONE_SIGMA
 
@@ -32,6 +32,23 @@ BOUND = 0.999  # share of the confident poses that are within their bound
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # rotation, translation: camera = R p + t
+
+
+@dataclass(frozen=True, eq=False)
+class Similarity:
+    """Another frame of a scene, in which p is at scale * turn p + shift."""
+
+    scale: float
+    turn: Array
+    shift: Array
+
+    def points(self, points3d: Array) -> Array:
+        return self.scale * points3d @ self.turn.T + self.shift
+
+    def pose(self, rotation: Array, translation: Array) -> Pose:
+        """A camera's pose, its depths in the unit of the new frame."""
+        turned = rotation @ self.turn.T
+        return turned, self.scale * translation - turned @ self.shift
 
 
 def parser(doc: str | None) -> argparse.ArgumentParser:
@@ -190,6 +207,7 @@ def line(row: dict[str, Any]) -> str:
 
 def measured(rows: Rows, options: argparse.Namespace, right_deg: float, right_shift: float = np.inf) -> None:
     """Print a line for each row as it comes, and write all with their outcomes to `--output`."""
+    warm_up()
     results: dict[str, dict[str, Any]] = {}
     for name, problems in rows:
         if not any(part in name for part in options.only):
@@ -210,8 +228,7 @@ def write(path: Path, record: dict[str, Any]) -> None:
     commit = subprocess.run(
         ["git", "-C", ROOT, "describe", "--always", "--dirty"], capture_output=True, text=True, check=False
     )
-    command = ["python", "-m", "benchmarks", Path(sys.argv[0]).stem.removeprefix("bench_"), *sys.argv[1:]]
-    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(command), "machine": machine()}
+    head = {"commit": commit.stdout.strip() or "unknown", "command": " ".join(sys.argv), "machine": machine()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as temporary:
         temporary.write_text(json.dumps(head | record, indent=1) + "\n")

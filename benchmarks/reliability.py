@@ -6,8 +6,7 @@
 Families: leds (the settings of `constellation`), shapes (0, 0.25 and 0.5 outliers a match), photos (against
 the points of one view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard
 (`hard_scenes.py`), focal (photos against one view, and planes, with a focal length 5 to 33 % wrong), focal_maps (photos
-left out of their map, as wrong by each of --factors), noise (image and scene points drawn independently), shuffled
-(keypoints of one photo, points that another one sees), labels (LEDs of three colours that a classifier of Gaussian
+left out of their map, as wrong by each of --factors), labels (LEDs of three colours that a classifier of Gaussian
 noise sees: without labels, with its likeliest class, and with its probabilities). --limit: problems of each
 setting. Photos are of scenes on which no constant was chosen (`--scenes`).
 
@@ -27,16 +26,16 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import patch
 
-import bench_constellation
-import bench_search
+import leds
 import numpy as np
 import pandas as pd
-from hard_scenes import CAMERA, HEIGHT, SCENES, WIDTH, Drawn, wrong_focal_plane
+import shapes
+from hard_scenes import CAMERA, SCENES, Drawn, wrong_focal_plane
 from matplotlib.figure import Figure
 from record import TIME_LIMIT, Array, Problem, beyond_bound, degrees, parser, sigmas
 from scipy.special import softmax
 from scipy.stats import binomtest
-from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, ViewProblem, scene_problems
+from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_problems
 
 from bpnp import Solution, solve, warm_up
 from bpnp.cameras import camera_from
@@ -48,8 +47,6 @@ from bpnp.solving.sources import Options, solutions_of
 
 OUTLIERS = (0.0, 0.25, 0.5, 0.75, 1.0)
 RATIOS = (0.0, 0.25, 0.5)
-NOISE = ((6, 6), (8, 8), (10, 17), (30, 30), (20, 100), (100, 100), (400, 400))
-SHUFFLED = (15, 40, 120, 400)
 FACTORS = (0.67, 0.8, 0.9, 0.95, 1.05, 1.1, 1.2, 1.33)
 WRONG_DEG, WRONG_SHIFT, WRONG_CENTRE = 3.0, 0.1, 0.05
 COLOURS, BLUR = 3, 0.8  # classes of LEDs, and the noise of what a classifier sees of them
@@ -57,26 +54,26 @@ NORMAL = (0.6827, 0.9545, 0.9973)  # shares within 1, 2 and 3 standard deviation
 GROUPS = {"right, confident": "tab:green", "right": "tab:olive", "wrong": "0.8", "wrong, confident": "tab:red"}
 
 
-def leds(options: Any) -> Iterator[Problem]:
-    for name in bench_constellation.SETTINGS:
-        yield from bench_constellation.problems(name, options.limit, options.seed)
+def of_leds(options: Any) -> Iterator[Problem]:
+    for name in leds.SETTINGS:
+        yield from leds.problems(name, options.limit, options.seed)
 
 
-def shapes(options: Any) -> Iterator[Problem]:
+def of_shapes(options: Any) -> Iterator[Problem]:
     for ratio in RATIOS:
         chosen = f"shapes-{ratio:.2f}", options.data, options.limit, options.seed, options.time_limit
-        for one in bench_search.problems(*chosen):
+        for one in shapes.problems(*chosen):
             yield replace(one, name=f"{ratio:g} outliers a match/{one.name}")
 
 
 def photos(options: Any) -> Iterator[Problem]:
     for outliers in OUTLIERS:
-        for photo in in_turns(options, outliers, 1):
+        for photo in in_turns(options, outliers, "view"):
             yield with_camera(f"{outliers:.0%} outliers/{photo.name}", photo, 1.0, options)
 
 
 def focal(options: Any) -> Iterator[Problem]:
-    for k, photo in enumerate(in_turns(options, 0.5, 1)):
+    for k, photo in enumerate(in_turns(options, 0.5, "view")):
         for factor in options.factors[k % 2 :: 2]:
             yield with_camera(f"photos {abs(factor - 1):.0%}/{photo.name} x {factor}", photo, factor, options)
     rng = np.random.default_rng([options.seed, 1])
@@ -84,13 +81,13 @@ def focal(options: Any) -> Iterator[Problem]:
 
 
 def focal_maps(options: Any) -> Iterator[Problem]:
-    for photo in in_turns(options, 1.0, 0):
+    for photo in in_turns(options, 1.0, "map"):
         for factor in options.factors:
             yield in_map(f"maps {abs(factor - 1):.0%}/{photo.name} x {factor}", photo, factor, options)
 
 
 def maps(options: Any) -> Iterator[Problem]:
-    for photo in in_turns(options, 1.0, 0):
+    for photo in in_turns(options, 1.0, "map"):
         yield in_map(f"maps/{photo.name}", photo, 1.0, options)
 
 
@@ -105,8 +102,8 @@ def labels(options: Any) -> Iterator[Problem]:
         for k in range(options.limit):
             rng = np.random.default_rng([options.seed, k])
             shape = ("ring", "headset", "drone", "marker")[k % 4]
-            setting = bench_constellation.Setting("labels", shape, background=3, missing=0.1, least=5, normals=False)  # type: ignore[arg-type]
-            shown = bench_constellation.picture(setting, 1000 * options.seed + k, rng)
+            setting = leds.Setting("labels", shape, background=3, missing=0.1, least=5, normals=False)  # type: ignore[arg-type]
+            shown = leds.picture(setting, 1000 * options.seed + k, rng)
             scene = rng.permutation(np.arange(len(shown.device.points3d)) % COLOURS)
             image = np.where(shown.led >= 0, scene[shown.led], rng.integers(COLOURS, size=len(shown.led)))
             score = (np.eye(COLOURS)[image] + BLUR * rng.standard_normal((len(image), COLOURS))) / BLUR**2
@@ -118,37 +115,15 @@ def labels(options: Any) -> Iterator[Problem]:
             yield Problem(f"{kind}/{k}", run, [(shown.rotation, shown.translation)], points[1])
 
 
-def noise(options: Any) -> Iterator[Problem]:
-    for m, n in NOISE:
-        rng = np.random.default_rng([options.seed, m, n])
-        for k in range(options.limit):
-            points = rng.uniform((0, 0), (WIDTH, HEIGHT), (m, 2)), rng.uniform(-1, 1, (n, 3))
-            yield Problem(
-                f"{m} x {n}/{k}", partial(solve, *points, CAMERA, time_limit=options.time_limit), [], points[1]
-            )
-
-
-def shuffled(options: Any) -> Iterator[Problem]:
-    names = (*options.scenes, "psb")
-    problems = [list(bench_search.of_data(name, 0.0, options.data, 8, options.seed)) for name in names]
-    for size in SHUFFLED:
-        rng = np.random.default_rng([options.seed, size])
-        for k in range(options.limit):
-            one, other = (problems[i] for i in rng.choice(len(problems), 2, replace=False))
-            points2d, points3d = one[rng.integers(len(one))][1], other[rng.integers(len(other))][2]
-            points = rng.permutation(points2d)[:size], rng.permutation(points3d)[:size]
-            run = partial(solve, *points, time_limit=options.time_limit)
-            yield Problem(f"shuffled, {size} points/{k}", run, [], points[1])
-
-
 FAMILIES = {
-    family.__name__: family for family in (leds, shapes, photos, maps, hard, focal, focal_maps, noise, shuffled, labels)
+    "leds": of_leds, "shapes": of_shapes, "photos": photos, "maps": maps, "hard": hard, "focal": focal,
+    "focal_maps": focal_maps, "labels": labels,
 }  # fmt: skip
 
 
-def in_turns(options: Any, outliers: float, views: int) -> Iterator[ViewProblem]:
+def in_turns(options: Any, outliers: float, against: Against) -> Iterator[ViewProblem]:
     """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
-    known = {"views": views, "outliers": outliers, "seed": options.seed, "most": MOST_POINTS if views else None}
+    known = {"against": against, "outliers": outliers, "seed": options.seed}
     turns = [scene_problems(options.data, scene, limit=options.limit, **known) for scene in options.scenes]
     for turn in zip(*turns, strict=False):
         yield from (photo for photo in turn if photo.matches >= LEAST_MATCHES)
@@ -294,7 +269,3 @@ def main() -> None:
     print(summary(rows))
     if chosen.draw:
         draw(rows, chosen.draw)
-
-
-if __name__ == "__main__":
-    main()

@@ -20,12 +20,12 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import bench_constellation
-import bench_search
-import bench_views
+import leds
+import shapes
 import torch
+import view_problems
 from record import ROOT, Outcome, Problem, line, outcomes, parser, summary, write
-from view_problems import MOST_POINTS, REPORTED
+from view_problems import REPORTED
 
 from bpnp import warm_up
 from bpnp.datamodules import MeshDataModule, Outliers
@@ -62,7 +62,7 @@ class Row:
 
 
 def search(name: str, limit: int, seed: int, data: Path) -> Iterator[Problem]:
-    return bench_search.problems(name, data, limit, seed)
+    return shapes.problems(name, data, limit, seed)
 
 
 def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Problem]:
@@ -70,12 +70,16 @@ def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Prob
     return [one for scene in REPORTED for one in search(scene + suffix, each, seed, data)][:limit]
 
 
-def views(method: str, chosen: dict[str, Any], limit: int, seed: int, data: Path) -> Iterator[Problem]:
-    return bench_views.problems(bench_views.photos(limit, seed, data=data, **chosen), method, seed)
+def photos(
+    against: str, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
+) -> Iterator[Problem]:
+    """Photos in their map, or by the points alone; apart: of other places."""
+    drawn = view_problems.photos(limit, REPORTED, data, against=against, outliers=outliers, seed=seed)
+    return view_problems.problems(view_problems.elsewhere(drawn) if apart else drawn, in_map=in_map, seed=seed)
 
 
-def leds(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
-    return bench_constellation.problems(name, limit, seed)
+def lights(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
+    return leds.problems(name, limit, seed)
 
 
 def network(
@@ -96,8 +100,6 @@ def network(
         yield Outcome(batch.ids[0], turn, shift, "", seconds)
 
 
-MAP = {"views": 0, "outliers": 1.0, "most": None}
-ONE = {"views": 1, "most": MOST_POINTS}
 PAPER = (15.0, 0.5)  # degrees and scene units
 ROWS = (
     *(
@@ -111,19 +113,19 @@ ROWS = (
     Row("search", "PSB meshes, 0.5 outliers a match", partial(search, "psb-0.50"), (100, 3), *PAPER, data="psb"),
     Row("search", "photos, the points that they see", partial(reported_scenes, ""), (100, 5), 1.0, data="colmap"),
     Row("search", "photos, 0.5 outliers a match", partial(reported_scenes, "-0.50"), (100, 5), 1.0, data="colmap"),
-    Row("maps", "left out of its map, which view is told", partial(views, "localize", ONE | {"best": True,
-        "outliers": 1.0}), (48, 5), 1.0, data="colmap", in_readme=True),
-    Row("maps", "left out of its map, nothing is told", partial(views, "localize", MAP), (58, 5), 1.0, data="colmap",
+    Row("maps", "left out of its map, which view is told", partial(photos, "best view", 1.0), (48, 5), 1.0,
+        data="colmap", in_readme=True),
+    Row("maps", "left out of its map, nothing is told", partial(photos, "map", 1.0), (58, 5), 1.0, data="colmap",
         in_readme=True),
     *(
         Row("maps", f"points of one view, no prior, {outliers:.0%} outliers a side",
-            partial(views, "solve", ONE | {"outliers": outliers}), (48, 5), 1.0, data="colmap")
+            partial(photos, "view", outliers, in_map=False), (48, 5), 1.0, data="colmap")
         for outliers in (0.5, 0.75, 1.0)
     ),
-    Row("maps", "of another place", partial(views, "localize", ONE | {"outliers": 1.0, "apart": True}), (18, 4), 0.0,
-        data="colmap", in_readme=True),
+    Row("maps", "of another place", partial(photos, "view", 1.0, apart=True), (18, 4), 0.0, data="colmap",
+        in_readme=True),
     *(
-        Row("leds", name, partial(leds, name), (300, 20), 3.0, in_readme="3 lights" in name)
+        Row("leds", name, partial(lights, name), (300, 20), 3.0, in_readme="3 lights" in name)
         for name in ("ring, 3 lights", "ring, 8 lights, 20 % missing", "headset, 3 lights",
                      "headset, 8 lights, 20 % missing", "ring, no normals, 3 lights", "drone, 3 lights")
     ),
@@ -233,7 +235,3 @@ def main() -> None:
             document.write_text(new, encoding="utf-8")
     if failures:
         sys.exit("\n".join(failures))
-
-
-if __name__ == "__main__":
-    main()

@@ -3,15 +3,17 @@
 Zhou, Agostinho, Osep, Leal-Taixe, "Is geometry enough for matching in visual localization?", ECCV 2022, section 5.
 """
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from record import Array, Pose
+from record import TIME_LIMIT, Array, Pose, Problem
 
+from bpnp import solve
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.maps.scene_map import SceneMap
 from bpnp.maps.views import View
@@ -24,24 +26,24 @@ LEAST_MATCHES = 10  # fewer matches count as a failure
 
 @dataclass(frozen=True, eq=False)
 class ViewProblem:
-    """A photo's keypoints (m, 2), normalised, and the points (n, 3) of its views; match3d (n,), -1 for no partner.
+    """A photo's keypoints (m, 2), normalised, and points (n, 3) of its map; matched: (n,), which of them it sees.
 
-    pose: of the photo. views: names of the k views in `scene`, most overlap first. focal: pixels. scene: the map
-    without the photo, of these points alone, in this order.
+    pose: of the photo. view: the one whose points they are, None for those of the whole map. focal: pixels. scene: the
+    map without the photo, of these points alone, in this order.
     """
 
     name: str
     points2d: Array
     points3d: Array
-    match3d: NDArray[np.int64]
+    matched: NDArray[np.bool_]
     pose: Pose
-    views: tuple[str, ...]
+    view: str | None
     focal: float
     scene: SceneMap
 
     @property
     def matches(self) -> int:
-        return int((self.match3d >= 0).sum())
+        return int(self.matched.sum())
 
     @property
     def pixels(self) -> tuple[Array, Array]:
@@ -56,7 +58,7 @@ class ViewProblem:
     @property
     def seen(self) -> Array:
         """Points that have a partner."""
-        return self.points3d[self.match3d >= 0]
+        return self.points3d[self.matched]
 
 
 def median_distance(points3d: Array, pose: Pose) -> float:
@@ -64,7 +66,7 @@ def median_distance(points3d: Array, pose: Pose) -> float:
     return float(np.median(np.linalg.norm(points3d @ pose[0].T + pose[1], axis=-1)))
 
 
-def photos(scene: Reconstruction, limit: int) -> list[ImagePoints]:
+def images_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
     """At most `limit` photos, spread evenly over those that have a view of enough overlap."""
     usable = [image for image in scene.images if len(overlapping(scene, image))]
     return [usable[k] for k in sorted({int(k * len(usable) / limit) for k in range(limit)})]
@@ -80,22 +82,24 @@ def overlapping(scene: Reconstruction, query: ImagePoints) -> list[tuple[float, 
     return sorted((pair for pair in shares if pair[0] >= LEAST_OVERLAP), key=lambda pair: -pair[0])
 
 
-def view_problem(
-    scene: Reconstruction, query: ImagePoints, *, views: int, outliers: float, seed: int = 0,
-    most: int | None = MOST_POINTS, best: bool = False,
-) -> ViewProblem:  # fmt: skip
-    """One photo against the points that `views` views see, or, for 0, all points of the map.
+Against = Literal["map", "view", "best view"]
 
-    outliers: of each side at most this share of all points is without a partner; 1 for all that there are.
-    most: keypoints, and points that one view sees; matches and outliers are thinned alike, so that their ratio
-    stays. None for all.
-    For one view it is drawn among those that overlap enough; for more, and if `best`, they are the ones that overlap
-    most.
+
+def view_problem(
+    scene: Reconstruction, query: ImagePoints, *, against: Against, outliers: float, seed: int = 0
+) -> ViewProblem:  # fmt: skip
+    """One photo against the points of the whole map, or those that one view sees.
+
+    against: "map", "view", drawn among those that overlap enough, or "best view", the one that overlaps most.
+    outliers: of each side at most this share of all points is without a partner; 1 for all that there are. Against a
+    view matches and outliers are thinned alike to MOST_POINTS a side, so that their ratio stays.
     """
     rng = np.random.default_rng([seed, query.image_id])
-    candidates = [view for _, view in overlapping(scene, query)]
-    chosen = [candidates[rng.integers(len(candidates))]] if views == 1 and not best else candidates[:views]
-    shown = chosen or [view for view in scene.images if view is not query]
+    view = None
+    if against != "map":
+        candidates = [view for _, view in overlapping(scene, query)]
+        view = candidates[rng.integers(len(candidates)) if against == "view" else 0]
+    shown = [image for image in scene.images if image is not query] if view is None else [view]
     # Points that the photo alone holds together with one view would not be in the map without it.
     tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
     tracks[query.observed] -= 1
@@ -106,22 +110,19 @@ def view_problem(
     others3d = np.setdiff1d(in_map, query.observed)
     allowed = np.inf if outliers >= 1 else len(true) * outliers / (1 - outliers)
     counts = [len(true), min(len(others2d), allowed), min(len(others3d), allowed)]
-    of_one = len(true) + len(others3d) if len(shown) == 1 else max(np.isin(view.seen, in_map).sum() for view in shown)
-    larger = max(counts[0] + counts[1], min(counts[0] + counts[2], of_one))
-    share = 1.0 if most is None else min(1.0, most / max(larger, 1))
+    larger = max(counts[0] + counts[1], counts[0] + counts[2])
+    share = 1.0 if view is None else min(1.0, MOST_POINTS / max(larger, 1))
     kept, extra2d, extra3d = (int(count * share) for count in counts)
     pick = rng.choice(len(true), kept, replace=False)
     clutter2d = others2d[rng.choice(len(others2d), extra2d, replace=False)]
     points2d = np.concatenate([query.points2d[place[pick]], clutter2d]).astype(np.float64)
     index3d = np.concatenate([true[pick], rng.choice(others3d, extra3d, replace=False)]).astype(np.int64)
     order2d, order3d = rng.permutation(len(points2d)), rng.permutation(len(index3d))
-    match3d = np.full(len(index3d), -1)
-    match3d[:kept] = np.argsort(order2d)[:kept]
     index3d = index3d[order3d]
+    name, pose = f"{scene.name}/{query.name}", (query.rotation, query.translation)
     return ViewProblem(
-        f"{scene.name}/{query.name}", points2d[order2d], scene.points3d[index3d], match3d[order3d],
-        (query.rotation, query.translation), tuple(view.name for view in chosen), query.camera.focal,
-        map_of(scene, query, index3d),
+        name, points2d[order2d], scene.points3d[index3d], order3d < kept, pose, view.name if view else None,
+        query.camera.focal, map_of(scene, query, index3d),
     )  # fmt: skip
 
 
@@ -140,9 +141,35 @@ def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64])
 def scene_problems(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewProblem]:
     """Problems of at most `limit` photos of a scene. chosen: options of `view_problem`."""
     scene = model_of(data, name)
-    for query in photos(scene, limit):
+    for query in images_of(scene, limit):
         yield view_problem(scene, query, **chosen)
 
 
 def model_of(data: Path, name: str) -> Reconstruction:
     return read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
+
+
+def photos(limit: int, scenes: Sequence[str], data: Path, **chosen: Any) -> list[ViewProblem]:
+    """Problems of at most `limit` photos of the scenes together. chosen: options of `view_problem`."""
+    each = -(-limit // len(scenes))
+    return [photo for name in scenes for photo in scene_problems(data, name, limit=each, **chosen)][:limit]
+
+
+def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:
+    """The map of each problem with the photo of the problem that comes half of them later."""
+    others = [*photos[len(photos) // 2 :], *photos[: len(photos) // 2]]
+    return [
+        replace(photo, points2d=other.points2d, focal=other.focal) for photo, other in zip(photos, others, strict=True)
+    ]
+
+
+def problems(photos: Sequence[ViewProblem], *, in_map: bool, seed: int) -> Iterator[Problem]:
+    """Of photos in their map, told the view if it is one, or by their points alone, without a prior. The error of a
+    centre is in distances of the median point."""
+    for photo in photos:
+        pixels, camera = photo.pixels
+        search = partial(solve, pixels, photo.points3d, camera)
+        if in_map:
+            search = partial(photo.scene.localize, pixels, camera, views=photo.view and [photo.view])
+        search = partial(search, seed=seed, time_limit=TIME_LIMIT)
+        yield Problem(photo.name, search, [photo.pose], photo.points3d, photo.distance)

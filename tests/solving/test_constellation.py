@@ -5,7 +5,7 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from bench_constellation import Camera, Frame, Setting, device, frame, picture
+from leds import Camera, Frame, Setting, device, frame, picture
 from planted import degrees_between
 from scipy.spatial.transform import Rotation
 

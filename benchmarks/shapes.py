@@ -1,6 +1,4 @@
-"""`solve` without a prior on shapes, meshes and photos of COLMAP models: errors, verdicts, CPU seconds.
-
-    python -m benchmarks search shapes shapes-0.25 psb psb-so3-0.50 fountain-P11-0.50
+"""Shapes, meshes and the points that photos see, for `solve` without a prior.
 
 A set is shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3 or the
 name of a COLMAP model; a number after it is the ratio of outliers to matches on either side: random points, of photos
@@ -14,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from record import TIME_LIMIT, Array, Problem, measured, parser
+from record import TIME_LIMIT, Array, Problem
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
@@ -24,8 +22,6 @@ from bpnp.datamodules.surfaces import normalise, sample_surface
 
 Points = tuple[str, Array, Array, Array, Array]  # name, points2d, points3d, rotation, translation
 POINTS, NOISE = 400, 2 / 800
-RIGHT_DEG = 2.0
-SETS = ("shapes", "shapes-0.25", "shapes-0.50", "psb", "psb-so3", "psb-0.50", "fountain-P11", "fountain-P11-0.50")
 
 
 def shapes(ratio: float, limit: int, seed: int) -> Iterator[Points]:
@@ -72,15 +68,3 @@ def problems(
     for name, points2d, points3d, rotation, translation in drawn:
         search = partial(solve, points2d, points3d, seed=seed, time_limit=time_limit)
         yield Problem(name, search, [(rotation, translation)], points3d)
-
-
-def main() -> None:
-    options = parser(__doc__)
-    options.add_argument("sets", nargs="*", default=SETS, metavar="SET")
-    chosen = options.parse_args()
-    rows = ((name, partial(problems, name, chosen.data, chosen.limit, chosen.seed)) for name in chosen.sets)
-    measured(rows, chosen, RIGHT_DEG)
-
-
-if __name__ == "__main__":
-    main()
