@@ -11,17 +11,7 @@ import bpnp
 from bpnp.examples import load
 
 COSTLY = ("lightning", "wandb", "trimesh", "pandas", "matplotlib", "plotly", "torchmetrics")
-HEAVY = (
-    *COSTLY,
-    "roma",
-    "torch._dynamo",
-    "bpnp.models",
-    "sympy",
-    "scipy.optimize",
-    "numba",
-    "pycolmap",
-    "jsonargparse",
-)
+OTHERS = ("roma", "torch._dynamo", "bpnp.models", "sympy", "scipy.optimize", "numba", "pycolmap", "jsonargparse")
 
 
 def loaded(statements: str, names: tuple[str, ...]) -> list[str]:
@@ -32,31 +22,19 @@ def loaded(statements: str, names: tuple[str, ...]) -> list[str]:
 
 
 def test_importing_the_package_loads_neither_compilers_nor_optimisers() -> None:
-    assert loaded("import bpnp", HEAVY) == []
+    assert loaded("import bpnp", (*COSTLY, *OTHERS)) == []
 
 
-def run_loads(*arguments: str) -> list[str]:
-    """Which of the modules COSTLY a command loads, and torch."""
-    call = f"from bpnp.cli import main\ntry:\n    main({list(arguments)})\nexcept SystemExit:\n    pass"
-    return loaded(call, (*COSTLY, "torch"))
+def run_loads(*lines: str) -> list[str]:
+    """Which of the modules COSTLY these commands load, and torch."""
+    calls = "\n".join(f"try:\n    main({line.split()})\nexcept SystemExit:\n    pass" for line in lines)
+    return loaded(f"from bpnp.cli import main\n{calls}", (*COSTLY, "torch"))
 
 
-@pytest.mark.parametrize(
-    "line",
-    [
-        "--help",
-        "--version",
-        "slove",
-        "fit --help",
-        "solve --help",
-        "solve --bogus",
-        "solve",
-        "prepare --help",
-        *(f"{name} --help" for name in ("localize", "report", "view", "table", "convert-weights", "wandb")),
-    ],
-)
-def test_help_and_mistakes_load_no_torch(line: str) -> None:
-    assert run_loads(*line.split()) == []
+def test_help_and_mistakes_load_no_torch() -> None:
+    commands = ("solve", "prepare", "localize", "report", "view", "table", "convert-weights", "wandb", "fit")
+    mistakes = ("slove", "solve --bogus", "solve")
+    assert run_loads("--help", "--version", *mistakes, *(f"{name} --help" for name in commands)) == []
 
 
 def test_the_command_that_solves_loads_neither_lightning_nor_wandb(tmp_path: Path) -> None:
@@ -64,8 +42,8 @@ def test_the_command_that_solves_loads_neither_lightning_nor_wandb(tmp_path: Pat
     for name, points in (("points2d", example.points2d), ("points3d", example.points3d), ("camera", example.camera)):
         np.savetxt(tmp_path / f"{name}.csv", points, delimiter=",")
     files = [str(tmp_path / f"{name}.csv") for name in ("points2d", "points3d", "camera")]
-    assert run_loads("solve", *files[:2], "--camera", files[2]) == ["torch"]
-    assert "lightning" in run_loads("convert-weights", "nowhere", "out.ckpt")  # the check sees what is loaded
+    assert run_loads(f"solve {files[0]} {files[1]} --camera {files[2]}") == ["torch"]
+    assert "lightning" in run_loads("convert-weights nowhere out.ckpt")  # the check sees what is loaded
 
 
 @pytest.mark.parametrize("name", bpnp.__all__)

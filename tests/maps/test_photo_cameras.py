@@ -3,7 +3,6 @@
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -81,19 +80,6 @@ def test_views_with_different_focal_lengths_have_none_to_offer(tmp_path: Path) -
     assert scene.camera_for(photo_with(tmp_path / "b.jpg", (WIDTH, HEIGHT))) == (None, "unknown focal length")
     with pytest.raises(ValueError, match=r"with one focal length, got 2 of 520 to 900 pixels; try --camera"):
         scene.camera_for(tmp_path / "b.jpg", exif=False)
-
-
-def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel(tmp_path: Path) -> None:
-    truth = plant_model(tmp_path, camera=PINHOLE, images=2, points=140, seen=90, clutter=0)
-    scene = SceneMap.from_colmap(tmp_path)
-    pixels = 520 * truth.points2d[0] + [400, 300]
-    points = [cv2.KeyPoint(float(x - 0.5), float(y - 0.5), 3) for x, y in pixels]
-    opencv = (np.array([[520, 0, 399.5], [0, 520, 299.5], [0, 0, 1.0]]), np.zeros(5))
-    for keypoints, camera in ((points, PINHOLE), (points, opencv), (pixels - 0.5, opencv)):
-        solution = scene.localize(keypoints, camera, views=["photo 0.jpg"], solver="search")
-        assert solution.reprojection_error < 1e-3
-        np.testing.assert_allclose(solution.rotation, truth.rotations[0], atol=1e-5)
-        np.testing.assert_allclose(solution.translation, truth.translations[0], atol=1e-5)
 
 
 def test_a_photo_is_localised_with_any_of_its_cameras(shared_data: Path) -> None:

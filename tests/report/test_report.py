@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from report_data import planted, row
+from report_data import planted, row, rows
 from scipy.spatial.transform import Rotation
 
 from bpnp.metrics import PoseErrors
 from bpnp.report import ProblemRow, read_results, write_results
-from bpnp.report.results import count_inliers, rows_from
+from bpnp.report.results import cause_shares, count_inliers, rows_from
 from bpnp.types import Batch, Pose, Prediction, SolveStats
 
 HOSTILE = [
@@ -185,3 +185,22 @@ def test_results_give_their_errors_and_a_data_frame(tmp_path: Path) -> None:
     frame = results.frame()
     assert frame.rotation_error_deg.tolist() == [r.rotation_error_deg for r in results.rows]
     assert frame[frame.cause == "solved"]["index"].tolist() == [1, 1, 2, 2]
+
+
+def test_each_row_has_the_cause_that_its_numbers_say() -> None:
+    good = dataclasses.replace(
+        rows(1, 0)[0], rotation_error_deg=1.0, converged=True, found=True, inliers=0, m=10
+    )  # fmt: skip
+    cases = {
+        "solved": {"converged": False},
+        "no pose": {"found": False, "rotation_error_deg": 180.0},
+        "wrong, not converged": {"rotation_error_deg": 6.0, "converged": False, "inliers": 9},
+        "wrong, but fits the image": {"rotation_error_deg": 6.0, "inliers": 5},
+        "wrong": {"rotation_error_deg": 6.0, "inliers": 4},
+    }
+    planted = [dataclasses.replace(good, **changes) for changes in cases.values()]  # type: ignore[arg-type]
+    assert [row.cause for row in planted] == list(cases)
+    shares = cause_shares([*planted, planted[0]])
+    assert shares == {cause: (2 if cause == "solved" else 1) / 6 for cause in cases}
+    with pytest.raises(ValueError, match="expected at least one row"):
+        cause_shares([])
