@@ -3,9 +3,9 @@
     python -m benchmarks city --views 477 1000 3000 10000 --limit 12
     python -m benchmarks city --twice 0.1
 
-The models of --scenes lie at random places, rotations and scales; changed copies of them make up the number of views:
+The models of the data lie at random places, rotations and scales; changed copies of them make up the number of views:
 other places with the statistics of real ones, mirrored or not, the points moved along a smooth field by a tenth of the
-distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos are left out with all
+distance from which they are seen, and a third of them dropped. Photos of five scenes are left out with all
 points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
 --twice: every place is there twice, this share of the points of the second one gone; a confident pose in it is wrong,
 and no pose there is right. A row begins with the rank of the views (`bpnp.maps.ranking`): of how many photos one of the
@@ -21,7 +21,20 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from record import TIME_LIMIT, Array, Outcome, Pose, Problem, Rows, Similarity, degrees, measured, outcomes, parser
+from record import (
+    TIME_LIMIT,
+    Array,
+    Outcome,
+    Pose,
+    Problem,
+    Rows,
+    Similarity,
+    degrees,
+    measured,
+    outcomes,
+    parser,
+    spread,
+)
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED, median_distance, model_of
 
@@ -119,8 +132,7 @@ def photos_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
     """At most `limit` photos and a fourth of all, spread evenly over those that see enough of what others see."""
     tracks = np.bincount(np.concatenate([image.observed for image in scene.images]), minlength=len(scene.points3d))
     usable = [image for image in scene.images if (tracks[image.observed] >= 3).sum() >= 50]
-    count = min(limit, len(scene.images) // 4)
-    return [usable[k] for k in sorted({int((k + 0.5) * len(usable) / count) for k in range(count)})]
+    return spread(usable, min(limit, len(scene.images) // 4), first=0.5)
 
 
 def city(
@@ -204,38 +216,33 @@ def is_near(view: View, photo: CityPhoto) -> bool:
     )
 
 
-def localized(scene: SceneMap, photos: Sequence[CityPhoto], seed: int, limit: float) -> list[Outcome]:
+def localized(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> list[Outcome]:
     seconds, rank = opened(scene), ranked(scene, photos)
+    search = partial(scene.localize, seed=seed, time_limit=TIME_LIMIT)
     found = outcomes(
         Problem(
-            photo.name,
-            partial(scene.localize, photo.focal * photo.points2d, photo.camera, seed=seed, time_limit=limit),
-            photo.poses,
+            photo.name, partial(search, photo.focal * photo.points2d, photo.camera), photo.poses,
             distance=photo.distance,
         )
         for photo in photos
-    )
+    )  # fmt: skip
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
     print(f"opened in {seconds:.2g} CPU s, {memory:.2g} GB, {rank}", end="; ")
     return found
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    names = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
-    scenes = [model_of(options.data, name) for name in names]
-    wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
+    scenes = [model_of(options.data, path.name) for path in sorted((options.data / "colmap").iterdir())]
+    wanted = dict.fromkeys(REPORTED, -(-options.limit // len(REPORTED)))
     for views in options.views if options.twice is None else [0]:
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
         name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
-        yield name, partial(localized, scene, photos[: options.limit], options.seed, options.time_limit)
+        yield name, partial(localized, scene, photos[: options.limit], options.seed)
 
 
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("scenes", nargs="*", metavar="SCENE", help="models of the city (default: all of the data)")
-    options.add_argument("--photos", nargs="+", default=REPORTED, metavar="SCENE", help="scenes of the photos")
     options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
     options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
-    options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds a photo (default: %(default)s)")
     chosen = options.parse_args()
     measured(rows(chosen), chosen, RIGHT_DEG, RIGHT_SHIFT)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from descriptor_poses import DescribedMap
 from rebuilt_maps import PhotoScene, aligned
-from record import TIME_LIMIT, Problem, Rows, measured, parser
+from record import TIME_LIMIT, Problem, Rows, measured, parser, spread
 from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
@@ -54,8 +54,7 @@ def rows(options: argparse.Namespace) -> Rows:
         kept = options.maps / f"{name}-{FEATURES}"
         scene = PhotoScene(options.data / "photos" / name, kept, CAMERA, FEATURES)
         full = SceneMap.from_colmap(scene.full())
-        photos = [photo for photo in scene.names() if photo in full.view_numbers]
-        chosen = [photos[i] for i in sorted({int(k * len(photos) / options.limit) for k in range(options.limit)})]
+        chosen = spread([photo for photo in scene.names() if photo in full.view_numbers], options.limit)
         drawn = [problems_of(scene, photo, full, options.seed) for photo in chosen]
         for method in drawn[0]:
             yield f"{name}, {method}", partial(list, [one[method] for one in drawn])

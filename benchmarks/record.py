@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -30,6 +30,7 @@ NEAR_FOCAL = 0.03  # of a focal length that counts as right
 FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
 BOUND = 0.999  # share of the confident poses that are within their bound
 
+T = TypeVar("T")
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]  # rotation, translation: camera = R p + t
 
@@ -60,6 +61,11 @@ def parser(doc: str | None) -> argparse.ArgumentParser:
     result.add_argument("--only", nargs="*", default=[""], help="parts of names: only rows with one of them")
     result.add_argument("--output", type=Path, help="JSON file for machine, commit, command and rows")
     return result
+
+
+def spread(items: Sequence[T], limit: int, first: float = 0.0) -> list[T]:
+    """At most `limit`, spread evenly, the first one after this part of a step."""
+    return [items[k] for k in sorted({int((k + first) * len(items) / limit) for k in range(limit)})]
 
 
 @dataclass(frozen=True)

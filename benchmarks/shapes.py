@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from record import TIME_LIMIT, Array, Problem
+from record import TIME_LIMIT, Array, Problem, spread
 from scipy.spatial.transform import Rotation
 
 from bpnp import solve
@@ -51,7 +51,7 @@ def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Itera
         module = ColmapDataModule(folder, test_fraction=1.0, rotate=True, clutter=ratio, seed=seed)
     module.setup("test")
     problems = module.datasets["test"]
-    for i in sorted({int(k * len(problems) / limit) for k in range(limit)}):
+    for i in spread(range(len(problems)), limit):
         batch = problems.problem(i)
         values = (batch.points2d, batch.points3d, batch.rotation, batch.translation)
         yield f"{name}/{batch.ids[0]}", *(x[0].double().numpy() for x in values if x is not None)  # type: ignore[misc]

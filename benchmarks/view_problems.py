@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from record import TIME_LIMIT, Array, Pose, Problem
+from record import TIME_LIMIT, Array, Pose, Problem, spread
 
 from bpnp import solve
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
@@ -68,8 +68,7 @@ def median_distance(points3d: Array, pose: Pose) -> float:
 
 def images_of(scene: Reconstruction, limit: int) -> list[ImagePoints]:
     """At most `limit` photos, spread evenly over those that have a view of enough overlap."""
-    usable = [image for image in scene.images if len(overlapping(scene, image))]
-    return [usable[k] for k in sorted({int(k * len(usable) / limit) for k in range(limit)})]
+    return spread([image for image in scene.images if len(overlapping(scene, image))], limit)
 
 
 def overlapping(scene: Reconstruction, query: ImagePoints) -> list[tuple[float, ImagePoints]]:
