@@ -1,4 +1,3 @@
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -149,12 +148,3 @@ def test_a_prediction_moves_with_its_poses() -> None:
     assert moved.poses["pnp"].rotation.dtype == moved.poses["pnp"].stats.residual.dtype == torch.float64
     assert moved.poses["pnp"].stats.iterations.dtype == torch.long
     assert moved.assignment is None
-
-
-def test_the_solver_of_the_contributing_guide_solves_batches() -> None:
-    guide = (Path(__file__).parents[1] / "CONTRIBUTING.md").read_text()
-    names: dict[str, type[torch.nn.Module]] = {}
-    exec(guide.split("```python\n")[1].split("```")[0], names)
-    pose = names["InFront"]()(Batch.from_arrays(np.zeros((2, 5, 2)), np.zeros((2, 7, 3)))).poses["in_front"]
-    assert pose.translation.tolist() == [[0, 0, 4]] * 2
-    assert pose.stats.converged.all()

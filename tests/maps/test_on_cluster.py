@@ -82,35 +82,12 @@ def test_processes_started_here_are_ended(place: tuple[Path, Path, Path]) -> Non
     assert [words for words in left if "multiprocessing.resource_tracker" not in words] == []
 
 
-def test_the_command_goes_on_where_it_was(
-    place: tuple[Path, Path, Path], cluster: LocalCluster, tmp_path: Path
-) -> None:
-    model, photos, database = place
-    output = tmp_path / "out"
-    command = ["localize", str(model), str(photos), "--camera", "PINHOLE,520,520,400,300", "--keypoints", str(database)]
-    main([*command, "--output", str(output), "--no_pictures", "--cluster", cluster.scheduler_address])
-    names, poses = _poses(output)
-    assert len(names) == PHOTOS
-    lost = output / "solutions" / "new3.png.json"
-    lost.unlink()
-    (output / "poses.txt").unlink()
-    times = {file: file.stat().st_mtime_ns for file in (output / "solutions").iterdir()}
-    lost.mkdir()  # so that the solution cannot be written
-    with pytest.raises(SystemExit):
-        main([*command, "--output", str(output), "--no_pictures"])
-    assert _poses(output)[0] == [name for name in names if name != "new3.png"]
-    lost.rmdir()
-    main([*command, "--output", str(output), "--no_pictures"])
-    again = _poses(output)
-    assert again[0] == names
-    np.testing.assert_array_equal(again[1], poses)
-    assert all(file.stat().st_mtime_ns == time for file, time in times.items())
-
-
-def _poses(output: Path) -> tuple[list[str], np.ndarray]:
-    """Names and (n, 7) quaternions and translations of poses.txt."""
-    rows = [line.split() for line in (output / "poses.txt").read_text().splitlines() if not line.startswith("#")]
-    return [row[0] for row in rows], np.array([row[1:] for row in rows], float)
+def test_the_command_takes_a_cluster(place: tuple[Path, Path, Path], cluster: LocalCluster, tmp_path: Path) -> None:
+    model, photos, database = map(str, place)
+    command = ["localize", model, photos, "--camera", "PINHOLE,520,520,400,300", "--keypoints", database]
+    main([*command, "--output", str(tmp_path), "--no_pictures", "--cluster", cluster.scheduler_address])
+    lines = (tmp_path / "poses.txt").read_text().splitlines()
+    assert [line.split()[0] for line in lines if not line.startswith("#")] == list(VIEWS)
 
 
 @pytest.mark.parametrize(("cluster_name", "got"), [("0", "got 0"), ("nowhere", "got nowhere"), ("tcp://[", "got tcp")])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
-from bpnp.maps.ranking import STEP, contrast, pictures_of_views, places_first, scores_of_views
+from bpnp.maps.ranking import STEP, places_first, scores_of_views
 from bpnp.maps.views import View
 from bpnp.solving.focal_length import UnknownCamera
 
@@ -79,13 +79,6 @@ def test_views_of_one_place_come_after_all_other_places() -> None:
     best_last = list(places_first(twice, scores[::-1].copy(), len(scene.points3d)))
     assert best_last[:10] == list(range(len(twice) - 1, len(twice) - 11, -1))
     assert sorted(best_last[-10:]) == list(range(10))
-
-
-def test_contrast_is_of_length_one_and_empty_for_no_points() -> None:
-    points2d = np.random.default_rng(0).normal(0, 0.2, (50, 2))
-    assert np.linalg.norm(contrast(points2d, 0.4)) == pytest.approx(1, abs=1e-5)
-    assert not contrast(np.empty((0, 2)), 1.0).any()
-    assert pictures_of_views(np.zeros((3, 3)), []).contrasts.shape[0] == 0
 
 
 def test_views_of_much_wider_points_come_last_where_the_focal_length_is_known() -> None:

@@ -9,7 +9,7 @@ from report_data import drawn_problem, inflated, row
 from scipy.spatial.transform import Rotation
 
 from bpnp.report.page.problems import PROBLEMS, page_points
-from bpnp.report.points import MOST, ProblemPoints, thin
+from bpnp.report.points import ProblemPoints
 from bpnp.report.results import Results
 
 
@@ -47,17 +47,6 @@ def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
         camera = points3d @ rotation.T + translation
         np.testing.assert_allclose((camera[:, :2] / camera[:, 2:])[line["match3d"]], points2d, atol=1e-4)
         assert line["poses"]["a"]["pnp"] is None
-
-
-def test_assignments_are_those_of_the_solver() -> None:
-    original = drawn_problem(0, "a", 501)
-    own = thin(replace(original, match3d=np.where(np.arange(501) % 4 == 0, original.match3d, -1).astype(np.int32)))
-    _, (line,) = read(page_points({"run": results([own])}, {"run": [own]}))
-    assert len(line["points2d"]) == len(line["points3d"]) == MOST
-    for number, matched, assigned in zip(line["ids3d"], line["match3d"], line["assigned"]["run"], strict=True):
-        assert (line["ids2d"][matched] if matched >= 0 else -1) == (number if number % 4 == 0 else -1)
-        partner = original.assigned3d[number]
-        assert assigned == (line["ids2d"].index(partner) if partner in line["ids2d"] else -1)
 
 
 def test_the_page_takes_the_worst() -> None:

@@ -1,17 +1,14 @@
-"""The RANSAC of a whole batch against PoseLib's and scipy's optimum, among many wrong pairs and points that repeat."""
+"""The RANSAC of a whole batch against PoseLib's, among many wrong pairs and points that repeat."""
 
 import numpy as np
 import pytest
 import torch
-from numpy.typing import NDArray
 from planted import Planted, plant
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust.consensus import Matches, residuals, truncated_scores
+from bpnp.robust.consensus import Matches, truncated_scores
 from bpnp.types import SolveStats
 
 THRESHOLD = 0.01
@@ -62,24 +59,6 @@ def test_pose_and_score_are_poselibs(inliers: float, lead: float) -> None:
         assert scores[0] < scores[1] * 1.005
         assert rotation_angle(ours[0], theirs[0]) < np.deg2rad(0.2)
         assert rotation_angle(ours[0], planted.rotation) < np.deg2rad(1)
-
-
-def test_pose_is_the_cauchy_fit_to_its_inliers() -> None:
-    _, pairs, weights = problem(3)
-    rotation, translation, _ = consensus(pairs, weights)
-    squared, inlier, *_ = residuals(as_matrix(rotation, translation), pairs, THRESHOLD**2)
-    points2d, points3d = (points[0, inlier[0, 0]].numpy() for points in pairs[:2])
-    scale = 4 * float(squared[inlier].median())
-
-    def error(step: NDArray[np.float64]) -> NDArray[np.float64]:
-        camera = points3d @ (Rotation.from_rotvec(step[:3]).as_matrix() @ rotation[0].numpy()).T
-        camera += translation[0].numpy() + step[3:]
-        return np.sqrt(scale * np.log1p(((camera[:, :2] / camera[:, 2:] - points2d) ** 2).sum(-1) / scale))
-
-    optimum = least_squares(error, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15).x
-    # The scale comes from the pose before the fit, hence not to the last digit; the noise moves the pose by 1e-3.
-    np.testing.assert_allclose(optimum, 0, atol=2e-4)
-    np.testing.assert_allclose(optimum[:3], 0, atol=2e-5)
 
 
 def test_points_behind_the_camera_are_no_inliers() -> None:

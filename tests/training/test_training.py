@@ -6,11 +6,14 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import torch
 from small_data import SMALL_MESHES, SMALL_NET
 
+from bpnp.cli import main
 from bpnp.report import read_results
 
 ARGUMENTS = [
@@ -25,20 +28,30 @@ ARGUMENTS = [
 WARMUP = ["--trainer.callbacks=bpnp.training.PoseLossWarmup", "--trainer.callbacks.start_epoch=2"]
 
 
-def start(command: str, folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
-    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+def words(command: str, folder: Path, *arguments: str) -> list[str]:
     paths = [f"--trainer.default_root_dir={folder}", f"--data.cache_dir={folder.parent}/cache"]
-    return subprocess.Popen(
-        [sys.executable, "-m", "bpnp", command, *ARGUMENTS, *paths, *arguments],
-        env=environment,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-    )
+    return [command, *ARGUMENTS, *paths, *arguments]
+
+
+def start(command: str, folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
+    """The command in a process of its own."""
+    line = [sys.executable, "-m", "bpnp", *words(command, folder, *arguments)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    return subprocess.Popen(line, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE)
 
 
 def finish(process: subprocess.Popen[bytes]) -> None:
     _, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors.decode()[-2000:]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    """As the processes have."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 def logged(folder: Path, metric: str, epoch: int) -> float:
@@ -52,7 +65,7 @@ def logged(folder: Path, metric: str, epoch: int) -> float:
 
 def test_a_killed_run_resumes_and_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     whole, killed = tmp_path / "whole", tmp_path / "killed"
-    finish(start("fit", whole, *WARMUP, "--trainer.max_epochs=4"))
+    main(words("fit", whole, *WARMUP, "--trainer.max_epochs=4"))
     process = start("fit", killed, *WARMUP, "--trainer.max_epochs=4000")
     last = killed / "checkpoints" / "last.ckpt"
     deadline = time.monotonic() + 200
@@ -61,11 +74,7 @@ def test_a_killed_run_resumes_and_ends_as_an_uninterrupted_one(tmp_path: Path) -
     process.send_signal(signal.SIGKILL)
     process.communicate()
     assert last.exists()
-    resume = ["--ckpt_path=last", "--trainer.max_epochs=4"]
-    done = start("fit", killed, *WARMUP, *resume)
-    _, errors = done.communicate(timeout=300)
-    if done.returncode:
-        pytest.fail(errors.decode()[-2000:])
+    main(words("fit", killed, *WARMUP, "--ckpt_path=last", "--trainer.max_epochs=4"))
     for metric in ("val/rotation_q2_deg", "val/pnp/rotation_q2_deg", "val/correspondence_loss"):
         assert logged(killed, metric, 3) == logged(whole, metric, 3), metric
 
@@ -73,18 +82,18 @@ def test_a_killed_run_resumes_and_ends_as_an_uninterrupted_one(tmp_path: Path) -
 def test_two_processes_give_the_figures_of_one(tmp_path: Path) -> None:
     # In float64: Adam turns the rounding of a gradient that should be zero into a whole step.
     double = "--trainer.precision=64-true"
-    results = {}
-    for devices in (1, 2):
-        folder = tmp_path / str(devices)
-        strategy = [f"--trainer.devices={devices}", "--trainer.strategy=" + ("ddp" if devices == 2 else "auto")]
-        finish(start("fit", folder, *strategy, double, "--trainer.max_epochs=2"))
-        finish(start("test", folder, *strategy, double, f"--ckpt_path={folder}/checkpoints/last.ckpt"))
-        results[devices] = read_results(folder / "test")
-    one, two = results[1], results[2]
+    one, two = tmp_path / "1", tmp_path / "2"
+    more = {one: ["--trainer.devices=1"], two: ["--trainer.devices=2", "--trainer.strategy=ddp"]}
+    for folder in (one, two):
+        fit = ["fit", folder, *more[folder], double, "--trainer.max_epochs=2"]
+        test = ["test", folder, *more[folder], double, f"--ckpt_path={folder}/checkpoints/last.ckpt"]
+        for arguments in (fit, test):
+            main(words(*arguments)) if folder is one else finish(start(*arguments))
+    alone, split = read_results(one / "test"), read_results(two / "test")
     # Seven test pairs in batches of four: the second process repeats some, which count once.
-    assert [row.id for row in two.rows] == [row.id for row in one.rows]
-    assert len(one.rows) == 7 * 3
-    assert two.correspondence_loss == pytest.approx(one.correspondence_loss, abs=1e-8)
-    for estimate, values in one.estimates.items():
+    assert [row.id for row in split.rows] == [row.id for row in alone.rows]
+    assert len(alone.rows) == 7 * 3
+    assert split.correspondence_loss == pytest.approx(alone.correspondence_loss, abs=1e-8)
+    for estimate, values in alone.estimates.items():
         for key in ("rotation_q2_deg", "translation_q2", "recall_rotation_20deg"):
-            assert two.estimates[estimate][key] == pytest.approx(values[key], rel=1e-6), (estimate, key)
+            assert split.estimates[estimate][key] == pytest.approx(values[key], rel=1e-6), (estimate, key)
