@@ -107,6 +107,12 @@ def directions(points: Any) -> Any:
     return points / np.linalg.norm(points, axis=-1, keepdims=True)
 
 
+def seen(points: Any, rotation: Any, translation: Any) -> NDArray[np.float64]:
+    """Normalised image coordinates (n, 2) of points (n, 3)."""
+    camera = points @ rotation.T + translation
+    return np.asarray(camera[:, :2] / camera[:, 2:])
+
+
 def view_with_outliers(
     rng: np.random.Generator, true: int, outliers: int, *, noise: float = 1e-3, frame: float = 0.4
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:

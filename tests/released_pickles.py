@@ -4,6 +4,7 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+from planted import seen
 from scipy.spatial.transform import Rotation
 
 Sample = dict[str, np.ndarray]
@@ -15,10 +16,9 @@ def sample(seed: int, *, tiled: int = 40) -> Sample:
     count = int(rng.integers(5, tiled + 1))
     points3d = rng.normal(size=(count, 3))
     rotation, translation = Rotation.from_quat(rng.normal(size=4)).as_matrix(), np.array([0.1, 0.2, 8.0])
-    camera = points3d @ rotation.T + translation
     w = rng.permutation(count)
     points2d = np.empty((count, 2))
-    points2d[w] = camera[:, :2] / camera[:, 2:]
+    points2d[w] = seen(points3d, rotation, translation)
     copies = np.resize(np.arange(count), tiled)
     sizes = {"num_points_2d": np.array([count]), "num_points_3d": np.array([count])}
     return {"p2d": points2d[copies], "p3d": points3d[copies], "W_gt": w[copies], "R_gt": rotation} | {

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from planted import padded, plant
+from planted import padded, plant, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp.report import ProblemRow, Results, write_results
@@ -66,11 +66,10 @@ def drawn_problem(index: int, name: str, count: int = 30) -> ProblemPoints:
     rng = np.random.default_rng(index)
     rotation, translation = Rotation.random(rng=rng).as_matrix(), np.array([0.1, -0.2, 4.0])
     points3d = rng.uniform(-1, 1, (count, 3)).astype(np.float32)
-    camera = points3d @ rotation.T + translation
     match = np.arange(count, dtype=np.int32)
     missing = (np.full((3, 3), np.nan), np.full(3, np.nan))
     estimates = {"ransac": (rotation, translation), "pnp": missing}
-    points2d = (camera[:, :2] / camera[:, 2:]).astype(np.float32)
+    points2d = seen(points3d, rotation, translation).astype(np.float32)
     return ProblemPoints(
         index, name, points2d, points3d, match, match[::-1].copy(), (rotation, translation), estimates, 2.0
     )

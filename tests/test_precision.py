@@ -11,7 +11,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from bpnp.layers import sinkhorn, weighted_pnp
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.precision import full_precision
 
 PRODUCTS = {torch.ops.aten.mm, torch.ops.aten.bmm, torch.ops.aten.addmm, torch.ops.aten.baddbmm}
 
@@ -76,16 +75,3 @@ def test_layers_keep_their_digits(compiled: bool, monkeypatch: pytest.MonkeyPatc
     for value, exact in zip(found, expected, strict=True):
         assert (value - exact).abs().max() < 1e-6 * exact.abs().max()
     assert torch.get_float32_matmul_precision() == "high"
-
-
-def test_half_precision_arguments_are_widened_and_autocast_is_off() -> None:
-    @full_precision
-    def product(x: Tensor, *, y: Tensor) -> Tensor:
-        return x @ y
-
-    x = torch.rand(3, 3)
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        assert (x @ x).dtype == torch.bfloat16
-        assert torch.equal(product(x, y=x), product(x, y=x.float()))
-        assert product(x.bfloat16(), y=x).dtype == torch.float32
-        assert (x @ x).dtype == torch.bfloat16

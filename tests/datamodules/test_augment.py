@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from planted import seen
 from scipy import stats
 from small_data import check_pairs
 
@@ -21,8 +22,7 @@ def planted(count: int = 60, *, free2d: int = 0, free3d: int = 0, seed: int = 0)
     rng = np.random.default_rng(seed)
     points3d = rng.normal(size=(count, 3))
     rotation, translation = cv2.Rodrigues(rng.normal(size=3))[0], np.array([0.1, -0.2, 9.0])
-    camera = points3d @ rotation.T + translation
-    points2d = np.concatenate([camera[:, :2] / camera[:, 2:], 50 + rng.random((free2d, 2))])
+    points2d = np.concatenate([seen(points3d, rotation, translation), 50 + rng.random((free2d, 2))])
     points3d = np.concatenate([points3d, 50 + rng.random((free3d, 3))])
     return Problem(f"p{seed}", np.float32(points2d), np.float32(points3d), count, rotation, translation, 800.0)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from planted import seen
 from released_pickles import Sample, sample, write
 
 from bpnp.cli import main
@@ -22,8 +23,8 @@ def check(store: Store, samples: list[Sample]) -> None:
         count = expected["num_points_2d"][0]
         assert (len(problem.points2d), len(problem.points3d)) == (count, count)
         assert problem.matched == count
-        camera = problem.points3d @ problem.rotation.T + problem.translation
-        assert problem.points2d == pytest.approx(camera[:, :2] / camera[:, 2:], abs=1e-6)
+        projected = seen(problem.points3d, problem.rotation, problem.translation)
+        assert problem.points2d == pytest.approx(projected, abs=1e-6)
         assert problem.points3d == pytest.approx(expected["p3d"][:count], abs=1e-6)
 
 

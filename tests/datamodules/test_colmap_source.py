@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planted import seen
 from planted_model import plant_model
 
 from bpnp.datamodules.augment import Augmentation, augment
@@ -23,8 +24,8 @@ def source(folder: Path, **options) -> ColmapSource:
 
 def residuals(problem: Problem) -> np.ndarray:
     """Distance of each match's 3D point, projected, to its 2D point."""
-    camera = problem.points3d[: problem.matched] @ problem.rotation.T + problem.translation
-    return np.linalg.norm(camera[:, :2] / camera[:, 2:] - problem.points2d[: problem.matched], axis=-1)
+    projected = seen(problem.points3d[: problem.matched], problem.rotation, problem.translation)
+    return np.linalg.norm(projected - problem.points2d[: problem.matched], axis=-1)
 
 
 def test_an_image_is_its_keypoints_and_the_points_it_sees(tmp_path: Path) -> None:

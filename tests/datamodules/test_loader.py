@@ -1,7 +1,6 @@
 """Batches: the sampler's laws for any length and number of processes, and exact resuming under Lightning."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -53,25 +52,6 @@ def sampler(sizes: Sequence[int], *, rank: int = 0, replicas: int = 1, **options
     return BucketSampler(
         ProblemDataset(Numbered(sizes), fresh=True), rank=rank, num_replicas=replicas, seed=3, **options
     )
-
-
-def test_stacked_pairs_are_padded_and_masked() -> None:
-    source = Numbered([2, 5, 3])
-    problems = [source.problem(i, 0) for i in (1, 2)]
-    problems[1] = replace(problems[1], matched=2, origin=np.array([1.0, 2.0, 3.0]))
-    batch = stacked(problems, torch.tensor([1, 2]))
-    assert batch.points2d.dtype == batch.focal.dtype == torch.float32
-    assert batch.rotation.dtype == torch.float64
-    assert batch.index.tolist() == [1, 2]
-    assert batch.ids == ("1", "2")
-    assert batch.focal.tolist() == [800.0, 800.0]
-    assert batch.origin.tolist() == [[0, 0, 0], [1, 2, 3]]
-    assert batch.match3d.tolist() == [[0, 1, 2, 3, 4], [0, 1, -1, -1, -1]]
-    for row, problem in enumerate(problems):
-        n = len(problem.points3d)
-        assert batch.mask3d[row].tolist() == batch.mask2d[row].tolist() == [True] * n + [False] * (5 - n)
-        np.testing.assert_array_equal(batch.points3d[row, :n], problem.points3d)
-        np.testing.assert_array_equal(batch.points2d[row, :n], problem.points2d)
 
 
 @pytest.mark.parametrize("count", [1, 7, 24, 1003])

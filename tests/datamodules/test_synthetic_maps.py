@@ -8,12 +8,7 @@ from jsonargparse import ArgumentParser
 from scipy.spatial.transform import Rotation
 
 from bpnp.datamodules import Outliers, Problem, SyntheticMapDataModule
-from bpnp.datamodules.synthetic_maps.maps import (
-    KINDS,
-    MOST_ERROR_PX,
-    MapOptions,
-    draw_map_problem,
-)
+from bpnp.datamodules.synthetic_maps.maps import KINDS, MOST_ERROR_PX, MapOptions, draw_map_problem
 
 
 def problems(count: int, **options: object) -> list[Problem]:

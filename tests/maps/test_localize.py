@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from planted import degrees_between
+from planted import degrees_between, seen
 from planted_model import PINHOLE, Planted, plant_model
 from scipy.spatial.transform import Rotation
 
@@ -24,8 +24,8 @@ def planted(tmp_path_factory: pytest.TempPathFactory) -> tuple[SceneMap, Planted
 def photo_of(truth: Planted, number: int) -> tuple[np.ndarray, np.ndarray]:
     """Pixels of a new photo near view `number`, clutter last, and the ids of what it sees (0: clutter)."""
     turn = Rotation.from_euler("xyz", [4, -6, 3], degrees=True).as_matrix()
-    camera = truth.points3d[truth.seen[number]] @ (turn @ truth.rotations[number]).T + truth.translations[number]
-    pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
+    points = truth.points3d[truth.seen[number]]
+    pixels = 520 * seen(points, turn @ truth.rotations[number], truth.translations[number]) + [400, 300]
     ids = np.concatenate([truth.seen[number] + 1, np.zeros(len(truth.clutter_px[number]), int)])
     return np.concatenate([pixels, truth.clutter_px[number]]), ids
 
@@ -68,9 +68,7 @@ def test_matches_and_their_places_name_the_same_points(planted: tuple[SceneMap, 
 
 def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[SceneMap, Planted]) -> None:
     scene, truth = planted
-    rotation, translation = truth.rotations[1], truth.translations[1]
-    camera = truth.points3d @ rotation.T + translation
-    pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
+    pixels = 520 * seen(truth.points3d, truth.rotations[1], truth.translations[1]) + [400, 300]
     pixels += np.random.default_rng(0).normal(0, 0.5, pixels.shape)
     solution = scene.localize(pixels, PINHOLE, views=["photo 1.jpg"])
     others = ~np.isin(solution.matches[:, 1], truth.seen[1] + 1)
@@ -107,8 +105,7 @@ def test_a_prior_says_on_which_side_the_photo_was_taken(planted: tuple[SceneMap,
         for name, (rotation, translation) in zip("ab", poses, strict=True)
     )
     twins = SceneMap(points, everything.astype(np.int64), np.full(140, 2, np.int32), views)
-    camera = points + [0, 0, 3]
-    pixels = 520 * camera[:, :2] / camera[:, 2:] + [400, 300]
+    pixels = 520 * seen(points, *poses[0]) + [400, 300]
     for rotation, translation in poses:
         prior = PosePrior(rotation, translation, 5.0, 0.3)
         found = twins.localize(pixels, PINHOLE, prior=prior, solver="search", time_limit=20)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from planted import degrees_between
+from planted import degrees_between, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
@@ -41,7 +41,7 @@ def pose_at(degrees: float, distance: float, tilt: float = 5.0) -> tuple[Array, 
     return rotation, np.array([0.0, 0.0, distance])
 
 
-def seen(points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
+def facing(points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
     """Places of the points that face the camera."""
     towards = -rotation.T @ translation - points
     return np.flatnonzero((towards * normals).sum(-1) > 0.2 * np.linalg.norm(towards, axis=-1))
@@ -50,7 +50,7 @@ def seen(points: Array, normals: Array, rotation: Array, translation: Array) -> 
 def map_of(points: Array, normals: Array) -> SceneMap:
     poses = [pose_at(degrees, 5.0) for degrees in range(10, 370, 40)]
     views = tuple(
-        View(f"{i}.jpg", camera_from(CAMERA), *pose, seen(points, normals, *pose).astype(np.int32))
+        View(f"{i}.jpg", camera_from(CAMERA), *pose, facing(points, normals, *pose).astype(np.int32))
         for i, pose in enumerate(poses)
     )
     return SceneMap(points, np.arange(len(points)), np.zeros(len(points), np.int32), views).seen_by(2)
@@ -58,8 +58,7 @@ def map_of(points: Array, normals: Array) -> SceneMap:
 
 def photo(rng: np.random.Generator, points: Array, normals: Array, rotation: Array, translation: Array) -> Array:
     """Pixels of 7 of 10 points that face the camera, half a pixel off, and of as many more that are anywhere."""
-    camera = points[seen(points, normals, rotation, translation)] @ rotation.T + translation
-    pixels = FOCAL * camera[:, :2] / camera[:, 2:]
+    pixels = FOCAL * seen(points[facing(points, normals, rotation, translation)], rotation, translation)
     pixels = pixels[rng.random(len(pixels)) < 0.7]
     clutter = rng.uniform(pixels.min(0), pixels.max(0), pixels.shape)
     return np.concatenate([pixels + rng.normal(0, 0.5, pixels.shape), clutter])
@@ -88,8 +87,7 @@ def test_faces_that_are_alike_in_all_points_are_ambiguous_and_both_poses_are_can
     rng = np.random.default_rng(0)
     points, normals = box(rng, turns, alike=ALIKE + DIFFERENT)
     pose = pose_at(-4.0, 4.2, -3.0)
-    camera = points[: ALIKE + DIFFERENT] @ pose[0].T + pose[1]  # the front alone
-    pixels = FOCAL * camera[:, :2] / camera[:, 2:]
+    pixels = FOCAL * seen(points[: ALIKE + DIFFERENT], *pose)  # the front alone
     clutter = rng.uniform(pixels.min(0), pixels.max(0), (100, 2))
     keypoints = np.concatenate([pixels + rng.normal(0, 0.5, pixels.shape), clutter])
     solution = map_of(points, normals).localize(keypoints, CAMERA)

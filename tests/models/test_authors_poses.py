@@ -8,6 +8,7 @@ import pytest
 import torch
 from authors_network import Released, checkpoint, plan
 from numpy.typing import NDArray
+from planted import seen
 from scipy.optimize import minimize
 from scipy.spatial.transform import Rotation
 from torch import nn
@@ -41,8 +42,8 @@ def planted(size: int, seed: int) -> tuple[Array, Array]:
     rng = np.random.default_rng(seed)
     points3d = rng.uniform(-1, 1, (size, 3)) * [1, 1, 0.4]
     rotation = Rotation.from_rotvec(rng.normal(0, 0.03, 3)).as_matrix()
-    camera = points3d @ rotation.T + [*rng.normal(0, 0.03, 2), DISTANCE]
-    return camera[:, :2] / camera[:, 2:] + rng.normal(0, 5e-4, (size, 2)), points3d
+    image = seen(points3d, rotation, [*rng.normal(0, 0.03, 2), DISTANCE])
+    return image + rng.normal(0, 5e-4, (size, 2)), points3d
 
 
 def released_poses(assignment: Array, points2d: Array, points3d: Array) -> tuple[Array, Array]:

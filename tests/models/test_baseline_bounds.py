@@ -9,14 +9,7 @@ from torch import Tensor
 
 from bpnp.geometry import camera_centre
 from bpnp.models.baselines.branch_and_bound import Boxes, count_inliers, maximise_inliers
-from bpnp.models.baselines.gosma import (
-    RayMixture,
-    SceneMixture,
-    align_mixtures,
-    distance,
-    lower_bound,
-    squared_norm,
-)
+from bpnp.models.baselines.gosma import RayMixture, SceneMixture, align_mixtures, distance, lower_bound, squared_norm
 
 
 def normal(*shape: int) -> Tensor:

@@ -7,11 +7,7 @@ from torch import Tensor
 from bpnp import Prediction
 from bpnp.layers import RansacPnP, Sinkhorn, WeightedPnP, sinkhorn
 from bpnp.metrics import rotation_error
-from bpnp.models.evaluation import (
-    match_again,
-    pnp_pose,
-    round_widths,
-)
+from bpnp.models.evaluation import match_again, pnp_pose, round_widths
 
 MU = 0.1
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plotly.offline import get_plotlyjs
-from report_data import HOSTILE, inflated, rows, write_run
+from report_data import HOSTILE, inflated, write_run
 
-from bpnp.report import write_page, write_results
+from bpnp.report import write_page
 from bpnp.report.page.charts import chart_text, recall_chart
-from bpnp.report.page.write import page_html, plotly_script
+from bpnp.report.page.write import page_html
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 
@@ -83,16 +83,6 @@ def test_nothing_on_the_page_comes_from_elsewhere_or_escapes_its_place(tmp_path:
     assert not re.search("https?://", page)
     policy = next(a["content"] or "" for tag, a in elements.tags if a.get("http-equiv") == "Content-Security-Policy")
     assert policy.startswith("default-src 'none';")
-
-
-def test_eight_runs_of_ten_thousand_pairs_stay_under_20_mb(tmp_path: Path) -> None:
-    """Numbers grow with the problems; the points of 500 take 3 MB."""
-    sizes = []
-    for count in (200, 1200):
-        write_results(tmp_path / str(count), rows(count, 0, ("ransac", "pnp", "refined")))
-        sizes.append(len(page_html([tmp_path / str(count)]).encode()))
-    assert sizes[0] + 8 * 10_795 * (sizes[1] - sizes[0]) / 1000 < 17e6
-    assert len(plotly_script()) < sizes[0] < 2.3e6
 
 
 def test_what_cannot_be_read_is_named_and_no_page_is_left(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from planted import seen
 from report_data import drawn_problem, inflated, row
 from scipy.spatial.transform import Rotation
 
@@ -44,8 +45,8 @@ def test_the_page_has_the_points_and_poses_of_every_problem() -> None:
         *quaternion, x, y, z = line["poses"]["b"]["ransac"]
         assert (Rotation.from_quat(quaternion).inv() * Rotation.from_matrix(rotation)).magnitude() < 1e-4
         np.testing.assert_allclose([x, y, z], translation, atol=1e-4)
-        camera = points3d @ rotation.T + translation
-        np.testing.assert_allclose((camera[:, :2] / camera[:, 2:])[line["match3d"]], points2d, atol=1e-4)
+        projected = seen(points3d, rotation, translation)
+        np.testing.assert_allclose(projected[line["match3d"]], points2d, atol=1e-4)
         assert line["poses"]["a"]["pnp"] is None
 
 

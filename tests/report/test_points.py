@@ -4,6 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planted import seen
 from report_data import planted
 from scipy.spatial.transform import Rotation
 
@@ -32,12 +33,10 @@ def test_a_view_keeps_true_matches_and_drops_padding(most: int) -> None:
         assert len(problem.points2d) == len(problem.points3d) == min(size, most)
         assert problem.pose is not None
         rotation, translation = problem.pose
-        camera = problem.points3d @ rotation.T + translation
         kept = problem.match3d >= 0
         assert kept.sum() == min(size - 5, most)
-        np.testing.assert_allclose(
-            (camera[:, :2] / camera[:, 2:])[kept], problem.points2d[problem.match3d[kept]], atol=1e-6
-        )
+        projected = seen(problem.points3d, rotation, translation)
+        np.testing.assert_allclose(projected[kept], problem.points2d[problem.match3d[kept]], atol=1e-6)
         np.testing.assert_array_equal(problem.assigned3d[kept], problem.match3d[kept])
         assert problem.error == pytest.approx(10.0, abs=1e-6)
 

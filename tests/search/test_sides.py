@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import degrees_between, directions
+from planted import degrees_between, directions, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp.search.point_sets import PointSets, faces
@@ -20,15 +20,14 @@ def rays(image: Array) -> Array:
     return np.asarray(directions(homogeneous))
 
 
-def wall(seed: int, side: int = 250, seen: int = 120, background: int = 200) -> tuple[PointSets, Array]:
+def wall(seed: int, side: int = 250, matches: int = 120, background: int = 200) -> tuple[PointSets, Array]:
     """A wall with normals and other points on either face, of which the camera sees one; its rotation."""
     rng = np.random.default_rng(seed)
     rotation, facing = Rotation.random(rng=rng).as_matrix(), np.repeat([-1.0, 1.0], side)
     points = np.column_stack([rng.uniform(-1, 1, (2 * side, 2)), facing * rng.uniform(0.1, 0.3, 2 * side)])
     normals = np.column_stack([np.zeros((2 * side, 2)), facing])
     visible = np.flatnonzero(faces(normals, None, points @ rotation.T + TRANSLATION, rotation))
-    camera = points[visible[:seen]] @ rotation.T + TRANSLATION
-    image = camera[:, :2] / camera[:, 2:] + NOISE * rng.normal(size=(seen, 2))
+    image = seen(points[visible[:matches]], rotation, TRANSLATION) + NOISE * rng.normal(size=(matches, 2))
     image = np.r_[image, rng.uniform(image.min(0), image.max(0), (background, 2))]
     return PointSets(rays(rng.permutation(image)), points, normals3d=normals), rotation
 
@@ -38,8 +37,7 @@ def cluttered(seed: int, outliers: int, shared: int = 100) -> tuple[Array, Array
     rng = np.random.default_rng(seed)
     rotation = Rotation.random(rng=rng).as_matrix()
     points = rng.normal(size=(shared + outliers, 3)) * [0.8, 0.8, 0.3]
-    camera = points[:shared] @ rotation.T + TRANSLATION
-    image = camera[:, :2] / camera[:, 2:] + NOISE * rng.normal(size=(shared, 2))
+    image = seen(points[:shared], rotation, TRANSLATION) + NOISE * rng.normal(size=(shared, 2))
     image = np.r_[image, image.std() * rng.normal(size=(outliers, 2))]
     return rays(image), points, rotation, np.arange(shared + outliers)
 

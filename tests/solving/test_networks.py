@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from planted import plant
+from planted import plant, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many
@@ -39,8 +39,7 @@ def scene(clutter: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     rng = np.random.default_rng(2)
     points = rng.normal(size=(40, 3)) @ VIEW
     rotation, translation = Rotation.from_rotvec([0.1, -0.05, 0.02]).as_matrix() @ VIEW, np.array([0.2, -0.1, 7.0])
-    camera = points @ rotation.T + translation
-    image = camera[:, :2] / camera[:, 2:]
+    image = seen(points, rotation, translation)
     others = rng.uniform(image.min(), image.max(), (clutter, 2))
     return (
         np.concatenate([image, others]),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
-from planted import degrees_between, plant
+from planted import degrees_between, plant, seen
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -23,13 +23,8 @@ POSES = [(Rotation.random(random_state=k).as_matrix(), np.array([side, 0.1, 7.0]
 NOISE2D, NOISE3D = RNG.uniform(-0.4, 0.4, (150, 2)), RNG.normal(size=(150, 3))
 
 
-def seen(points: Array, pose: tuple[Array, Array]) -> Array:
-    camera = points @ pose[0].T + pose[1]
-    return np.asarray(camera[:, :2] / camera[:, 2:])
-
-
 # An image of two objects of one make, and a scene in which one object stands twice.
-TWO_IN_THE_IMAGE = np.concatenate([seen(OBJECT, pose) for pose in POSES])
+TWO_IN_THE_IMAGE = np.concatenate([seen(OBJECT, *pose) for pose in POSES])
 SHIFT = np.array([3.0, 0, 0])
 TWO_IN_THE_SCENE = np.concatenate([OBJECT, OBJECT + SHIFT])
 
@@ -48,7 +43,7 @@ def test_scores_and_labels_say_which_of_two_it_is(likely: int) -> None:
     by_label = solve(TWO_IN_THE_IMAGE, OBJECT, labels2d=np.where(mine, 3, 5), labels3d=np.full(80, 3))
     assert which(by_label) == likely
     assert mine[by_label.matches[:, 0]].all()
-    image, labels3d = seen(OBJECT, POSES[0]), np.where(mine, 2, 4)
+    image, labels3d = seen(OBJECT, *POSES[0]), np.where(mine, 2, 4)
     solution = solve(image, TWO_IN_THE_SCENE, labels2d=np.full(80, 2), labels3d=labels3d)
     assert mine[solution.matches[:, 1]].all()
 
@@ -67,7 +62,7 @@ def test_a_prior_says_which_twin_it_is() -> None:
     half = RNG.uniform(-1, 1, (6, 3))
     points = np.concatenate([half, half * [-1, -1, 1]])
     rotation, translation = Rotation.from_rotvec([0.5, 0.3, 0.8]).as_matrix(), np.array([0.0, 0.05, 6.0])
-    image = seen(points, (rotation, translation))
+    image = seen(points, rotation, translation)
     for turned in (rotation, rotation @ np.diag([-1.0, -1, 1])):
         near = Rotation.from_rotvec([0.03, -0.02, 0.03]).as_matrix() @ turned
         solution = solve(image, points, prior=PosePrior(near, translation, 3.0, 0.2))  # type: ignore[arg-type]
@@ -80,7 +75,7 @@ def test_a_prior_says_which_twin_it_is() -> None:
 def test_normals_say_from_which_side_a_point_is_seen() -> None:
     normals = np.tile([0.0, 0.0, -1.0], (60, 1))  # towards a camera with R = I
     board = np.column_stack([RNG.uniform(-1, 1, (60, 2)), 0.4 * RNG.uniform(-1, 1, 60)])
-    image = seen(board, (np.eye(3), np.array([0.0, 0, 6])))
+    image = seen(board, np.eye(3), [0.0, 0, 6])
     assert degrees_between(solve(image, board, normals3d=normals).rotation, np.eye(3)) < 0.1
     behind = solve(image, board, normals3d=-normals, time_limit=1.0)
     assert not behind.found or degrees_between(behind.rotation, np.eye(3)) > 5
@@ -115,7 +110,7 @@ def test_a_threshold_bounds_the_errors_of_matches() -> None:
     solutions = [solve(*points, inlier_threshold=threshold) for threshold in (0.001, 0.01)]
     for solution, threshold in zip(solutions, (0.001, 0.01), strict=True):
         i, j = solution.matches.T
-        errors = np.linalg.norm(points[0][i] - seen(points[1], (solution.rotation, solution.translation))[j], axis=1)
+        errors = np.linalg.norm(points[0][i] - seen(points[1], solution.rotation, solution.translation)[j], axis=1)
         assert 0.8 * threshold < errors.max() * (1 if threshold == 0.001 else 2) <= 2 * threshold
     assert solutions[0].inlier_count < solutions[1].inlier_count
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from planted import view_with_outliers
+from planted import seen, view_with_outliers
 
 import bpnp
 
@@ -51,8 +51,7 @@ def test_only_the_classes_tell_two_equal_things_apart() -> None:
     shape, label = rng.uniform(-0.7, 0.7, (50, 3)), rng.integers(0, 4, 50)
     points = np.concatenate([shape, shape + [3.0, 0, 0]])
     classes3d = np.concatenate([probabilities(rng, label, 3.0), probabilities(rng, (label + 1) % 4, 3.0)])
-    camera = shape + [3.0, 0, 6]
-    image = camera[:, :2] / camera[:, 2:]
+    image = seen(shape, np.eye(3), [3.0, 0, 6])
     classes2d = probabilities(rng, (label + 1) % 4)
     classes: dict[str, Any] = {"labels2d": classes2d, "labels3d": classes3d}
     right, twin = (np.eye(3), [0, 0, 6.0]), (np.eye(3), [3.0, 0, 6.0])

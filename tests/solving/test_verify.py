@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from planted import degrees_between, view_with_outliers
+from planted import degrees_between, seen, view_with_outliers
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -64,8 +64,7 @@ def test_the_mirror_image_of_a_plane_is_met() -> None:
     rng = np.random.default_rng(9)
     points = np.column_stack([rng.uniform(-1, 1, (80, 2)), np.zeros(80)])
     rotation, translation = Rotation.from_euler("xz", [35, 20], degrees=True).as_matrix(), np.array([0, 0, 6.0])
-    camera = points @ rotation.T + translation
-    x = camera[:, :2] / camera[:, 2:] + 5e-4 * rng.standard_normal((80, 2))
+    x = seen(points, rotation, translation) + 5e-4 * rng.standard_normal((80, 2))
     assert bpnp.verify(x, points, rotation, translation).verdict == "confident"
     mirrored = np.diag([1, 1, -1.0]) @ rotation @ np.diag([1, 1, -1.0])
     wrong = bpnp.verify(x, points, mirrored, translation)

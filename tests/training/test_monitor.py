@@ -68,14 +68,6 @@ def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3)
     trainer.fit(PlantedModule(), loader, loader)
 
 
-def test_the_mass_on_true_matches_and_the_iterations_are_those_planted() -> None:
-    batch = planted(5)
-    values = watched_values(PlantedModule()(batch), batch)
-    assert float(values["true_match_mass"]) == pytest.approx(0.25)
-    assert float(values["pnp_iterations"]) == 7
-    assert watched_values(Prediction(), batch) == {}
-
-
 def test_the_spread_of_known_features() -> None:
     """Corners are sqrt(1 - 1/4) from their mean; of opposite points what is padded does not count."""
     corners, opposite = torch.eye(4).expand(1, 4, 4), torch.tensor([[[1.0, 0], [-3, 0], [0, 9], [0, 9]]])
@@ -102,6 +94,8 @@ def test_a_training_logs_what_is_watched(tmp_path: Path) -> None:
     rows = list(csv.DictReader((tmp_path / "logs" / "version_0" / "metrics.csv").open()))
     mass = [float(row["val/true_match_mass"]) for row in rows if row["val/true_match_mass"]]
     assert mass == pytest.approx([0.25] * 3)
+    assert {float(row["val/pnp_iterations"]) for row in rows if row["val/pnp_iterations"]} == {7}
+    assert watched_values(Prediction(), planted(5)) == {}
     with pytest.raises(ValueError, match="expected `problems`"):
         TrainingMonitor(problems=0)
 
