@@ -94,9 +94,18 @@ def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:
     pinhole = ("PINHOLE", [520.0, 520.0, WIDTH / 2, HEIGHT / 2])
     truth = plant_model(tmp_path, camera=pinhole, images=2, points=140, seen=90, clutter=0)
     scene, pixels = SceneMap.from_colmap(tmp_path), 520 * truth.points2d[0] + [WIDTH / 2, HEIGHT / 2]
-    solution = scene.localize(pixels, image_size=(WIDTH, HEIGHT), views=["photo 0.jpg"], solver="search")
-    assert solution.focal_length == pytest.approx(520, rel=0.01)
-    assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
+    bent = camera_from(("SIMPLE_RADIAL", (520.0, WIDTH / 2, HEIGHT / 2, -0.3))).project(
+        np.c_[truth.points2d[0], np.ones(90)]
+    )
+    size, rough = {"image_size": (WIDTH, HEIGHT)}, ("SIMPLE_PINHOLE", (560.0, WIDTH / 2, HEIGHT / 2))
+    for keypoints, known in (
+        (pixels, size),
+        (pixels, {"camera": rough, "focal_error": 0.1}),
+        (bent, size | {"distortion": True}),
+    ):
+        solution = scene.localize(keypoints, **known, views=["photo 0.jpg"], solver="search")
+        assert solution.focal_length == pytest.approx(520, rel=0.01)
+        assert degrees_between(solution.rotation, truth.rotations[0]) < 0.1
     with pytest.raises(ValueError, match="or `image_size` where the focal length is unknown, got neither"):
         scene.localize(pixels)
 

@@ -221,7 +221,9 @@ def test_progress_names_the_pair() -> None:
     sets2d, sets3d = [planted.points2d[0]] * 2, planted.points3d[0]
     solve_many(sets2d, sets3d, progress=lambda pair, batch, _: calls.append((pair, batch)))
     assert {pair for pair, _ in calls} == {0, 1}
-    assert [batch for pair, batch in calls if pair == 0] == [batch for pair, batch in calls if pair == 1]
+    first, second = ([batch for pair, batch in calls if pair == number] for number in (0, 1))
+    solve(sets2d[0], sets3d, progress=lambda pair, batch, _: calls.append((pair + 2, batch)))
+    assert first == second == [batch for pair, batch in calls if pair == 2]
 
 
 def test_keypoints_of_opencv_count_from_the_centre_of_the_first_pixel() -> None:

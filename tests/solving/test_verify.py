@@ -128,5 +128,16 @@ def test_options_reach_the_verdict(view: Any) -> None:
     inward = -points / np.linalg.norm(points, axis=1, keepdims=True)
     facing = bpnp.verify(bearings, points, *pose, normals3d=inward)
     assert facing.inlier_count < 60
-    assert np.array_equal(bpnp.verify(bearings, points, *pose, seed=3).rotation,
-                          bpnp.verify(bearings, points, *pose, seed=3).rotation)  # fmt: skip
+    brief = bpnp.verify(bearings, points, *pose, time_limit=1e-9)
+    assert brief.stats.iterations < bpnp.verify(bearings, points, *pose).stats.iterations
+    around = [[c.score for c in bpnp.verify(bearings, points, *pose, seed=seed).candidates[1:]] for seed in (0, 0, 3)]
+    assert around[0] == around[1] != around[2]
+
+
+@pytest.mark.parametrize("side", ["scores2d", "scores3d"])
+def test_scores_weigh_the_likelihood_of_a_pose(view: Any, side: str) -> None:
+    partners = np.where(np.arange(120) < 60, 1.0, 0.05)
+    right, none, wrong = (
+        bpnp.verify(*view, **scores).candidates[0].score for scores in ({side: partners}, {}, {side: 1.05 - partners})
+    )
+    assert right > none > wrong
