@@ -43,9 +43,9 @@ class TwinSettings:
     """
 
     look: RasterSearch = RasterSearch(
-        Draws(2**16, least_starts=2**16),
-        Screens((100, 300), (2**10, 2**8)),
-        Narrowing(0.08, 0.02, steps=3, copies=8, points=300),
+        Draws(2**13, least_starts=2**13),
+        Screens((50, 300), (2**11, 2**8)),
+        Narrowing(0.1, 0.015, steps=6, points=300),
         annealed=6,
     )
     looks: int = 8

@@ -101,8 +101,8 @@ class Screens:
 class Narrowing:
     """From the scale of the screening to one at which poses are annealed.
 
-    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; at twice the first one chance fills
-        the view, at half of it the gaps between starts are wider than the basins. steps: from one to the other, with
+    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; from 0.12 on
+        chance fills the view, at 0.03 the gaps between the starts are wider than the basins. steps: from one to the other, with
         factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
     copies: of a pose at each step. points: 3D points that are looked up there. halved: half of the poses go on each
         time, the best copy of each, so that those of some do not crowd out the others.
@@ -236,17 +236,24 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     near: tuple[RasterSearch, ...] = tuple(
-        RasterSearch(Draws(2**16, least_starts=2**14), Screens(kept=(2**13, 2**10)), Narrowing(first), annealed=20)
+        RasterSearch(
+            Draws(2**16, least_starts=2**14),
+            Screens((100, 1000), (2**13, 2**10)),
+            Narrowing(first, points=600),
+            annealed=12,
+        )
         for first in (0.06, 0.03)  # the finer one where keypoints are dense and few points are seen
     )
     beside: RasterSearch = RasterSearch(
-        Draws(2**17, 10.0, 0.1, 2**15),
-        Screens((50, 300), (2**14, 2**9)),
-        Narrowing(0.03, 0.015, steps=2, copies=16, points=600),
+        Draws(2**13, 10.0, 0.1, 2**13),
+        Screens((50, 300), (2**11, 2**8)),
+        Narrowing(0.08, 0.015, steps=5, copies=16, points=600),
         annealed=12,
     )
     proposed: RasterSearch = RasterSearch(screens=Screens(kept=(2**13, 2**10)))
-    everywhere: RasterSearch = RasterSearch()
+    everywhere: RasterSearch = RasterSearch(
+        Draws(2**15), Screens((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
+    )
     cones: Cones = Cones()
     facing: Facing = Facing()
     evidence: Evidence = Evidence()

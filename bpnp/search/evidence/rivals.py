@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.annealing import polished
-from bpnp.search.candidates import Candidates
+from bpnp.search.annealing import anneal_on_points, polished
+from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.partners import Zoomed, with_focal_length
@@ -68,7 +68,9 @@ def _at_other_focal_lengths(
     if -rule.independent * decades > rule.missed:
         scene = entered()
         poses = [near_focal_length(sets, rotation, middle, zoom, scale, scene) for zoom in rule.zoomed.zooms]
-        zoom, there, pose = min(poses, key=lambda one: float(one[2].log10_false_alarms[0]))
+        zoom, there, pose = min(poses, key=lambda one: one[2].log10_false_alarms.min(initial=math.inf))
+        if not len(pose):  # after the deadline
+            return
         seen = pose.rotation[0] @ sets.middle + pose.translation[0]
         fitted = with_focal_length(there, pose.rotation[0], seen, max(float(pose.scale[0]), there.image.scales[0]))
         yield None if fitted is None else fitted._replace(zoom=zoom * fitted.zoom)
@@ -87,7 +89,8 @@ def near_focal_length(
     there = Scene(zoomed, 0, scene.settings, scene.deadline)
     wide = max(scale, rule.width * abs(math.log(zoom)) * sets.image.spread)
     poses = rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None]
-    return zoom, zoomed, with_false_alarms(polished(there, *poses, wide), zoomed)
+    ends = anneal_on_points(there, Candidates.unscored(*there.enter(*poses)), 2 * wide)
+    return zoom, zoomed, with_false_alarms(in_user_frame(ends, there), zoomed)
 
 
 def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:

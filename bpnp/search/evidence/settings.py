@@ -92,7 +92,7 @@ class Evidence:
     missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`).
     independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
         a better optimum though several starts ended at a pose that exceeds chance. look_fails: that starts around a
-        wrong pose miss a better one beside it; 12 of 12 met it (Laplace's rule of succession).
+        wrong pose miss a better one beside it, as 30 of 534 did.
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
         tenth wrong is believed half as often again.
     contested, repetitions, zoomed: constants of these alternatives.
