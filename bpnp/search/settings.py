@@ -101,9 +101,9 @@ class Screens:
 class Narrowing:
     """From the scale of the screening to one at which poses are annealed.
 
-    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; from 0.12 on
-        chance fills the view, at 0.03 the gaps between the starts are wider than the basins. steps: from one to the other, with
-        factors above 0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
+    first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; from 0.12 on chance fills the view,
+        at 0.03 the gaps between the starts are wider than the basins. steps: from one to the other, with factors above
+        0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
     copies: of a pose at each step. points: 3D points that are looked up there. halved: half of the poses go on each
         time, the best copy of each, so that those of some do not crowd out the others.
     """
