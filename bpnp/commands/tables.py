@@ -5,7 +5,7 @@ from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bpnp.commands.output import progress, say
+from bpnp.commands.output import say
 from bpnp.commands.parser import at_least
 from bpnp.files import claimed, packaged_config, write_text
 from bpnp.report.terminal import Paper, console
@@ -25,7 +25,6 @@ def table(
     rho: list[float] | None = None,
     seeds: list[int] | None = None,
     time_limit: float | None = None,
-    processes: int = 1,
     output: Path = Path("runs/table"),
     paper: Literal["auto", "modelnet40", "megadepth", "none"] = "auto",
     overrides: list[str] | None = None,
@@ -37,18 +36,16 @@ def table(
 
     Args:
         data: name or file of a configuration with `data`.
-        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, hungarian, bpnpnet,
+        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, hungarian, bpnpnet,
             matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian need a
             CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
         limit: problems, a fixed random choice; all by default.
         rho: outliers a match on both sides; a table and a plot over these.
         seeds: of the data; the mean over these and its standard deviation.
         time_limit: seconds a problem, for methods that have a limit.
-        processes: worker processes of one thread each; each takes a method at a time.
         output: folder of the results.
         paper: published rows beneath.
     """
-    from bpnp.loops.processes import in_processes
     from bpnp.report.figures import outlier_curves, save_figure
     from bpnp.report.tables import (
         CAPTION,
@@ -61,7 +58,7 @@ def table(
     )
     from bpnp.training.comparison import MethodTest, parse_methods, read_data, with_setting
 
-    at_least(1, limit=limit, processes=processes)
+    at_least(1, limit=limit)
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
     recipe = read_data(Path(packaged_config(data)), overrides or [])
@@ -85,15 +82,9 @@ def table(
         missing = [test for test in every if test.results() is None]
         if len(missing) < len(every):
             say(f"{len(every) - len(missing)} of {len(every)} tests are finished, in {output}", to=out)
-        if processes == 1:
-            for test in missing:
-                say(f"testing {test.method.label} in {test.folder}", to=out)
-                test.run(progress_bar=out.is_interactive)
-        else:
-            with progress() as shown:
-                task = shown.add_task("tests", total=len(missing))
-                for _ in in_processes(lambda i: missing[i].run(), range(len(missing)), processes):
-                    shown.advance(task)
+        for test in missing:
+            say(f"testing {test.method.label} in {test.folder}", to=out)
+            test.run(progress_bar=out.is_interactive)
         rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
     published = PAPERS.get(recipe["class_path"].rpartition(".")[2]) if paper == "auto" else paper
     rows += paper_rows(None if published == "none" else published)

@@ -19,7 +19,7 @@ import bpnp.datamodules
 from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser, plain
 from bpnp.files import claimed
-from bpnp.training.callbacks import InterruptedCheckpoint, OfflineWandbLogger, SafeCheckpointIO, interruptible
+from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
@@ -78,9 +78,6 @@ class BpnpCLI(LightningCLI):
         chosen = self._get(self.config_init, "trainer.logger")
         loggers = chosen if isinstance(chosen, list) else [] if chosen in (None, True, False) else [chosen]
         root = self._get(self.config_init, "trainer.default_root_dir")
-        for logger in loggers:
-            if isinstance(logger, OfflineWandbLogger):
-                logger.keep_in(root)
         if chosen is not False and not any(isinstance(logger, CSVLogger) for logger in loggers):
             loggers = [*loggers, CSVLogger(root, name="logs")]
         return super().instantiate_trainer(**{"plugins": plugins, "logger": loggers} | kwargs)

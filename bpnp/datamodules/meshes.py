@@ -88,8 +88,7 @@ class MeshSource:
         seed: Sequence[int],
         label: str,
     ) -> None:
-        if count is not None and count < 1:
-            raise ValueError(f"expected at least one {label} problem, got {count}")
+        check_within(1, math.inf, **{f"{label}_problems": 1 if count is None else count})
         radius = float(store.columns["radius"][rows].max())
         self.sees_all = cameras.distance - cameras.translation_range - radius > MIN_DEPTH
         if not self.sees_all:

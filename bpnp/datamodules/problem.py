@@ -1,7 +1,7 @@
 """A problem, one set of image points and one of scene points, as a source gives it; and how problems become a batch."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -98,26 +98,18 @@ def stacked(problems: Sequence[Problem], index: Int[Tensor, " b"]) -> Batch:
 
     Points are float32, poses float64.
     """
-    count2d = torch.tensor([len(problem.points2d) for problem in problems])[:, None]
-    count3d = torch.tensor([len(problem.points3d) for problem in problems])[:, None]
-    matched = torch.tensor([problem.matched for problem in problems])[:, None]
-    points2d = torch.zeros(len(problems), int(count2d.max()), 2)
-    points3d = torch.zeros(len(problems), int(count3d.max()), 3)
-    for i, problem in enumerate(problems):
-        points2d.numpy()[i, : len(problem.points2d)] = problem.points2d
-        points3d.numpy()[i, : len(problem.points3d)] = problem.points3d
-    places = torch.arange(points3d.shape[1])
-    origins = [np.zeros(3) if problem.origin is None else problem.origin for problem in problems]
-    return Batch(
-        points2d=points2d,
-        points3d=points3d,
-        mask2d=torch.arange(points2d.shape[1]) < count2d,
-        mask3d=places < count3d,
-        focal=torch.tensor([problem.focal for problem in problems], dtype=torch.float32),
-        index=index,
-        ids=tuple(problem.name for problem in problems),
-        rotation=torch.from_numpy(np.stack([problem.rotation for problem in problems])),
-        translation=torch.from_numpy(np.stack([problem.translation for problem in problems])),
-        match3d=torch.where(places < matched, places, -1),
-        origin=torch.from_numpy(np.stack(origins)),
+    places = [np.arange(len(problem.points3d)) for problem in problems]
+    batch = Batch.from_arrays(
+        [problem.points2d for problem in problems],
+        [problem.points3d for problem in problems],
+        match3d=[np.where(j < problem.matched, j, -1) for j, problem in zip(places, problems, strict=True)],
+        focal=[problem.focal for problem in problems],
+        index=index.tolist(),
+        ids=[problem.name for problem in problems],
     )
+    poses = [(problem.rotation, problem.translation, problem.origin) for problem in problems]
+    rotation, translation, origin = (
+        torch.tensor(np.array([np.zeros(3) if value is None else value for value in values]))
+        for values in zip(*poses, strict=True)
+    )
+    return replace(batch, rotation=rotation, translation=translation, origin=origin)

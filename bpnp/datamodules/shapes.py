@@ -1,5 +1,6 @@
 """Collections of shapes to sample: procedural ones, and meshes in a folder."""
 
+import math
 import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping
@@ -11,6 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+from bpnp.checks import check_within
 from bpnp.datamodules.surfaces import SUFFIXES, Mesh, read_mesh, sample_surface
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.geometry import random_rotations
@@ -39,8 +41,7 @@ def procedural_shapes(split: str, count: int, *, seed: int) -> Shapes:
 
     Shape i does not depend on their number. Raises ValueError for none.
     """
-    if count < 1:
-        raise ValueError(f"expected at least one procedural {split} shape, got {count}")
+    check_within(1, math.inf, **{f"{split}_shapes": count})
     samplers = {
         f"procedural/{split}/{i:06d}": partial(_procedural_samples, (seed, PARTS.index(split), i)) for i in range(count)
     }

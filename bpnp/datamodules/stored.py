@@ -12,6 +12,7 @@ from lightning.pytorch.trainer.states import TrainerFn
 from numpy.typing import NDArray
 from torch import Tensor
 
+from bpnp.checks import check_within
 from bpnp.datamodules.augment import Augmentation, Side
 from bpnp.datamodules.loader import STAGES, ProblemDataModule
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
@@ -197,9 +198,7 @@ def split_scenes(
         raise ValueError(f"expected scenes among {', '.join(scenes)}, got {', '.join(unknown)}; try one of those")
     if twice := sorted({name for name in named if named.count(name) > 1}):
         raise ValueError(f"expected each scene once in the lists of scenes, got {', '.join(twice)} more than once")
-    for part, fraction in fractions.items():
-        if not 0 <= fraction <= 1:
-            raise ValueError(f"expected `{part}_fraction` between 0 and 1, got {fraction}")
+    check_within(0, 1, test_fraction=test_fraction, val_fraction=val_fraction)
     rest = sorted(set(scenes) - set(named))
     rest = [rest[i] for i in np.random.default_rng(seed).permutation(len(rest))]
     for part, fraction in fractions.items():

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from bpnp.checks import check_positive, check_within
 from bpnp.geometry import bearings, choose, chords
 from bpnp.loops.parallel import Deadline
 from bpnp.robust.proposals import pose_hypotheses
@@ -40,8 +41,7 @@ class Search(nn.Module):
 
     def __init__(self, *, seed: int = 0, time_limit: float | None = 5.0, settings: SearchSettings = DEFAULT) -> None:
         super().__init__()
-        if time_limit is not None and not time_limit > 0:
-            raise ValueError(f"expected a positive `time_limit` in seconds, got {time_limit}")
+        check_positive(time_limit=math.inf if time_limit is None else time_limit)
         self.seed, self.time_limit, self.settings = seed, time_limit, settings
 
     def forward(self, batch: Batch) -> Prediction:
@@ -123,8 +123,7 @@ def residual_energy(
 
 def round_widths(rounds: int, ransac: nn.Module) -> list[float]:
     """s of each round in radians, falling by the same factor to the `threshold` of `ransac`."""
-    if rounds < 0:
-        raise ValueError(f"expected a number of `rounds`, got {rounds}; try 0 for none")
+    check_within(0, math.inf, rounds=rounds)
     if rounds == 0:
         return []
     last = getattr(ransac, "threshold", None)
@@ -205,8 +204,7 @@ class Refinement(nn.Module):
 
     def __init__(self, *, hypotheses: int = 192, enabled: bool = True) -> None:
         super().__init__()
-        if hypotheses < 0:
-            raise ValueError(f"expected a number of `hypotheses`, got {hypotheses}; try 0 for none")
+        check_within(0, math.inf, hypotheses=hypotheses)
         self.hypotheses, self.enabled = hypotheses, enabled
 
     def forward(self, prediction: Prediction, batch: Batch) -> Prediction:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bpnp.cameras import Camera, Lens
+from bpnp.cameras import Camera, image_size, same_shape
 from bpnp.report.points import Array
 
 
@@ -25,10 +25,10 @@ def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
     Raises ValueError for a photo of another shape than the camera's images.
     """
     height, width = photo.shape[:2]
-    known = (camera.camera.width, camera.camera.height) if isinstance(camera, Lens) else (0, 0)
-    if not all(known):
+    known = None if camera is None else image_size(camera)
+    if known is None:
         return width, height
-    if abs(width * known[1] - height * known[0]) > max(*known, width, height):  # a pixel of rounding on a side
+    if not same_shape((width, height), known):
         raise ValueError(
             f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
             f"{height}; try the photo of this camera"

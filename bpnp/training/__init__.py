@@ -1,12 +1,11 @@
 """The LightningModule, its losses, and the callbacks of a training."""
 
-from bpnp.training.callbacks import OfflineWandbLogger, PoseLossWarmup, SafeCheckpointIO, TrainingMonitor
+from bpnp.training.callbacks import PoseLossWarmup, SafeCheckpointIO, TrainingMonitor
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
 
 __all__ = [
     "BlindPnPTask",
-    "OfflineWandbLogger",
     "PoseLossWarmup",
     "ResultsWriter",
     "SafeCheckpointIO",

@@ -2,7 +2,6 @@
 
 import io
 import math
-import os
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,6 @@ from typing import Any
 import torch
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
-from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from torch import Tensor, nn
@@ -23,6 +21,8 @@ from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets.normalisation import centred
 from bpnp.models.weights import read_checkpoint
 from bpnp.types import Batch, Prediction
+
+COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
 
 
 class PoseLossWarmup(Callback):
@@ -36,8 +36,7 @@ class PoseLossWarmup(Callback):
     """
 
     def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:
-        if start_epoch < 0 or weight < 0:
-            raise ValueError(f"expected start_epoch >= 0 and weight >= 0, got {start_epoch} and {weight}")
+        check_within(0, math.inf, start_epoch=start_epoch, weight=weight)
         self.start_epoch, self.weight = start_epoch, weight
         self.switched_at: int | None = None
 
@@ -89,34 +88,6 @@ def interruptible(trainer: Trainer) -> Iterator[None]:
             signal.signal(signal.SIGINT, signal.default_int_handler)
             raise KeyboardInterrupt from None
         raise
-
-
-COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
-
-
-class OfflineWandbLogger(WandbLogger):
-    """Lightning's W&B logger that sends nothing unless asked: offline where WANDB_MODE is not set.
-
-    Args:
-        project, name: of the run.
-        save_dir: where the folder of an offline run goes, for `wandb sync`; none for the run's folder in `bpnp fit`,
-            else the working directory.
-    """
-
-    def __init__(self, project: str = "bpnp", name: str | None = None, save_dir: str | None = None) -> None:
-        mode = os.environ.get("WANDB_MODE") or "offline"  # as an argument too: wandb reads its variables only once
-        super().__init__(project=project, name=name, save_dir=save_dir or ".", offline=mode == "offline", mode=mode)
-        self._placed = save_dir is not None
-
-    def keep_in(self, folder: str) -> None:
-        """Put the run that is to begin below `folder`, unless a `save_dir` was given."""
-        if not self._placed:
-            self._save_dir = self._wandb_init["dir"] = folder
-
-    @property
-    def experiment(self) -> Any:
-        os.makedirs(self._wandb_init["dir"], exist_ok=True)
-        return super().experiment
 
 
 class TrainingMonitor(Callback):

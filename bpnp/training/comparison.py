@@ -27,7 +27,6 @@ SHORT_NAMES = {
     "softposit": "bpnp.models.baselines.SoftPOSIT",
     "ransac": "bpnp.models.baselines.RandomRansac",
     "gosma": "bpnp.models.baselines.GOSMA",
-    "gopac": "bpnp.models.baselines.GOPAC",
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
     "matcher": "bpnp.models.Matcher",
@@ -54,7 +53,7 @@ class Method:
         if self.checkpoint is not None:
             state = Path(self.checkpoint).stat()
             described["checkpoint_state"] = [state.st_size, int(state.st_mtime)]
-        return dict(json.loads(json.dumps(described, default=str)))
+        return dict(plain(described))
 
     def build(self) -> nn.Module:
         """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
@@ -177,7 +176,7 @@ class MethodTest:
         level, threads = messages.level, torch.get_num_threads()
         messages.setLevel(logging.WARNING)
         torch.set_num_threads(1)
-        torch.manual_seed(0)  # of a network without a checkpoint: its weights are the same in every process
+        torch.manual_seed(0)  # of a network without a checkpoint
         trainer = Trainer(
             accelerator="cpu", devices=1, callbacks=[writer], logger=False, enable_checkpointing=False,
             enable_progress_bar=progress_bar, enable_model_summary=False,

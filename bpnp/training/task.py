@@ -15,6 +15,7 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LambdaLR
 from torchmetrics import MetricCollection
 
+from bpnp.checks import check_within
 from bpnp.layers.implicit import BackwardStats
 from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
@@ -81,11 +82,8 @@ class BlindPnPTask(LightningModule):
             self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver, grown=True))
         self.loss = None if loss is None else chosen(loss, nn.Module)
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
-        if warmup_steps < 0 or (decay_start or 0) < 0 or decay_steps < 1:
-            raise ValueError(
-                "expected `warmup_steps` and `decay_start` >= 0 and `decay_steps` >= 1, got "
-                f"{warmup_steps}, {decay_start} and {decay_steps}"
-            )
+        check_within(0, math.inf, warmup_steps=warmup_steps, decay_start=decay_start or 0)
+        check_within(1, math.inf, decay_steps=decay_steps)
         self.warmup_steps, self.decay_start, self.decay_steps = warmup_steps, decay_start, decay_steps
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")

@@ -74,7 +74,7 @@ def test_scenes_are_split_without_overlap() -> None:
     [
         ({"test": ["s77"]}, "expected scenes among s0, s1, .* got s77"),
         ({"test": ["s1"], "train": ["s1"]}, "got s1 more than once"),
-        ({"test_fraction": 1.5}, "`test_fraction` between 0 and 1"),
+        ({"test_fraction": 1.5}, "`test_fraction` from 0 to 1"),
     ],
 )
 def test_a_split_that_does_not_fit_is_one_error(options: dict, message: str) -> None:

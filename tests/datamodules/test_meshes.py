@@ -169,7 +169,7 @@ def test_wrong_arguments_are_named(tmp_path: Path) -> None:
         module(tmp_path, euler_range=(45.0, 0.0))
     with pytest.raises(ValueError, match="`noise_px` .* got nan"):
         module(tmp_path, noise_px=float("nan"))
-    with pytest.raises(ValueError, match="at least one train problem, got 0"):
+    with pytest.raises(ValueError, match="expected `train_problems` of 1 or more, got 0"):
         module(tmp_path, train_problems=0).setup("fit")
     with pytest.raises(ValueError, match="`val_fraction` between 0 and 1, got 1"):
         hold_out(10, 1.0, seed=0)

@@ -20,7 +20,7 @@ def wrong_pairs(planted: Planted, share: float, *, seed: int = 0) -> Tensor:
     return assignment.scatter_(1, match.unsqueeze(1), 1 + torch.rand(b, 1, n, generator=generator).double())
 
 
-@pytest.mark.parametrize(("backend", "share"), [("poselib", 0.6), ("opencv", 0.3), ("torch", 0.3)])
+@pytest.mark.parametrize(("backend", "share"), [("poselib", 0.6), ("opencv", 0.3)])
 def test_finds_a_planted_pose_among_wrong_pairs(backend: str, share: float) -> None:
     planted = plant(8, 80, noise=0.001, seed=1)
     assignment = wrong_pairs(planted, share)
@@ -31,7 +31,7 @@ def test_finds_a_planted_pose_among_wrong_pairs(backend: str, share: float) -> N
     assert stats.residual.max() < THRESHOLD
 
 
-@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
+@pytest.mark.parametrize("backend", ["poselib", "opencv"])
 @pytest.mark.parametrize("kind", ["three pairs", "one place", "collinear", "no agreement", "nothing finite"])
 def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
     planted = plant(3, 12, seed=4)
@@ -54,14 +54,12 @@ def test_without_four_inliers_there_is_no_pose(backend: str, kind: str) -> None:
     assert r[0].isnan().all()
     assert t[0].isnan().all()
     assert stats.residual[0] == torch.inf
-    tried = (
-        kind not in ("three pairs", "nothing finite") or backend == "torch"
-    )  # what was tried counts, whatever came of it
+    tried = kind not in ("three pairs", "nothing finite")  # what was tried counts, whatever came of it
     assert (stats.iterations[0] > 0) == tried
     assert rotation_angle(r[1:], planted.rotation[1:]).max() < 1e-5
 
 
-@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
+@pytest.mark.parametrize("backend", ["poselib", "opencv"])
 def test_points_of_one_plane_are_no_trap(backend: str) -> None:
     planted = plant(12, 60, seed=6)
     points3d = planted.points3d * torch.tensor([1.0, 1.0, 0.0]).double()
@@ -74,7 +72,7 @@ def test_points_of_one_plane_are_no_trap(backend: str) -> None:
     assert torch.rad2deg(rotation_angle(r, planted.rotation)).max() < 2
 
 
-@pytest.mark.parametrize("backend", ["poselib", "opencv", "torch"])
+@pytest.mark.parametrize("backend", ["poselib", "opencv"])
 def test_a_seed_gives_the_same_pose_again(backend: str) -> None:
     planted = plant(2, 40, noise=0.005, seed=6)
     assignment = wrong_pairs(planted, 0.4)

@@ -4,11 +4,9 @@ import math
 
 import roma
 import torch
-from planted import plant
 from torch import Tensor
 
-from bpnp.geometry import camera_centre
-from bpnp.models.baselines.branch_and_bound import Boxes, count_inliers, maximise_inliers
+from bpnp.models.baselines.branch_and_bound import Boxes
 from bpnp.models.baselines.gosma import RayMixture, SceneMixture, align_mixtures, distance, lower_bound, squared_norm
 
 
@@ -95,24 +93,3 @@ def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() 
         lowest = min(lowest, float(values.min()) / norm + 1)
     assert found.bound <= lowest
     assert found.value <= lowest  # no grid point beats it
-
-
-def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:
-    problem = plant(1, 7, seed=3, outliers2d=2, outliers3d=2)
-    rays, points = problem.bearings[0], problem.points3d[0]
-    centre = camera_centre(*problem.pose)[0]
-    turn = roma.rotmat_to_rotvec(problem.rotation)[0]
-    domain = whole(turn + 0.05, 0.15, centre + 0.05, 0.15)
-    found = maximise_inliers(rays, points, domain, angle=0.01, max_boxes=3_000_000)
-    assert found.rotation is not None
-    assert found.value == found.bound
-    assert found.value >= 7
-    assert count_inliers(rays, points, found.rotation, found.place, 0.01) == found.value
-    steps = torch.linspace(-1, 1, 7).double()
-    grid = torch.cartesian_prod(steps, steps, steps)
-    most = 0
-    for shift in grid:
-        directions = torch.nn.functional.normalize(points - domain.place[0] - 0.15 * shift, dim=-1)
-        cosine = (rays @ roma.rotvec_to_rotmat(domain.turn + 0.15 * grid)) @ directions.mT
-        most = max(most, int((cosine >= math.cos(0.01)).any(-1).sum(-1).max()))
-    assert most <= found.value

@@ -1,76 +1,50 @@
-"""The RANSAC of a whole batch against PoseLib's, among many wrong pairs and points that repeat."""
+"""Scores and inliers of a pose, counted one match after the other; and a RANSAC that is not misled from behind."""
 
 import numpy as np
-import pytest
 import torch
-from planted import Planted, plant
-from torch import Tensor
+from planted import plant
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust.consensus import Matches, truncated_scores
-from bpnp.types import SolveStats
+from bpnp.robust.consensus import Matches, residuals, truncated_scores
 
 THRESHOLD = 0.01
 
 
-def problem(
-    seed: int, *, pairs: int = 600, inliers: float = 0.3, lead: float = 2.0, noise: float = 0.0025
-) -> tuple[Planted, Matches, Tensor]:
-    """Candidate pairs of 400 points in any order, a share of them true, and weights that favour these by `lead`."""
-    planted, generator = plant(1, 400, noise=noise, seed=seed), torch.Generator().manual_seed(seed)
-    order = torch.randperm(pairs, generator=generator)
-    true = order < round(inliers * pairs)
-    other = torch.randint(1, 400, (pairs,), generator=generator)
-    second = torch.where(true, order % 400, other)
-    first = torch.where(true, second, (second + other.roll(1)) % 400)
-    weights = (torch.randn(pairs, generator=generator, dtype=torch.float64) + lead * true).exp()
-    chosen = Matches(planted.points2d[:, planted.match3d[0, first]], planted.points3d[:, second], true.unsqueeze(0))
-    return planted, chosen._replace(real=torch.ones(1, pairs, dtype=torch.bool)), weights.unsqueeze(0)
-
-
-def consensus(
-    pairs: Matches, weights: Tensor, *, backend: str = "torch", hypotheses: int = 2048
-) -> tuple[Tensor, Tensor, SolveStats]:
-    """The consensus of pairs (b, k): an assignment of each 2D point to the 3D point of the same index."""
-    return ransac_pnp(
-        torch.diag_embed(weights),
-        *pairs[:2],
-        mask2d=pairs.real,
-        mask3d=pairs.real,
-        matches_factor=1.0,
-        backend=backend,
-        threshold=THRESHOLD,
-        max_iterations=hypotheses,
+def test_a_score_is_the_sum_of_truncated_errors() -> None:
+    planted = plant(2, 40, noise=0.004, seed=1)
+    seen = planted.points2d.gather(1, planted.match3d.unsqueeze(-1).expand(-1, -1, 2))
+    matches = Matches(seen, planted.points3d, torch.rand(2, 40, generator=torch.Generator().manual_seed(0)) < 0.8)
+    rotation, translation = planted.near(0.5, seed=1)  # some points are behind this camera
+    poses = torch.stack(
+        [torch.cat([r, t.unsqueeze(-1)], -1) for r, t in (planted.pose, (rotation, translation - 5))], 1
     )
-
-
-def as_matrix(rotation: Tensor, translation: Tensor) -> Tensor:
-    """[R | t] (b, 1, 3, 4)."""
-    return torch.cat([rotation, translation.unsqueeze(-1)], -1).unsqueeze(1)
-
-
-@pytest.mark.parametrize(("inliers", "lead"), [(0.1, 2.0), (0.3, 2.0), (0.6, 2.0), (0.3, 0.0), (0.6, 0.0)])
-def test_pose_and_score_are_poselibs(inliers: float, lead: float) -> None:
-    for seed in range(3):
-        planted, pairs, weights = problem(seed, inliers=inliers, lead=lead)
-        ours, theirs = (consensus(pairs, weights, backend=backend)[:2] for backend in ("torch", "poselib"))
-        scores = [truncated_scores(as_matrix(*pose), pairs, THRESHOLD**2) for pose in (ours, theirs)]
-        assert scores[0] < scores[1] * 1.005
-        assert rotation_angle(ours[0], theirs[0]) < np.deg2rad(0.2)
-        assert rotation_angle(ours[0], planted.rotation) < np.deg2rad(1)
+    scores = truncated_scores(poses, matches, THRESHOLD**2)
+    for b in range(2):
+        for c in range(2):
+            expected, inliers = 0.0, []
+            for x, p, real in zip(*(values[b].numpy() for values in matches), strict=True):
+                camera = poses[b, c, :, :3].numpy() @ p + poses[b, c, :, 3].numpy()
+                error = ((camera[:2] / camera[2] - x) ** 2).sum() if camera[2] > 0 else np.inf
+                expected += real * min(error, THRESHOLD**2)
+                inliers.append(bool(real and error < THRESHOLD**2))
+            assert abs(float(scores[b, c]) - expected) < 1e-6
+            assert residuals(poses[:, c], matches, THRESHOLD**2)[1][b].tolist() == inliers
+    assert (scores[:, 0] < 0.7 * scores[:, 1]).all()
 
 
 def test_points_behind_the_camera_are_no_inliers() -> None:
     """Every other 3D point is put where it is seen from behind, in the same place of the image."""
-    planted, pairs, weights = problem(4, inliers=0.6, noise=0.001)
-    camera = pairs.points3d @ planted.rotation.mT + planted.translation
+    planted = plant(1, 400, noise=0.001, seed=4)
+    camera = planted.points3d @ planted.rotation.mT + planted.translation
     camera[:, ::2] *= -1
-    pairs = pairs._replace(points3d=(camera - planted.translation) @ planted.rotation)
-    rotation, translation, stats = consensus(pairs, weights)
+    points3d = (camera - planted.translation.unsqueeze(1)) @ planted.rotation
+    rotation, translation, stats = ransac_pnp(
+        planted.permutation(), planted.points2d, points3d, matches_factor=1.0, threshold=THRESHOLD
+    )
     assert rotation_angle(rotation, planted.rotation) < np.deg2rad(1)
-    camera = pairs.points3d @ rotation.mT + translation
-    distance = (camera[..., :2] / camera[..., 2:] - pairs.points2d).norm(dim=-1)[0]
+    camera = points3d @ rotation.mT + translation
+    distance = (camera[..., :2] / camera[..., 2:] - planted.points2d[:, planted.match3d[0]]).norm(dim=-1)[0]
     assert (distance[::2] < THRESHOLD).any()
     front = distance[1::2]
     torch.testing.assert_close(stats.residual[0], front[front < THRESHOLD].mean())

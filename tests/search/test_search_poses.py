@@ -66,7 +66,7 @@ def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, o
 @pytest.mark.parametrize(
     ("call", "named"),
     [
-        (lambda: Search(time_limit=0.0), "positive `time_limit`"),
+        (lambda: Search(time_limit=0.0), "`time_limit` > 0"),
         (lambda: DEFAULT.expecting(1.0), "`clutter`"),
         (lambda: SearchSettings(Schedule(turns=0)), "`turns`"),
         (lambda: SearchSettings(starts=0), "`starts`"),

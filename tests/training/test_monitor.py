@@ -1,11 +1,9 @@
 import csv
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-import wandb
 from lightning import LightningModule
 from lightning.pytorch.loggers import CSVLogger
 from planted import posed
@@ -14,7 +12,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.callbacks import OfflineWandbLogger, TrainingMonitor, feature_spreads, watched_values
+from bpnp.training.callbacks import TrainingMonitor, feature_spreads, watched_values
 
 
 class PlantedModule(LightningModule):
@@ -98,23 +96,3 @@ def test_a_training_logs_what_is_watched(tmp_path: Path) -> None:
     assert watched_values(Prediction(), planted(5)) == {}
     with pytest.raises(ValueError, match="expected `problems`"):
         TrainingMonitor(problems=0)
-
-
-def test_the_wandb_logger_is_offline_unless_asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WANDB_MODE", "")
-    monkeypatch.setenv("WANDB_SILENT", "true")
-    wandb.finish()  # a run that another test left would be joined
-    logger = OfflineWandbLogger(save_dir=str(tmp_path / "runs"))
-    fit(tmp_path, TrainingMonitor(problems=2), logger, epochs=1)
-    assert logger.experiment.offline
-    logger.experiment.finish()
-    (run,) = (tmp_path / "runs" / "wandb").glob("offline-run-*")
-    assert is_written(next(run.glob("*.wandb")), b"val/true_match_mass")
-
-
-def is_written(path: Path, text: bytes) -> bool:
-    """Whether another process writes this to a file within half a minute."""
-    deadline = time.monotonic() + 30
-    while text not in path.read_bytes() and time.monotonic() < deadline:
-        time.sleep(0.1)
-    return text in path.read_bytes()

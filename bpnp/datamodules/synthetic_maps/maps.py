@@ -215,8 +215,7 @@ class MapSource:
     """
 
     def __init__(self, options: MapOptions, *, count: int, seed: Sequence[int], label: str) -> None:
-        if count < 1:
-            raise ValueError(f"expected at least one {label} problem, got {count}")
+        check_within(1, math.inf, **{f"{label}_problems": count})
         self.options, self.count, self.seed, self.label = options, count, tuple(seed), label
 
     @property

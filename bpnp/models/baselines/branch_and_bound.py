@@ -1,10 +1,11 @@
-"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid; and GOPAC
-(Campbell et al., ICCV 2017), whose uncertainty angles bound how far a direction turns in a box.
+"""Branch and bound over camera poses: camera = R (p - c), R in a cube of rotation vectors, c in a cuboid.
+
+Uncertainty angles bound how far a direction turns in a box (Campbell et al., Globally-optimal inlier set maximisation,
+ICCV 2017).
 """
 
 import itertools
 import math
-from abc import abstractmethod
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -12,17 +13,6 @@ import roma
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-
-from bpnp.checks import check_positive
-from bpnp.geometry import bearings
-from bpnp.layers.pnp import weighted_pnp
-from bpnp.loops.parallel import NEVER, Deadline
-from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
-
-DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
-CHUNK = 2**22  # angles computed at a time
-ROUNDING = 1e-9  # of a cosine
-SMALLEST = 1e-3  # half side of the smallest boxes of camera centres, in root mean square radii of the scene
 
 
 class Boxes(NamedTuple):
@@ -41,68 +31,23 @@ class Boxes(NamedTuple):
         return Boxes(*(values[index] for values in self))
 
 
-class Found(NamedTuple):
-    """The best pose, camera = R (p - c), and its number of inliers or its distance; `certified`: no pose of the domain
-    is better than `bound`, and this one is as good, or within the gap that is asked for."""
-
-    rotation: Float[Tensor, "3 3"] | None
-    place: Float[Tensor, "3"]
-    value: float
-    bound: float
-    boxes: int
-    certified: bool
-
-
-class BranchAndBound(SingleSolver):
-    """Searches the camera centre in a cube around the scene's centre and the rotation everywhere."""
-
-    def __init__(self, max_boxes: int | None, time_limit: float | None) -> None:
-        super().__init__(time_limit)
-        self.max_boxes = math.inf if max_boxes is None else max_boxes
-
-    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        centre = problem.points3d.mean(0)
-        radius = root_mean_square((problem.points3d - centre).norm(dim=-1))
-        points = (problem.points3d - centre) / radius
-        away = weak_perspective_distance(problem.points2d, points)
-        zero = points.new_zeros(1, 3)
-        domain = Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * away))
-        found, residual = self.search(problem.points2d, points, domain, away, deadline)
-        if found.rotation is None:
-            return Answer(iterations=found.boxes)
-        translation = -found.rotation @ (radius * found.place + centre)
-        return Answer((found.rotation, translation), found.boxes, residual, found.certified)
-
-    @abstractmethod
-    def search(
-        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
-    ) -> tuple[Found, float]:
-        """The best pose for a scene of root mean square radius 1 at the origin, and its residual.
-
-        away: weak-perspective distance of the camera.
-        """
-
-
 def best_first(
     boxes: Boxes,
     bounds: Float[Tensor, " b"],
-    expand: Callable[[Boxes], tuple[Boxes, Float[Tensor, " c"], int | float]],
+    expand: Callable[[Boxes], tuple[Boxes, Float[Tensor, " c"], float]],
     *,
     at_once: int,
     until: Callable[[int], bool],
-    small: Callable[[Boxes], Bool[Tensor, " b"]] | None = None,
 ) -> tuple[float, int]:
     """Expand the `at_once` boxes of highest bound together until no box can hold anything better than was found.
 
     bounds: no pose of a box is better. expand: boxes to their children, the bounds of these, and the value that a bound
-    must exceed for its box to be kept. until: whether to stop after so many children. small: which boxes are kept for
-    their bound but not expanded.
+    must exceed for its box to be kept. until: whether to stop after so many children.
     Returns the highest bound of the boxes that are left, -inf if none is, and the number of children.
     """
-    done, aside = 0, bounds.new_tensor([-math.inf])
+    done = 0
     while len(bounds) and not until(done):
-        # One at a time: of equal bounds the oldest.
-        chosen = bounds.topk(min(at_once, len(bounds))).indices if at_once > 1 else bounds.argmax().unsqueeze(0)
+        chosen = bounds.topk(min(at_once, len(bounds))).indices
         rest = torch.ones_like(bounds, dtype=torch.bool)
         rest[chosen] = False
         children, upper, least = expand(boxes.pick(chosen))
@@ -111,17 +56,7 @@ def best_first(
         bounds = torch.cat([bounds[rest], torch.minimum(upper, bounds.max())])
         promising = bounds > least
         boxes, bounds = boxes.pick(promising), bounds[promising]
-        if small is not None:
-            final = small(boxes)
-            aside = torch.cat([aside, bounds[final]])
-            boxes, bounds = boxes.pick(~final), bounds[~final]
-    return float(torch.cat([aside, bounds]).max()), done
-
-
-def root_mean_square(distances: Float[Tensor, " k"]) -> float:
-    """Root mean square; 1 where it is zero."""
-    value = float(distances.square().mean().sqrt())
-    return value if value > 0 and math.isfinite(value) else 1.0
+    return float(bounds.max()) if len(bounds) else -math.inf, done
 
 
 def rotation_uncertainty(boxes: Boxes) -> Float[Tensor, " b"]:
@@ -168,141 +103,3 @@ def split(boxes: Boxes, turning: Bool[Tensor, " b"]) -> Boxes:
     )
     nearest = (children.turn.abs() - children.turn_half.unsqueeze(-1)).clamp_min(0).norm(dim=-1)
     return children.pick(nearest <= math.pi)
-
-
-class GOPAC(BranchAndBound):
-    """Branch and bound on the number of inlying image points; exact, feasible for small problems only.
-
-    `residual` of the pose is the share of image points without a partner; `converged` is the certificate that no pose
-    has more inliers.
-
-    Args:
-        angle: largest angle between an inlier's ray and its scene point, radians.
-        max_boxes: most boxes, inner ones included; null for as many as the time allows.
-        time_limit: seconds a problem, after which the best pose so far is returned unconverged; null for none.
-    """
-
-    estimates = ("gopac",)
-
-    def __init__(self, *, angle: float = 0.005, max_boxes: int | None = None, time_limit: float | None = 30.0) -> None:
-        super().__init__(max_boxes, time_limit)
-        check_positive(angle=angle)
-        self.angle = angle
-
-    def search(
-        self, points2d: Tensor, points3d: Tensor, domain: Boxes, away: float, deadline: Deadline
-    ) -> tuple[Found, float]:
-        rays = bearings(points2d)
-        found = maximise_inliers(rays, points3d, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline)
-        return found, 1 - found.value / len(rays)
-
-
-def maximise_inliers(
-    rays: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
-    domain: Boxes,
-    *,
-    angle: float,
-    max_boxes: int | float = math.inf,
-    deadline: Deadline = NEVER,
-) -> Found:
-    """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
-
-    The outer search is over the camera centre c in the one box of the domain; for each box two inner searches over R:
-    at its centre, for a better pose, which is refined, and with every angle widened by the uncertainty psi_t(p_j),
-    for whether the box can hold one. Boxes under SMALLEST are not split: their bound may stay above the count.
-    """
-    best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
-    inner = 1
-
-    def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
-        nonlocal best, inner
-        children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
-        bounds = []
-        for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
-            reach = torch.full_like(moving, angle)
-            here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
-            if here.rotation is not None:
-                best = _refined(rays, points, here.rotation, place, angle)
-            wide = (reach + moving).clamp_max(math.pi)
-            there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
-            inner += here.boxes + there.boxes
-            bounds.append(there.bound)
-        return children, rays.new_tensor(bounds), best[2]
-
-    left, outer = best_first(
-        domain,
-        rays.new_full((1,), len(rays)),
-        expand,
-        at_once=1,
-        small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST,
-        until=lambda done: deadline.passed() or done + inner >= max_boxes,
-    )
-    bound = max(best[2], left)
-    return Found(*best, bound, outer + inner, best[2] >= bound)
-
-
-def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
-    """The pose and its number of inliers; refined by the weighted PnP layer unless that loses inliers."""
-    count = count_inliers(rays, points, rotation, place, angle)
-    weights = within(rays, points, rotation, place, angle).to(rays)
-    inputs = weights, rays, points, rotation, -rotation @ place
-    turned, shift, stats = weighted_pnp(*(x.unsqueeze(0) for x in inputs))
-    if bool(stats.converged[0]):
-        moved = -turned[0].mT @ shift[0]
-        if (refined := count_inliers(rays, points, turned[0], moved, angle)) >= count:
-            return turned[0], moved, refined
-    return rotation, place, count
-
-
-def best_rotation(
-    rays: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
-    place: Float[Tensor, "3"],
-    reach: Float[Tensor, " n"],
-    domain: Boxes,
-    *,
-    floor: int,
-    first: bool = False,
-    smallest: float = 1e-3,
-    deadline: Deadline = NEVER,
-) -> Found:
-    """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
-
-    Boxes that cannot have more than `floor` rays are dropped. first: stop at the first rotation that has. Boxes of half
-    side below `smallest` (radians) are not split; they, and those left at the deadline, keep the bound above the count.
-    """
-    directions = torch.nn.functional.normalize(points - place, dim=-1)
-    count, rotation = floor, None
-
-    def expand(parents: Boxes) -> tuple[Boxes, Tensor, int | float]:
-        nonlocal count, rotation
-        children = split(parents, torch.ones_like(parents.turn_half, dtype=torch.bool))
-        cosine = (rays @ children.rotation) @ directions.mT  # (b, m, n)
-        widened = (reach + rotation_uncertainty(children).unsqueeze(-1)).clamp_max(math.pi)
-        reached = (cosine >= reach.cos() - ROUNDING).any(-1).sum(-1)
-        reachable = (cosine >= (widened.cos() - ROUNDING).unsqueeze(1)).any(-1).sum(-1).to(rays)
-        i = int(reached.argmax())
-        if int(reached[i]) > count:
-            count, rotation = int(reached[i]), children.rotation[i]
-        return children, reachable, count
-
-    left, boxes = best_first(
-        domain,
-        rays.new_full((1,), len(rays)),
-        expand,
-        at_once=max(1, CHUNK // (8 * len(rays) * len(directions))),
-        small=lambda boxes: boxes.turn_half < smallest,
-        until=lambda _: deadline.passed() or (first and rotation is not None),
-    )
-    return Found(rotation, place, count, max(count, left), boxes, count >= left)
-
-
-def count_inliers(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> int:
-    """nu(R, c): rays f_i with some angle(f_i, R (p_j - c)) <= `angle`."""
-    return int(within(rays, points, rotation, place, angle).any(-1).sum())
-
-
-def within(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> Bool[Tensor, "m n"]:
-    directions = torch.nn.functional.normalize(points - place, dim=-1)
-    return (rays @ rotation) @ directions.mT >= math.cos(angle) - ROUNDING
