@@ -43,7 +43,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 def test_the_wheel_holds_what_is_used_and_no_more(built: dict[str, Path]) -> None:
     names = zipfile.ZipFile(built["wheel"]).namelist()
-    for name in ("py.typed", "weights/procedural-so3.ckpt", "report/page/assets/page.html"):
+    for name in (
+        "py.typed",
+        "__init__.pyi",
+        "report/__init__.pyi",
+        "weights/procedural-so3.ckpt",
+        "report/page/assets/page.html",
+    ):
         assert f"bpnp/{name}" in names
     assert any(name.endswith("LICENSE") for name in names)
     assert {name.split("/")[0].split("-")[0] for name in names} == {"bpnp"}

@@ -126,7 +126,7 @@ def run_training(arguments: Sequence[str]) -> None:
 
     Raises ValueError for a mistake of the user's, and for a training that diverged.
     """
-    for name in bpnp.datamodules.__all__:  # those that are imported are listed by --help and have short names
+    for name in dir(bpnp.datamodules):  # those that are imported are listed by --help and have short names
         getattr(bpnp.datamodules, name)
     own_task = _names_a_task(arguments)
     try:

@@ -1,0 +1,16 @@
+from .maps.scene_map import SceneMap as SceneMap
+from .models.bpnpnet import BPnPNet as BPnPNet
+from .models.matcher import Matcher as Matcher
+from .search.starts import GravityPrior as GravityPrior
+from .search.starts import PosePrior as PosePrior
+from .search.warm_up import warm_up as warm_up
+from .solving.solution import Solution as Solution
+from .solving.solve import solve as solve
+from .solving.solve import solve_many as solve_many
+from .solving.verify import verify as verify
+from .types import Batch as Batch
+from .types import Pose as Pose
+from .types import Prediction as Prediction
+from .types import SolveStats as SolveStats
+
+__version__: str

@@ -1,0 +1,10 @@
+from .augment import Outliers as Outliers
+from .authors import AuthorsDataModule as AuthorsDataModule
+from .colmap.module import ColmapDataModule as ColmapDataModule
+from .loader import ProblemDataModule as ProblemDataModule
+from .meshes import MeshDataModule as MeshDataModule
+from .problem import Problem as Problem
+from .problem import ProblemSource as ProblemSource
+from .stored import StoredDataModule as StoredDataModule
+from .stored import write_problems as write_problems
+from .synthetic_maps.maps import SyntheticMapDataModule as SyntheticMapDataModule
