@@ -33,11 +33,14 @@ def prepare_modelnet40(
         normalisation: of each mesh.
         processes: worker processes.
     """
-    from bpnp.datamodules.meshes import prepare_meshes
+    from bpnp.datamodules.meshes import surfaces_recipe
+    from bpnp.datamodules.shapes import open_shapes
+    from bpnp.datamodules.store import prepare
 
     at_least(4, points=points)
     at_least(1, processes=processes)
-    store = prepare_meshes(source, output, points=points, normalisation=normalisation, processes=processes)
+    recipe = surfaces_recipe(open_shapes(source), points=points, normalisation=normalisation, label=str(source))
+    store = prepare(recipe, output, processes=processes)
     _show(store, Counter(store.name(row).split("/")[-2] for row in range(len(store))))
 
 
@@ -58,13 +61,14 @@ def prepare_megadepth(
         clutter: natural clutter to keep, as a ratio to the matches; 0.5 adds half as many points.
         processes: worker processes.
     """
-    from bpnp.datamodules.colmap.module import prepare_colmap
+    from bpnp.datamodules.colmap.module import colmap_recipe
+    from bpnp.datamodules.store import prepare
     from bpnp.datamodules.stored import scene_rows
 
     at_least(4, min_points=min_points)
     at_least(1, processes=processes)
     at_least(0, clutter=clutter)
-    store = prepare_colmap(source, output, min_points=min_points, clutter=clutter, processes=processes)
+    store = prepare(colmap_recipe(source, min_points=min_points, clutter=clutter), output, processes=processes)
     _show(store, {"scenes": len(scene_rows(store)), "images": len(store)})
 
 
@@ -76,9 +80,10 @@ def prepare_authors(source: Path, *, output: Path = Path("data/authors"), datase
         output: new folder.
         dataset: where there are several, such as data61_2d3d.
     """
-    from bpnp.datamodules.authors import prepare_authors, split_rows
+    from bpnp.datamodules.authors import authors_recipe, split_rows
+    from bpnp.datamodules.store import prepare
 
-    store = prepare_authors(source, output, dataset=dataset)
+    store = prepare(authors_recipe(source, dataset), output)
     _show(store, {split: len(split_rows(store, split)) for split in ("train", "test")})
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.datamodules.loader import hold_out
 from bpnp.datamodules.problem import Problem
-from bpnp.datamodules.store import Made, Recipe, Row, Store, cached, is_store, open_store, prepare
+from bpnp.datamodules.store import Made, Recipe, Row, Store, cached, is_store, open_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, problem_row, scene_rows
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.geometry import MIN_POINTS
@@ -71,17 +71,11 @@ class AuthorsDataModule(StoredDataModule):
         return {"train": rows[training], "val": rows[held_out], "test": split_rows(self.store, "test")}
 
 
-def prepare_authors(source: Path, output: Path, *, dataset: str | None = None) -> Store:
-    """The authors' pickles below `source` as a store with the scenes train and test.
-
-    Samples that cannot be used are left out and listed. Raises ValueError, StoreError, OSError or PickleError: nothing
-    to convert, a bad pickle, no usable sample, another `output`.
-    """
-    return prepare(authors_recipe(source, dataset), output)
-
-
 def authors_recipe(source: Path, dataset: str | None) -> Recipe:
-    """How the store of the authors' files below `source` is made."""
+    """How the store of the authors' files below `source` is made, with the scenes train and test.
+
+    Raises ValueError where there is nothing to convert, or several data sets; `prepare` PickleError for a bad file.
+    """
     name, parts = _find_parts(source, dataset)
     files = [file for _, part in parts for file in part]
     return Recipe(

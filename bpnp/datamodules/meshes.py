@@ -20,7 +20,7 @@ from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotatio
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
 from bpnp.datamodules.shapes import Sampler, Shapes, open_shapes, procedural_shapes
-from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store, prepare
+from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store
 from bpnp.datamodules.surfaces import MeshError, Normalisation, normalise
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
@@ -281,18 +281,8 @@ class MeshDataModule(ProblemDataModule):
         return cached(recipe, label, self.cache_dir)
 
 
-def prepare_meshes(source: Path, output: Path, *, points: int, normalisation: Normalisation, processes: int) -> Store:
-    """Keep `points` surface samples of every mesh of `source` (see `open_shapes`), for `MeshDataModule(root=output)`.
-
-    Meshes that cannot be used are left out and listed. If `output` has been made from the same source in the same way
-    it is left as it is. Raises ValueError, StoreError or OSError: unusable source, no usable mesh, another `output`.
-    """
-    recipe = surfaces_recipe(open_shapes(source), points=points, normalisation=normalisation, label=str(source))
-    return prepare(recipe, output, processes=processes)
-
-
 def surfaces_recipe(shapes: Shapes, *, points: int, normalisation: Normalisation, label: str) -> Recipe:
-    """How the store of surface samples is made. label: what the shapes are, for messages."""
+    """How the store of `points` surface samples of each shape is made. label: what the shapes are, for messages."""
     samplers = list(shapes.samplers.items())
     starts = range(0, len(samplers), MESHES_A_PART)
     return Recipe(

@@ -213,7 +213,7 @@ class Recipe(Dataset[Made]):
 
 
 def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
-    """The store `output`, made unless it is there already; a run that is stopped leaves nothing.
+    """The store `output`, made unless it is there already, in the same way; a run that is stopped leaves nothing.
 
     Raises StoreError if `output` is something else or was made with other parameters, or if no job gives a row;
     ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.

@@ -11,9 +11,13 @@ from released_pickles import Sample, sample, write
 
 from bpnp.cli import main
 from bpnp.datamodules.augment import Outliers
-from bpnp.datamodules.authors import AuthorsDataModule, PickleError, prepare_authors
-from bpnp.datamodules.store import Store, StoreError, open_store
+from bpnp.datamodules.authors import AuthorsDataModule, PickleError, authors_recipe
+from bpnp.datamodules.store import Store, StoreError, open_store, prepare
 from bpnp.datamodules.stored import PROBLEMS, scene_rows, stored_problem
+
+
+def prepare_authors(source: Path, output: Path) -> Store:
+    return prepare(authors_recipe(source, None), output)
 
 
 def check(store: Store, samples: list[Sample]) -> None:

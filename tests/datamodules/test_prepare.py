@@ -18,8 +18,9 @@ from small_data import check_pairs
 
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
-from bpnp.datamodules.colmap.module import prepare_colmap
-from bpnp.datamodules.meshes import POINTS, SURFACES, prepare_meshes
+from bpnp.datamodules.colmap.module import colmap_recipe
+from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
+from bpnp.datamodules.shapes import open_shapes
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
 from bpnp.datamodules.surfaces import normalise, read_mesh, sample_surface
 
@@ -50,7 +51,8 @@ def meshes(tmp_path: Path) -> Path:
 
 def run(source: Path, output: Path, **changes: object) -> Store:
     options = {"points": 32, "normalisation": "unit_sphere", "processes": 1} | changes
-    return prepare_meshes(source, output, **options)
+    processes = options.pop("processes")
+    return prepare(surfaces_recipe(open_shapes(source), label=str(source), **options), output, processes=processes)
 
 
 def check_same_bytes(store: Path, expected: Path) -> None:
@@ -224,7 +226,7 @@ def test_colmap_pairs_are_those_read_anew(tmp_path: Path, capsys: pytest.Capture
 def test_no_usable_model_is_one_error(tmp_path: Path) -> None:
     scenes(tmp_path / "scenes", 1)
     with pytest.raises(StoreError, match="at least one usable image.*min_points"):
-        prepare_colmap(tmp_path / "scenes", tmp_path / "store", min_points=50, clutter=0.0, processes=1)
+        prepare(colmap_recipe(tmp_path / "scenes", min_points=50, clutter=0.0), tmp_path / "store")
     assert not (tmp_path / "store").exists()
 
 

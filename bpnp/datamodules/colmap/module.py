@@ -17,7 +17,7 @@ from bpnp.datamodules.colmap.model_files import FILES, ColmapError
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
 from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
-from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, prepare
+from bpnp.datamodules.store import Made, Recipe, StoreError, is_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, large_enough, problem_row
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.types import Batch
@@ -152,16 +152,16 @@ def _origin(points3d: NDArray[np.float64]) -> NDArray[np.float64]:
     return median if np.linalg.norm(median) > FAR * extent else np.zeros(3)
 
 
-def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: float, processes: int) -> Store:
-    """The problems of every image of every COLMAP model below `source`, for `ColmapDataModule(root=output)`.
+def colmap_recipe(source: Path, *, min_points: int, clutter: float) -> Recipe:
+    """How the store of the problems of every image of every COLMAP model below `source` is made.
 
     Images with fewer than `min_points` matches, and models that cannot be read, are left out and listed. `clutter`:
-    natural clutter to keep on both sides, as a ratio to the matches. Output and errors as `prepare_meshes`.
+    natural clutter to keep on both sides, as a ratio to the matches.
     """
     models = [(scene, *model) for scene, models in find_scenes(source).items() for model in models.items()]
     files = (folder / f"{file}.{suffix}" for _, _, folder in models for file in FILES for suffix in ("bin", "txt"))
     names = [name for _, name, _ in models]
-    recipe = Recipe(
+    return Recipe(
         kind=PROBLEMS,
         widths=WIDTHS,
         parameters={
@@ -174,7 +174,6 @@ def prepare_colmap(source: Path, output: Path, *, min_points: int, clutter: floa
         what="image",
         source=str(source),
     )
-    return prepare(recipe, output, processes=processes)
 
 
 def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: float) -> Made:
