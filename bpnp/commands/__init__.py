@@ -18,11 +18,7 @@ COMMANDS: Mapping[str, Command | Mapping[str, Command]] = {
     "view": view,
     "wandb": wandb_results,
     "table": table,
-    "prepare": {
-        "modelnet40": prepare_modelnet40,
-        "megadepth": prepare_megadepth,
-        "authors": prepare_authors,
-    },
+    "prepare": {"modelnet40": prepare_modelnet40, "megadepth": prepare_megadepth, "authors": prepare_authors},
     "convert-weights": convert_weights,
     "warm-up": warm_up,
 }

@@ -95,12 +95,7 @@ def _show(store: "Store", counts: Mapping[str, int]) -> None:
             say(f"  {name}: {reason}")
 
 
-def convert_weights(
-    file: Path,
-    out: Path,
-    *,
-    ransac: Literal["poselib", "opencv"] = "poselib",
-) -> None:
+def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv"] = "poselib") -> None:
     """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
 
     The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. Raises ValueError or OSError as

@@ -16,11 +16,7 @@ LINES: Mapping[str, "Lines | None"] = {"true": "match3d", "assigned": "assigned3
 
 
 def report(
-    runs: list[Path],
-    *,
-    paper: Paper | None = None,
-    html: Path | None = None,
-    recall: Path | None = None,
+    runs: list[Path], *, paper: Paper | None = None, html: Path | None = None, recall: Path | None = None
 ) -> None:
     """Show results side by side: tables here, and on request a page and recall curves.
 

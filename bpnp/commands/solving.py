@@ -83,7 +83,7 @@ def solve(
         device: such as cuda; cpu by default.
     """
     from bpnp.cameras import camera_from
-    from bpnp.commands.point_files import read_camera, read_points2d, read_points3d, read_prior
+    from bpnp.commands.point_files import read_camera, read_prior
     from bpnp.search.starts import GravityPrior
     from bpnp.solving.solve import solve as find_pose
 
@@ -105,8 +105,7 @@ def solve(
     known: Any = None if prior is None else read_prior(prior, prior_degrees, prior_distance)
     if up_camera is not None and up_scene is not None:
         known = GravityPrior(up_camera, up_scene, up_degrees)
-    image_points, labels2d = read_points2d(points2d)
-    scene_points, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
+    image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     lens = None if camera is None else read_camera(camera, image)
     size = None if image_size is None else _size(image_size)
     under = None if photo is None or picture is None else read_photo(photo)
@@ -124,9 +123,7 @@ def solve(
             image_size=size,
             focal_error=focal_error,
             distortion=distortion,
-            normals3d=normals3d,
-            labels2d=labels2d,
-            labels3d=labels3d,
+            **annotations,
             solver=solver,
             prior=known,
             inlier_threshold=inlier_threshold,
@@ -186,7 +183,7 @@ def verify(
         time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search around the pose.
     """
-    from bpnp.commands.point_files import read_camera, read_pairs, read_points2d, read_points3d, read_pose
+    from bpnp.commands.point_files import read_camera, read_pairs, read_pose
     from bpnp.solving.verify import verify as judge_pose
 
     judged: tuple[Any, Any]
@@ -196,8 +193,7 @@ def verify(
         judged = read_pose(pose)
     else:
         raise ValueError("expected the JSON of a pose, or --rotation and --translation")
-    image_points, labels2d = read_points2d(points2d)
-    scene_points, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
+    image_points, scene_points, annotations = _read_sides(points2d, points3d, surface, seed)
     with progress(items=False) as shown:
         shown.add_task("looking around the pose", total=None)
         solution = judge_pose(
@@ -206,9 +202,7 @@ def verify(
             judged[0],
             judged[1],
             None if camera is None else read_camera(camera, image),
-            normals3d=normals3d,
-            labels2d=labels2d,
-            labels3d=labels3d,
+            **annotations,
             matches=None if matches is None else read_pairs(matches),
             refine=not as_it_is,
             inlier_threshold=inlier_threshold,
@@ -216,6 +210,15 @@ def verify(
             time_limit=time_limit,
         )
     _tell(solution, json=json, output=output)
+
+
+def _read_sides(points2d: Path, points3d: Path, surface: int | None, seed: int) -> tuple[Any, Any, dict[str, Any]]:
+    """Image points, scene points, and the normals and labels that their files have."""
+    from bpnp.commands.point_files import read_points2d, read_points3d
+
+    seen, labels2d = read_points2d(points2d)
+    scene, normals3d, labels3d = read_points3d(points3d, surface=surface, seed=seed)
+    return seen, scene, {"normals3d": normals3d, "labels2d": labels2d, "labels3d": labels3d}
 
 
 def _tell(solution: "Solution", *, json: bool, output: Path | None) -> Console:

@@ -47,15 +47,7 @@ def table(
         paper: published rows beneath.
     """
     from bpnp.report.figures import outlier_curves, save_figure
-    from bpnp.report.tables import (
-        CAPTION,
-        FILE_COLUMNS,
-        as_latex,
-        note,
-        paper_rows,
-        table_frame,
-        table_of_rows,
-    )
+    from bpnp.report.tables import CAPTION, FILE_COLUMNS, as_latex, note, paper_rows, table_frame, table_of_rows
     from bpnp.training.comparison import MethodTest, parse_methods, read_data, with_setting
 
     at_least(1, limit=limit)

@@ -217,12 +217,7 @@ class Refinement(nn.Module):
         if self.hypotheses:
             assert prediction.assignment is not None
             proposed = pose_hypotheses(
-                prediction.assignment,
-                batch.points2d,
-                batch.points3d,
-                batch.mask2d,
-                batch.mask3d,
-                count=self.hypotheses,
+                prediction.assignment, batch.points2d, batch.points3d, batch.mask2d, batch.mask3d, count=self.hypotheses
             )
         proposed = proposed[0].to(rotation), proposed[1].to(translation)
         refined = refine(batch, torch.cat([rotation, proposed[0]], 1), torch.cat([translation, proposed[1]], 1))

@@ -73,7 +73,9 @@ class TrainedNet(nn.Module):
 
         Raises ValueError that lists the names for any other. Nothing is downloaded.
         """
-        return cls.from_checkpoint(pretrained_path(name))
+        if name not in (names := pretrained_names()):
+            raise ValueError(f"expected the name of packaged weights, got {name!r}; try {', '.join(names)}")
+        return cls.from_checkpoint(name)
 
     @property
     def estimates(self) -> tuple[str, ...]:
@@ -94,20 +96,11 @@ def checkpoint_path(name: str | Path) -> Path:
     if Path(name).is_file():
         return Path(name)
     if str(name) in pretrained_names():
-        return pretrained_path(str(name))
+        return Path(str(WEIGHTS / f"{name}.ckpt"))
     raise FileNotFoundError(
         f"expected a checkpoint, got no file at {name}; try runs/<name>/checkpoints/last.ckpt, or packaged weights: "
         f"{', '.join(pretrained_names())}"
     )
-
-
-def pretrained_path(name: str) -> Path:
-    """The checkpoint of packaged weights. Raises ValueError that lists the names there are."""
-    if name not in pretrained_names():
-        raise ValueError(
-            f"expected the name of packaged weights, got {name!r}; try {', '.join(pretrained_names()) or 'training'}"
-        )
-    return Path(str(WEIGHTS / f"{name}.ckpt"))
 
 
 def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:

@@ -4,10 +4,4 @@ from bpnp.training.callbacks import PoseLossWarmup, SafeCheckpointIO, TrainingMo
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask
 
-__all__ = [
-    "BlindPnPTask",
-    "PoseLossWarmup",
-    "ResultsWriter",
-    "SafeCheckpointIO",
-    "TrainingMonitor",
-]
+__all__ = ["BlindPnPTask", "PoseLossWarmup", "ResultsWriter", "SafeCheckpointIO", "TrainingMonitor"]

@@ -12,7 +12,7 @@ from small_data import small_net
 from bpnp import Batch, BPnPNet, Matcher, solve
 from bpnp.datamodules import MeshDataModule, Outliers, SyntheticMapDataModule
 from bpnp.metrics import rotation_error
-from bpnp.models.weights import LEARNED, described, pretrained_path
+from bpnp.models.weights import LEARNED, checkpoint_path, described
 
 ROOT = Path(__file__).parents[2]
 
@@ -101,7 +101,7 @@ def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
 def test_the_matcher_is_a_prior_and_a_solver_of_solve(cluttered: Batch) -> None:
     assert cluttered.rotation is not None
     points = cluttered.points2d[0], cluttered.points3d[0]
-    for way in ({"prior": Matcher.from_pretrained("matcher-clutter")}, {"solver": pretrained_path("matcher-clutter")}):
+    for way in ({"prior": Matcher.from_pretrained("matcher-clutter")}, {"solver": checkpoint_path("matcher-clutter")}):
         relative = torch.as_tensor(solve(*points, **way).rotation)[None]
         assert float(rotation_error(relative, cluttered.rotation[:1].double())) < 5
 

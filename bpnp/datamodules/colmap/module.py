@@ -2,8 +2,7 @@
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -181,27 +180,19 @@ def model_rows(scene: str, name: str, folder: Path, min_points: int, clutter: fl
 
     What was not used of it is listed, not logged: there may be hundreds of models.
     """
-    with silent(logging.getLogger(__package__)):
-        try:
+    disabled = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings(action="ignore"):
             reconstruction = read_reconstruction(folder, name=name)
             source = ColmapSource([reconstruction], min_points=min_points, clutter=clutter)
-        except (ColmapError, StoreError) as error:
-            return [], {name: str(error)}
+    except (ColmapError, StoreError) as error:
+        return [], {name: str(error)}
+    finally:
+        logging.disable(disabled)
     total, skipped = len(reconstruction.images), {}
     if left_out := total - len(source.images):
         skipped[f"{name}/*"] = f"{left_out} of {total} images with fewer than {min_points} points"
     if reconstruction.notable:
         skipped[f"{name}/points"] = reconstruction.notable
     return [problem_row(scene, source.problem(i)) for i in range(len(source.images))], skipped
-
-
-@contextmanager
-def silent(logger: logging.Logger) -> Iterator[None]:
-    """No messages below errors of a logger and of those under it, and no warnings."""
-    level = logger.level
-    logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings(action="ignore"):
-            yield
-    finally:
-        logger.setLevel(level)

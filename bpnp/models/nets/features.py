@@ -62,14 +62,7 @@ class ImageFeatures(PointFeatures):
         scale: factor on the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
     """
 
-    def __init__(
-        self,
-        *,
-        channels: int = 128,
-        depth: int = 12,
-        centre: bool = False,
-        scale: float = 1.0,
-    ) -> None:
+    def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, scale: float = 1.0) -> None:
         super().__init__(2, channels=channels, depth=depth, centre=centre)
         self.scale = scale
 
@@ -86,14 +79,7 @@ class SceneFeatures(PointFeatures):
             scene's unit nor on its origin.
     """
 
-    def __init__(
-        self,
-        *,
-        channels: int = 128,
-        depth: int = 12,
-        centre: bool = False,
-        normalise: bool = False,
-    ) -> None:
+    def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, normalise: bool = False) -> None:
         super().__init__(3, channels=channels, depth=depth, centre=centre)
         self.normalise = normalise
         self.align = InputTransform()

@@ -130,10 +130,7 @@ def figures() -> dict[str, dict[str, Any]]:
     space: list[dict[str, Any]] = [_marks(size=3.5, line={"width": 0}), _picked(18)]
     scene = (
         [mark | {"type": "scatter3d"} for mark in space],
-        {
-            "margin": dict.fromkeys("lrtb", 0),
-            "scene": axes | view,
-        },
+        {"margin": dict.fromkeys("lrtb", 0), "scene": axes | view},
     )
     axis: dict[str, Any] = {"constrain": "domain", "zeroline": False}
     lines = [_lines(color=INK["quiet"]), _lines(color=INK["wrong"], dash="dot")]
