@@ -117,3 +117,16 @@ def packaged_config(name: str) -> str:
 def config_names() -> list[str]:
     """The names that `packaged_config` takes."""
     return sorted(str(path.relative_to(CONFIGS).with_suffix("")) for path in CONFIGS.rglob("*.yaml"))
+
+
+def config_content(file: Path) -> dict[str, Any]:
+    """The content of a configuration file. Raises ValueError that names a file without options."""
+    import yaml
+
+    try:
+        content = yaml.safe_load(file.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"expected YAML in {file}, got {' '.join(str(error).split())}") from error
+    if not isinstance(content, dict):
+        raise ValueError(f"expected options such as `model:` and `data:` in {file}, got {content!r:.60}")
+    return content

@@ -8,7 +8,6 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import yaml
 from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -18,7 +17,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 import bpnp.datamodules
 from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser, plain
-from bpnp.files import claimed
+from bpnp.files import claimed, config_content
 from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
 from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
@@ -154,17 +153,6 @@ def _names_a_task(arguments: Sequence[str]) -> bool:
     """Whether the options or a configuration file name a LightningModule in place of BlindPnPTask."""
     words = [word for text in arguments for word in text.split("=", 1)]
     files = [Path(value) for name, value in pairwise(words) if name in ("-c", "--config")]
-    models = [_options_in(file).get("model") for file in files if file.is_file()]
+    models = [config_content(file).get("model") for file in files if file.is_file()]
     named = any(isinstance(model, str) or (isinstance(model, dict) and "class_path" in model) for model in models)
     return named or not {"--model", "--model.class_path"}.isdisjoint(words)
-
-
-def _options_in(file: Path) -> dict[str, Any]:
-    """The content of a configuration file. Raises ValueError that names a file without options."""
-    try:
-        content = yaml.safe_load(file.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"expected YAML in {file}, got {' '.join(str(error).split())}") from error
-    if not isinstance(content, dict):
-        raise ValueError(f"expected options such as `model:` and `data:` in {file}, got {content!r:.60}")
-    return content

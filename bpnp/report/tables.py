@@ -160,7 +160,8 @@ def results_table(runs: Mapping[str, Results], *, paper: Paper | None = None) ->
     The best number of each column is bold, among runs of the same problems. `paper` adds the published rows of that
     data set, for orientation only: they are of other data and take no part in the comparison.
     """
-    return table_of_rows(_title("Pose errors", runs), RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
+    sizes = " or ".join(str(size) for size in sorted({results.problems for results in runs.values()}))
+    return table_of_rows(f"Pose errors, {sizes} problems", RESULT_COLUMNS, run_rows(runs, paper), CAPTION)
 
 
 def table_of_rows(title: str, columns: Sequence[Column], rows: Sequence[Row], caption: str) -> SplitTable:
@@ -180,8 +181,7 @@ def report(paths: Sequence[Path], *, paper: Paper | None = None) -> None:
 
     Raises ValueError if a folder cannot be read.
     """
-    out = console()
-    out.print(results_table(read_runs(paths), paper=paper))
+    console().print(results_table(read_runs(paths), paper=paper))
 
 
 def table_frame(rows: Sequence[Row]) -> "DataFrame":
@@ -211,8 +211,3 @@ def note(rows: Sequence[Row]) -> list[str]:
     """A line on each source that is not ours."""
     sources = dict.fromkeys(row.source for row in rows if row.source != HERE)
     return [f"{source}: another data set than ours." for source in sources]
-
-
-def _title(what: str, runs: Mapping[str, Results]) -> str:
-    sizes = sorted({results.problems for results in runs.values()})
-    return f"{what}, {' or '.join(map(str, sizes))} problems"

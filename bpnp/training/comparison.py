@@ -9,13 +9,12 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from jsonargparse import ArgumentParser, Namespace
 from lightning import LightningDataModule, Trainer
 from torch import nn
 from torch.utils.data import DataLoader, DistributedSampler
 
-from bpnp.files import packaged_config
+from bpnp.files import config_content, packaged_config
 from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
@@ -119,7 +118,7 @@ def with_setting(data: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
 def _recipe(path: Path, what: str) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"expected a recipe with {what}, got no file {path}")
-    return yaml.safe_load(path.read_text(encoding="utf-8")) or {}
+    return config_content(path)
 
 
 @dataclass(frozen=True)
