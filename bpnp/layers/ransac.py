@@ -10,7 +10,7 @@ from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
 from bpnp.robust.backends import BACKENDS, each_sample
-from bpnp.robust.consensus import Matches, in_scene, normalised, residuals
+from bpnp.robust.matches import Matches, in_scene, normalised, residuals
 from bpnp.robust.minimal_solvers import take
 from bpnp.types import SolveStats
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
-from bpnp.robust.consensus import Matches, residuals
+from bpnp.robust.matches import Matches, residuals
 
 FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
@@ -27,7 +27,7 @@ def each_sample(
     """One sample after the other: poses [R | t], NaN for none, and hypotheses, or the bound on them where the library
     does not tell. Samples with fewer than 4 matches have no pose and no iterations.
 
-    matches: as `bpnp.robust.consensus.normalised` gives them, most probable first.
+    matches: as `bpnp.robust.matches.normalised` gives them, most probable first.
     """
     poses, iterations = matches.points3d.new_full((len(matches.real), 3, 4), torch.nan), matches.real.sum(-1)
     for i, count in enumerate(iterations.tolist()):

@@ -12,7 +12,7 @@ from torch import Tensor
 from bpnp.distinct_poses import distinct
 from bpnp.geometry import bearings
 from bpnp.precision import full_precision
-from bpnp.robust.consensus import Matches, in_scene, normalised, truncated_scores, weighted_draws
+from bpnp.robust.matches import Matches, in_scene, normalised, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples, take
 
 TRIPLES = 1024  # solved for each sample

@@ -7,7 +7,7 @@ from torch import Tensor
 from bpnp.geometry import MIN_POINTS, bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
-from bpnp.robust.consensus import distinct_triples
+from bpnp.robust.matches import distinct_triples
 from bpnp.robust.minimal_solvers import p3p
 
 TRIPLES = 256  # random ones, solved at a time

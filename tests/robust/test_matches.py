@@ -6,7 +6,7 @@ from planted import plant
 
 from bpnp.geometry import rotation_angle
 from bpnp.layers import ransac_pnp
-from bpnp.robust.consensus import Matches, residuals, truncated_scores
+from bpnp.robust.matches import Matches, residuals, truncated_scores
 
 THRESHOLD = 0.01
 
