@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from bpnp.models.nets.normalisation import MaskedBatchNorm, centred, highest_normed, linear_context_norm
+from bpnp.models.nets.normalisation import MaskedBatchNorm, centred, linear_context_norm
 from bpnp.types import unpadded
 
 
@@ -101,9 +101,9 @@ class InputTransform(nn.Module):
 
     def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
         z, seen = points, None if unpadded(mask) else mask
-        for linear, norm in zip(self.linears[:2], self.norms[:2], strict=True):
+        for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
             z = torch.relu(norm(linear(z), seen))
-        z = torch.relu(highest_normed(z, self.linears[2], self.norms[2], seen))  # type: ignore[arg-type]
+        z = (z if seen is None else z.masked_fill(~seen.unsqueeze(-1), 0)).amax(1)
         for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
             z = torch.relu(norm(linear(z)))
         transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))

@@ -1,6 +1,5 @@
 """Norms of padded sets, which see no padded point: the context norm (Yi et al. 2018) and batch norm."""
 
-from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -95,29 +94,21 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     momentum: float
 
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
-        weight = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
-        axes = tuple(range(x.ndim - 1))
-        total = (x * weight).sum(axes)
-        scale, shift = self.factors(weight.sum().reshape(1), total, lambda mean: (((x - mean) * weight) ** 2).sum(axes))
-        return torch.addcmul(shift, x, scale)
-
-    def factors(
-        self, count: Tensor, total: Float[Tensor, " c"], scatter_about: Callable[[Tensor], Tensor]
-    ) -> tuple[Float[Tensor, " c"], Float[Tensor, " c"]]:
-        """Factor and summand of the norm; in training from the values' number, sum, and sum of squares about a mean."""
         mean, variance = self.running_mean, self.running_var
         if self.training:
-            mean, variance = self._statistics(count, total, scatter_about)
+            mean, variance = self._statistics(x, mask)
         scale = torch.rsqrt(variance + self.eps) * self.weight
-        return scale, self.bias - mean * scale
+        return torch.addcmul(self.bias - mean * scale, x, scale)
 
-    def _statistics(
-        self, count: Tensor, total: Tensor, scatter_about: Callable[[Tensor], Tensor]
-    ) -> tuple[Tensor, Tensor]:
+    def _statistics(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the values of all processes, which the running statistics follow."""
+        real = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1)
+        weight, axes = real.to(self.running_mean), tuple(range(x.ndim - 1))  # half precision has too few digits here
+        count, total = weight.sum().reshape(1), (x * weight).sum(axes)
         if dist.is_initialized():
             count, total = collectives.all_reduce(count), collectives.all_reduce(total)
         mean = total / count
-        scatter = scatter_about(mean)
+        scatter = (((x - mean) * weight) ** 2).sum(axes)
         if dist.is_initialized():
             scatter = collectives.all_reduce(scatter)
         enough = count > 1
@@ -127,35 +118,3 @@ class MaskedBatchNorm(nn.BatchNorm1d):
             self.running_var.lerp_((scatter / (count - 1).clamp_min(1)).to(self.running_var.dtype), rate)
             self.num_batches_tracked += 1
         return torch.where(enough, mean, self.running_mean), torch.where(enough, scatter / count, self.running_var)
-
-
-def highest_normed(
-    x: Float[Tensor, "b k c"], layer: nn.Linear, norm: MaskedBatchNorm, mask: Bool[Tensor, "b k"] | None
-) -> Float[Tensor, "b d"]:
-    """Largest value of norm(layer(x)) over the real points of each set, per channel; mask None: nothing is padded.
-
-    Only the largest values are kept for the gradient, no values of d channels of each point: z = W x + b has the mean
-    W s + b and the variance diag(W C W^T), s and C the mean and the covariance of x. z is largest where the norm is, or
-    smallest if the norm's factor is negative.
-    """
-    weight, bias = layer.weight, layer.bias
-    with torch.autocast(x.device.type, enabled=False):
-        x = x.to(weight.dtype)
-        with torch.no_grad():
-            z = linear(x, torch.where(norm.weight < 0, -1, 1).unsqueeze(-1) * weight)
-            z = z if mask is None else z.masked_fill(~mask.unsqueeze(-1), -torch.inf)
-            # The same as z.argmax(1), which takes twenty times as long on a CPU.
-            place = nn.functional.adaptive_max_pool2d_with_indices(z.mT.unsqueeze(2), 1)[1].flatten(1)
-        first = x.shape[1] * torch.arange(len(x), device=x.device).unsqueeze(-1)
-        highest = (nn.functional.embedding(place + first, x.flatten(0, 1)) * weight).sum(2) + bias
-        real = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1).to(x.dtype)
-        count = real.sum().reshape(1)
-        centre = (x * real).sum((0, 1)) / count
-        mean = weight @ centre + bias
-
-        def scatter_about(about: Tensor) -> Tensor:
-            around = ((x - centre) * real).flatten(0, 1)
-            return ((weight @ (around.mT @ around)) * weight).sum(1) + count * (mean - about) ** 2
-
-        scale, shift = norm.factors(count, count * mean, scatter_about)
-        return torch.addcmul(shift, highest, scale)
