@@ -1,6 +1,8 @@
 """`bpnp table`: several methods on the same problems, in the form of the paper's tables."""
 
+import json
 from contextlib import ExitStack
+from dataclasses import asdict
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -46,23 +48,26 @@ def table(
         output: folder of the results.
         paper: published rows beneath.
     """
+    from bpnp.datamodules import Outliers
     from bpnp.report.figures import outlier_curves, save_figure
     from bpnp.report.tables import CAPTION, FILE_COLUMNS, as_latex, note, paper_rows, table_frame, table_of_rows
-    from bpnp.training.comparison import MethodTest, parse_methods, read_data, with_setting
+    from bpnp.training.comparison import MethodTest, parse_methods, read_data
 
     at_least(1, limit=limit)
     at_least(0, time_limit=time_limit, rho=min(rho, default=None) if rho else None)
     chosen = parse_methods(methods, time_limit=time_limit)
-    recipe = read_data(Path(packaged_config(data)), overrides or [])
+    recipe = Path(packaged_config(data))
     tests: dict[tuple[float | None, str], list[MethodTest]] = {}  # by share of outliers and method, a test a seed
     shares: list[float | None] = [*dict.fromkeys(rho)] if rho else [None]
     drawn: list[int | None] = [*dict.fromkeys(seeds)] if seeds else [None]
     for share, seed in product(shares, drawn):
-        described, folder = recipe, output
+        changes, folder = list(overrides or []), output
         if share is not None:
-            described, folder = with_setting(described, "test_outliers", {"ratio": share}), folder / f"rho-{share:g}"
+            outliers = json.dumps(asdict(Outliers(share)))
+            changes, folder = [*changes, f"--data.test_outliers={outliers}"], folder / f"rho-{share:g}"
         if seed is not None:
-            described, folder = with_setting(described, "seed", seed), folder / f"seed-{seed}"
+            changes, folder = [*changes, f"--data.seed={seed}"], folder / f"seed-{seed}"
+        described = read_data(recipe, changes)
         for method in chosen:
             name = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in method.label)
             tests.setdefault((share, method.label), []).append(MethodTest(method, described, folder / name, limit))
@@ -78,7 +83,7 @@ def table(
             say(f"testing {test.method.label} in {test.folder}", to=out)
             test.run(progress_bar=out.is_interactive)
         rows = [row for (share, label), repeated in tests.items() for row in _rows(label, share, repeated)]
-    published = PAPERS.get(recipe["class_path"].rpartition(".")[2]) if paper == "auto" else paper
+    published = PAPERS.get(described["class_path"].rpartition(".")[2]) if paper == "auto" else paper
     rows += paper_rows(None if published == "none" else published)
     out.print(table_of_rows("Pose errors", FILE_COLUMNS, rows, " ".join([CAPTION, *note(rows)])))
     frame = table_frame(rows)

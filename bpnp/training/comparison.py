@@ -100,19 +100,15 @@ def _solver(what: str, text: str) -> tuple[str, dict[str, Any]]:
 
 
 def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
-    """`data` of a recipe's YAML with `--data.NAME=VALUE` overrides, as class_path and init_args.
+    """`data` of a recipe's YAML with `--data.NAME=VALUE` overrides, as class_path and all init_args.
 
-    Raises ValueError for a file without it, or for what its class does not accept.
+    Raises ValueError for a file without it, for a class that cannot be imported, or for what it does not accept.
     """
     data = _recipe(recipe, "`data`; try --data psb").get("data")
     if not data:
         raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
-    return checked(LightningDataModule, "data", data if isinstance(data, dict) else {"class_path": data}, overrides)
-
-
-def with_setting(data: dict[str, Any], name: str, value: Any) -> dict[str, Any]:
-    """The same data with another value of a setting. Raises ValueError for data that have no such setting."""
-    return checked(LightningDataModule, "data", data | {"init_args": data["init_args"] | {name: value}})
+    settings = data if isinstance(data, dict) else {"class_path": data}
+    return dict(_parsed(LightningDataModule, "data", settings, overrides)[1].as_dict()["data"])
 
 
 def _recipe(path: Path, what: str) -> dict[str, Any]:
@@ -195,16 +191,8 @@ def problem_order(size: int) -> list[int]:
     return np.random.default_rng(ORDER_SEED).permutation(size).tolist()
 
 
-def checked(base: type, name: str, settings: Mapping[str, Any], overrides: Sequence[str] = ()) -> dict[str, Any]:
-    """`class_path` and all `init_args` of a subclass of `base`, after `--NAME.SETTING=VALUE` overrides.
-
-    Raises ValueError, naming the class, for one that cannot be imported and for settings that it does not accept.
-    """
-    return dict(_parsed(base, name, settings, overrides)[1].as_dict()[name])
-
-
 def build(base: type, name: str, settings: Mapping[str, Any]) -> Any:
-    """The object; raises as `checked` does, and as its constructor."""
+    """A subclass of `base`. Raises ValueError for settings that its class does not accept, and as its constructor."""
     parser, chosen = _parsed(base, name, settings)
     instantiate = parser.instantiate if hasattr(parser, "instantiate") else parser.instantiate_classes  # by release
     return instantiate(chosen)[name]
