@@ -161,6 +161,12 @@ def test_poses_are_those_of_all_runs_also_after_a_photo_that_failed(place: Place
     assert (made["solver"], made["time_limit"], made["camera_from"]) == ("search", 60.0, "view photo 0.jpg of the map")
     assert content["b.png"]["verdict"] == "confident"
     assert content["b.png"]["inlier_threshold"] > 0
+    unwritable = place.folder / "out/solutions/b.png.json"
+    unwritable.unlink()
+    unwritable.mkdir()
+    with pytest.raises(SystemExit):
+        place.run("b.png")
+    assert list(place.poses()) == ["a.png"]
 
 
 def test_a_folder_and_an_underscore_are_different_photos(place: Place) -> None:

@@ -3,8 +3,6 @@
 import json
 import os
 import resource
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -90,31 +88,20 @@ def test_a_failed_write_leaves_nothing(tmp_path: Path, store: Store) -> None:
     assert not is_store(tmp_path)
 
 
-FULL = """
-import sys
-from pathlib import Path
-import numpy as np
-from bpnp.datamodules.store import new_store
-try:
-    with new_store(Path(sys.argv[1]), "toy", {"points": 3}) as writer:
-        for i in range(400):
-            writer.add(str(i), {"points": np.ones((2048, 3))}, {"radius": 1.0})
-except OSError as error:
-    sys.exit(str(error))
-"""
-
-
-def limited() -> None:
-    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, 2_000_000))
-
-
 def test_a_full_disk_is_one_error_that_names_the_store(tmp_path: Path) -> None:
     """No SIGBUS and nothing left."""
-    store = tmp_path / "disk" / "store"
+    store, (soft, hard) = tmp_path / "disk" / "store", resource.getrlimit(resource.RLIMIT_FSIZE)
     store.parent.mkdir()
-    command = [sys.executable, "-c", FULL, str(store)]
-    result = subprocess.run(command, capture_output=True, text=True, preexec_fn=limited)
-    assert result.returncode == 1, result.stderr
-    assert f"File too large: '{store}'" in result.stderr
-    assert result.stdout == ""
+
+    def fill() -> None:
+        with new_store(store, "toy", {"points": 3}) as writer:
+            for i in range(400):
+                writer.add(str(i), {"points": np.ones((2048, 3))}, {"radius": 1.0})
+
+    resource.setrlimit(resource.RLIMIT_FSIZE, (2_000_000, hard))
+    try:
+        with pytest.raises(OSError, match=f"File too large: '{store}'"):
+            fill()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert list(store.parent.iterdir()) == []
