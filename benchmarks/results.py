@@ -74,8 +74,8 @@ def photos(
     against: str, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
 ) -> Iterator[Problem]:
     """Photos in their map, or by the points alone; apart: of other places."""
-    drawn = view_problems.photos(limit, REPORTED, data, against=against, outliers=outliers, seed=seed)
-    return view_problems.problems(view_problems.elsewhere(drawn) if apart else drawn, in_map=in_map, seed=seed)
+    drawn = view_problems.photos(limit, data, apart=apart, against=against, outliers=outliers, seed=seed)
+    return view_problems.problems(drawn, in_map=in_map, seed=seed)
 
 
 def lights(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:

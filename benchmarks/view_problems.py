@@ -148,10 +148,11 @@ def model_of(data: Path, name: str) -> Reconstruction:
     return read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
 
 
-def photos(limit: int, scenes: Sequence[str], data: Path, **chosen: Any) -> list[ViewProblem]:
-    """Problems of at most `limit` photos of the scenes together. chosen: options of `view_problem`."""
-    each = -(-limit // len(scenes))
-    return [photo for name in scenes for photo in scene_problems(data, name, limit=each, **chosen)][:limit]
+def photos(limit: int, data: Path, *, apart: bool = False, **chosen: Any) -> list[ViewProblem]:
+    """Problems of at most `limit` photos of the reported scenes; apart: of other places. chosen: for `view_problem`."""
+    each = -(-limit // len(REPORTED))
+    drawn = [photo for name in REPORTED for photo in scene_problems(data, name, limit=each, **chosen)]
+    return (elsewhere(drawn) if apart else drawn)[:limit]
 
 
 def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:

@@ -3,6 +3,7 @@
 import importlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,19 +18,18 @@ from bpnp.models.weights import LEARNED, checkpoint_path, described
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
-    """Views of test shapes from every side, scaled by 7 and moved: the units of a scene are its own."""
-    data = MeshDataModule(
-        rotation="so3",
-        num_points=64,
-        pool_size=64,
-        test_shapes=24,
-        batch_size=24,
-        cache_dir=str(tmp_path_factory.mktemp("c")),
-    )
+def views_of_shapes(count: int, folder: Path, **options: Any) -> Batch:
+    """Of test shapes, 64 points each."""
+    sizes = {"num_points": 64, "pool_size": 64, "test_shapes": count, "batch_size": count}
+    data = MeshDataModule(**sizes, cache_dir=str(folder), **options)
     data.setup("test")
     return next(iter(data.test_dataloader()))
+
+
+@pytest.fixture(scope="module")
+def unseen(tmp_path_factory: pytest.TempPathFactory) -> Batch:
+    """From every side."""
+    return views_of_shapes(24, tmp_path_factory.mktemp("c"), rotation="so3")
 
 
 def test_an_unknown_name_is_refused_with_those_there_are() -> None:
@@ -67,18 +67,8 @@ def test_a_learned_prior_is_the_packaged_net_and_knows_any_unit(unseen: Batch) -
 
 @pytest.fixture(scope="module")
 def cluttered(tmp_path_factory: pytest.TempPathFactory) -> Batch:
-    """Views of test shapes as in the paper, with half as many outliers as pairs on each side; any scale and origin."""
-    data = MeshDataModule(
-        num_points=64,
-        pool_size=64,
-        test_shapes=16,
-        test_outliers=Outliers(ratio=0.5),
-        batch_size=16,
-        cache_dir=str(tmp_path_factory.mktemp("c")),
-    )
-    data.setup("test")
-    batch: Batch = next(iter(data.test_dataloader()))
-    return batch
+    """As in the paper, with half as many outliers as pairs on each side."""
+    return views_of_shapes(16, tmp_path_factory.mktemp("c"), test_outliers=Outliers(ratio=0.5))
 
 
 def test_the_matcher_finds_the_partners_among_clutter(cluttered: Batch) -> None:
