@@ -1,5 +1,6 @@
 """Small data sets on disk, in the layouts that the recipes read, and a network small enough to train in a test."""
 
+import time
 from pathlib import Path
 from typing import Any
 
@@ -120,3 +121,11 @@ def write_off(path: Path, mesh: Mesh, *, joined_header: bool) -> None:
     vertices = [" ".join(map(str, v)) for v in mesh.vertices.tolist()]
     faces = [" ".join(map(str, (3, *f))) for f in mesh.faces.tolist()]
     path.write_text("\n".join([head.replace("OFF ", "OFF"), *vertices, *faces]) + "\n")
+
+
+def is_written(path: Path, text: bytes) -> bool:
+    """Whether another process writes this to a file within half a minute."""
+    deadline = time.monotonic() + 30
+    while text not in path.read_bytes() and time.monotonic() < deadline:
+        time.sleep(0.1)
+    return text in path.read_bytes()

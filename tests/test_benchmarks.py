@@ -1,8 +1,7 @@
 """The baselines of the benchmarks must be right, or a ratio to them says nothing; and the commands must run."""
 
 import json
-import subprocess
-import sys
+import runpy
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -175,21 +174,18 @@ def test_reliability_goes_on_where_it_was(tmp_path: Path, monkeypatch, capsys) -
     assert (tmp_path / "drawn.png").stat().st_size > 1000
 
 
-def test_the_list_has_every_benchmark_and_a_sentence_for_each() -> None:
-    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-        command = [sys.executable, "-m", "benchmarks", *arguments]
-        return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-
-    listed = run()
-    assert listed.returncode == 0
-    lines = dict(line.strip().split(maxsplit=1) for line in listed.stdout.splitlines()[2:])
-    assert set(lines) == {
-        "city", "focal", "layers", "left_out", "opening", "reliability", "results", "rigs", "stars"
-    }  # fmt: skip
+def test_the_list_has_every_benchmark_and_a_sentence_for_each(monkeypatch, capsys) -> None:
+    start = runpy.run_path(str(ROOT / "benchmarks" / "__main__.py"))["main"]
+    monkeypatch.setattr("sys.argv", ["benchmarks"])
+    start()
+    lines = dict(line.strip().split(maxsplit=1) for line in capsys.readouterr().out.splitlines()[2:])
+    assert set(lines) == {"city", "focal", "layers", "left_out", "opening", "reliability", "results", "rigs", "stars"}
     assert all(sentence.endswith((".", ":")) or "`" in sentence for sentence in lines.values())
-    unknown = run("serch")
-    assert unknown.returncode == 1
-    assert "'serch'" in unknown.stderr
+    for name, code in (("serch", "expected a name of this list, got 'serch'"), ("stars", 0)):
+        monkeypatch.setattr("sys.argv", ["benchmarks", name, "--help"])
+        with pytest.raises(SystemExit, match=str(code)):
+            start()
+    assert "usage: python -m benchmarks stars" in capsys.readouterr().out
 
 
 FIGURES = {

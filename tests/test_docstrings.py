@@ -16,10 +16,6 @@ MODULES = sorted(
 )
 
 
-def test_the_layers_and_the_solver_have_examples() -> None:
-    assert {"bpnp.layers.pnp", "bpnp.layers.assignment", "bpnp.solving.solve", "bpnp.types"} <= set(MODULES)
-
-
 @pytest.mark.parametrize("name", MODULES)
 def test_examples_are_right(name: str) -> None:
     result = doctest.testmod(importlib.import_module(name), extraglobs={"torch": torch, "np": np})

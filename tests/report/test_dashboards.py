@@ -1,9 +1,9 @@
 import json
-import time
 from pathlib import Path
 
 import pytest
 from report_data import write_run
+from small_data import is_written
 
 from bpnp.report.dashboards import log_results, scalars
 from bpnp.report.page.charts import recall_chart
@@ -45,9 +45,4 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     assert json.loads(path.read_text())["data"] == json.loads(chart.to_json())["data"]
     assert len(list((media / "images" / "test").glob("worst_problems_*.png"))) == 2
     assert len(list((media / "images" / "test").glob("recall_*.png"))) == 1
-    log = next(run.glob("*.wandb"))
-    for _ in range(100):  # wandb's own process may write it after `finish`
-        if b"test/pnp/rotation_q2_deg" in log.read_bytes():
-            return
-        time.sleep(0.1)
-    pytest.fail(f"expected the scalars in {log}, got {log.stat().st_size} bytes")
+    assert is_written(next(run.glob("*.wandb")), b"test/pnp/rotation_q2_deg")

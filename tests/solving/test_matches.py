@@ -19,10 +19,3 @@ def test_many_points_are_matched_as_by_the_dense_assignment() -> None:
     assert len(pairs) == near.sum() == count_one_to_one(image, projected, 1.0)
     own = ((image[pairs[:, 0]] - projected[pairs[:, 1]]) ** 2).sum()
     assert own == pytest.approx(squared[rows, columns][near].sum(), rel=1e-6)
-
-
-def test_a_dense_cluster_does_not_lose_its_matches() -> None:
-    """Hundreds of points within the radius of each other: more neighbours than are looked at."""
-    rng = np.random.default_rng(0)
-    image, projected = rng.normal(size=(200, 2)), rng.normal(size=(150, 2))
-    assert len(one_to_one(image, projected, 50.0)) == 150

@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 import pytest
 import torch
-from planted import plant, seen
+from planted import Answering, plant, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp import GravityPrior, PosePrior, solve, solve_many
@@ -15,23 +15,9 @@ from bpnp.search.settings import DEFAULT
 from bpnp.solving import networks
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
-from bpnp.types import Batch, Pose, Prediction, SolveStats
+from bpnp.types import Batch, Prediction
 
 VIEW = Rotation.from_euler("xyz", [100, -35, 60], degrees=True).as_matrix()
-
-
-class Expecting(torch.nn.Module):
-    """Answers with one pose in the axes that it expects, and keeps what it was given."""
-
-    def __init__(self, frame: str, rotation: np.ndarray, translation: np.ndarray) -> None:
-        super().__init__()
-        self.frame, self.given = frame, []
-        self.pose = torch.as_tensor(rotation)[None], torch.as_tensor(translation)[None]
-
-    def forward(self, batch: Batch) -> Prediction:
-        self.given.append(batch.points3d[0])
-        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
-        return Prediction(poses={"fixed": Pose(*self.pose, stats)})
 
 
 def scene(clutter: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -54,19 +40,19 @@ def test_a_network_for_views_gets_the_points_in_its_coordinates_and_its_pose_is_
     image, points, rotation, translation = scene()
     shift = np.array([0.3, -0.2, 6.0])  # of the view; far: of the scene from its origin
     turned, points = points @ VIEW.T, points + far
-    net = Expecting("view", rotation @ VIEW.T, translation - rotation @ VIEW.T @ shift).eval()
+    net = Answering(rotation @ VIEW.T, translation - rotation @ VIEW.T @ shift, "view").eval()
     prior = PosePrior(VIEW, shift - VIEW @ np.full(3, far), 20.0, 2.0)
     solution = solve(image, points, solver=net, prior=prior)
-    np.testing.assert_allclose(net.given[0], turned + shift, atol=1e-4)
+    np.testing.assert_allclose(net.given[0].points3d[0], turned + shift, atol=1e-4)
     np.testing.assert_allclose(solution.rotation, rotation, atol=1e-6)
     np.testing.assert_allclose(solution.translation, translation - rotation @ np.full(3, far), atol=1e-5 * (1 + far))
 
 
 def test_a_view_of_unknown_place_sees_the_points_where_and_as_large_as_the_image_does() -> None:
     image, points, rotation, translation = scene()
-    net = Expecting("view", np.eye(3), np.zeros(3)).eval()
+    net = Answering(np.eye(3), np.zeros(3), "view").eval()
     solve(image, points, solver=net, prior=PosePrior(VIEW, None, 20.0))
-    given = net.given[0].numpy()
+    given = net.given[0].points3d[0].numpy()
     np.testing.assert_allclose(given - given[0], (points - points[0]) @ VIEW.T, atol=1e-4)
     seen = given[:, :2] / given[:, 2:]
     np.testing.assert_allclose(np.median(seen, 0), np.median(image, 0), atol=0.05)

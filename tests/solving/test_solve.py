@@ -4,14 +4,12 @@ import cv2
 import numpy as np
 import pycolmap
 import pytest
-import torch
-from planted import Planted, degrees_between, plant, seen
+from planted import Answering, Planted, degrees_between, plant, seen
 from scipy.spatial.transform import Rotation
 
 from bpnp import PosePrior, Solution, solve, solve_many
 from bpnp.examples import load
 from bpnp.models import Search
-from bpnp.types import Pose, Prediction, SolveStats
 
 FISHEYE = ("OPENCV_FISHEYE", [300.0, 310.0, 400.0, 300.0, 0.05, -0.02, 0.01, 0.001])
 K = np.array([[520.0, 1.5, 405.0], [0.0, 500.0, 290.0], [0.0, 0.0, 1.0]])
@@ -141,28 +139,16 @@ def test_points_that_fix_no_pose_fail_with_the_reason(change2d, change3d, reason
     assert (solution.matches.shape, solution.inlier_count, solution.candidates) == ((0, 2), 0, ())
 
 
-class Fixed(torch.nn.Module):
-    """A solver that always has the same answer."""
-
-    def __init__(self, rotation: torch.Tensor, translation: torch.Tensor) -> None:
-        super().__init__()
-        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
-        self.pose = Pose(rotation[None].float(), translation[None].float(), stats)
-
-    def forward(self, batch) -> Prediction:
-        return Prediction(poses={"fixed": self.pose})
-
-
 def test_a_module_solves_and_is_judged_by_the_points() -> None:
     planted = plant(1, 100, noise=0.001)
     x, p = planted.points2d[0], planted.points3d[0]
-    near = Fixed(*(value[0] for value in planted.near(0.003)))
+    near = Answering(*(value[0] for value in planted.near(0.003)))
     solution = solve(x, p, solver=near)
     assert solution.verdict == "confident"
     assert degrees(solution, planted) < 0.1
-    wrong = Fixed(torch.eye(3).double(), torch.tensor([0.0, 0.0, 5.0]).double())
+    wrong = Answering(np.eye(3), np.array([0.0, 0.0, 5.0]))
     assert solve(x, p, solver=wrong).verdict != "confident"
-    missing = solve(x, p, solver=Fixed(torch.full((3, 3), torch.nan), torch.full((3,), torch.nan)))
+    missing = solve(x, p, solver=Answering(np.full((3, 3), np.nan), np.full(3, np.nan)))
     assert (missing.verdict, missing.found) == ("failed", False)
     searched = solve(x, p, solver=Search())
     assert degrees(searched, planted) < 0.1
