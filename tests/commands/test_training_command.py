@@ -86,11 +86,12 @@ def test_a_loss_by_class_path_trains(tmp_path: Path) -> None:
 def test_a_task_by_class_path_trains(tmp_path: Path) -> None:
     config = tmp_path / "own.yaml"
     config.write_text("model:\n  class_path: test_training_command.OwnTask\n  init_args:\n    rate: 0.5\n")
-    for own in (["--model=test_training_command.OwnTask", "--model.rate=0.5"], [f"--config={config}"]):
+    options = ["--model=test_training_command.OwnTask", "--model.rate=0.5"]
+    for given, own in (("options", options), ("file", [f"--config={config}"])):
         seen.clear()
-        main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path / own[0][-5:])])
+        main(["fit", *MESHES, *own, *SHORT, *folders(tmp_path / given)])
         assert seen == [0.5, 0.5]
-        assert (tmp_path / own[0][-5:] / "run/checkpoints/last.ckpt").is_file()
+        assert (tmp_path / given / "run/checkpoints/last.ckpt").is_file()
 
 
 def test_a_task_whose_test_step_returns_nothing_is_tested(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
