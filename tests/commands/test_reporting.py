@@ -25,6 +25,14 @@ def test_commands_write_what_they_say(
     written = Path(capsys.readouterr().out.removeprefix("wrote ").rstrip("\n"))
     assert written.parent == tmp_path / "run" / "test" / "views"
     assert imread(written).std() > 0.05
+    pictures = set()
+    for more in ([], ["--lines", "assigned"], ["--estimate", "pnp"]):
+        main(["view", str(tmp_path / "run"), "script", "--output", str(tmp_path / "view.png"), *more])
+        pictures.add((tmp_path / "view.png").read_bytes())
+    assert len(pictures) == 3
+    capsys.readouterr()
+    main(["report", str(tmp_path / "run"), "--paper", "megadepth"])
+    assert "Lc Lp" in capsys.readouterr().out
     assert "got 'nothing'; try one of" in fails("view", str(tmp_path / "run"), "nothing")
     (tmp_path / "run" / "test" / "points.npz").unlink()
     assert "expected points.npz in" in fails("view", str(tmp_path / "run"))

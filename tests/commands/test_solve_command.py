@@ -77,7 +77,9 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
     np.savetxt(tmp_path / "x.csv", np.hstack([X, colours]), delimiter=",", header="x,y,label", comments="")
     np.savetxt(tmp_path / "p.csv", sides, delimiter=",", header="x,y,z,nx,ny,nz,label", comments="")
 
-    asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
+    solution, rough = bpnp.solve(X, P), tmp_path / "rough.json"
+    rough.write_text(solution.to_json())
+    asked = list[dict[str, Any]]()
     with pytest.MonkeyPatch.context() as patch:
 
         def noted(*points: Any, **options: Any) -> Solution:
@@ -85,14 +87,20 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
             return solution
 
         patch.setattr("bpnp.solving.solve.solve", noted)
-        words = "--clutter 0.25 --seed 7 --solver search --time_limit 3 --inlier_threshold 0.1"
-        main(["solve", str(tmp_path / "x.csv"), str(tmp_path / "p.csv"), *words.split()])
-    (options,) = asked
+        words = "--clutter 0.25 --seed 7 --solver search --time_limit 3 --inlier_threshold 0.1 --focal_error 0.2"
+        words += f" --distortion --at_infinity --device cpu --prior {rough} --prior_degrees 6 --prior_distance 0.5"
+        files = [str(tmp_path / "x.csv"), str(tmp_path / "p.csv")]
+        main(["solve", *files, *words.split()])
+        main(["solve", *files, *UP, "--up_degrees", "7"])
+    options, upright = asked
     np.testing.assert_array_equal(options["normals3d"], sides[:, 3:6])
     np.testing.assert_array_equal(options["labels3d"], sides[:, 6])
     np.testing.assert_array_equal(options["labels2d"], colours[:, 0])
-    given = {name: options[name] for name in ("clutter", "seed", "solver", "time_limit", "inlier_threshold")}
-    assert given == {"clutter": 0.25, "seed": 7, "solver": "search", "time_limit": 3.0, "inlier_threshold": 0.1}
+    prior = options["prior"]
+    assert (prior.rotation_sigma_deg, prior.translation_sigma, upright["prior"].sigma_deg) == (6, 0.5, 7)
+    expected = {"clutter": 0.25, "seed": 7, "solver": "search", "time_limit": 3.0, "inlier_threshold": 0.1}
+    expected |= {"focal_error": 0.2, "distortion": True, "at_infinity": True, "device": "cpu"}
+    assert {name: options[name] for name in expected} == expected
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from planted import plant
 
+import bpnp
 from bpnp import Solution
 from bpnp.cli import main
 
@@ -48,6 +49,19 @@ def test_a_pose_in_numbers_with_matches_is_judged(
     content = json.loads(capsys.readouterr().out)
     np.testing.assert_allclose(content["translation"], T + 0.01, atol=1e-12)
     assert content["inlier_threshold"] == 50
+
+
+def test_options_reach_the_verdict_as_they_are_written(files: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """What each does there: tests/solving/test_verify.py."""
+    asked, solution = list[dict[str, Any]](), bpnp.solve(X, P)
+
+    def noted(*given: Any, **options: Any) -> Solution:
+        asked.append(options)
+        return solution
+
+    monkeypatch.setattr("bpnp.solving.verify.verify", noted)
+    main(["verify", *files, *NUMBERS, "--seed", "3", "--time_limit", "7", "--as_it_is"])
+    assert [asked[0][name] for name in ("seed", "time_limit", "refine")] == [3, 7, False]
 
 
 @pytest.mark.parametrize(

@@ -106,6 +106,13 @@ def test_a_turn_keeps_camera_coordinates_and_the_pose_in_the_scene() -> None:
     assert not torch.allclose(*(turned.rotation.mT @ straight.rotation))
 
 
+def test_turns_are_uniform() -> None:
+    """The entries of a uniform rotation have mean 0 and variance 1/3."""
+    batch = raw(*(planted(6, seed=seed) for seed in range(200)))
+    turns = augmented(batch, rotate=True).rotation.mT @ augmented(batch).rotation
+    assert turns.mean(0).abs().max() < 4 * (1 / 3 / 200) ** 0.5
+
+
 HARD: dict[str, Any] = {
     "max_points": 30, "clutter": 0.3, "rotate": True,
     "outliers": Outliers(ratio=(0.0, 1.0), side="random", occlusion=(0.0, 0.4), occluded_side="random"),

@@ -6,12 +6,10 @@ from torch import Tensor
 
 from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
-from bpnp.metrics import rotation_error
 from bpnp.models import Refinement
 from bpnp.models.nets import PointFeatures
 from bpnp.search.settings import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_loss
-from bpnp.types import SolveStats
 
 
 def different_sizes(*sizes: int, dtype: torch.dtype = torch.float64) -> Batch:
@@ -66,34 +64,6 @@ def test_refinement_starts_from_hypotheses_too_unless_there_are_none() -> None:
     assert int(alone) <= 2 * (1 + DEFAULT.shaking.copies) < int(crowd)
     with pytest.raises(ValueError, match="expected `hypotheses` of 0 or more, got -1"):
         Refinement(hypotheses=-1)
-
-
-class Rough(torch.nn.Module):
-    """Finds this pose, whatever the assignment."""
-
-    def __init__(self, *pose: Tensor) -> None:
-        super().__init__()
-        self.pose = pose
-
-    def forward(self, *_: Tensor) -> tuple[Tensor, Tensor, SolveStats]:
-        return *self.pose, SolveStats.of(torch.ones(len(self.pose[0]), dtype=torch.bool))
-
-
-def test_rounds_find_the_pose_and_the_pairs_from_a_rough_pose_alone() -> None:
-    """The features tell nothing: every pair costs the same."""
-    scene, found = plant(4, 150, noise=0.002, seed=3), {}
-    for rounds in (0, 8):
-        net = small_net(rounds=rounds, refine=False, threshold=0.003).double().eval()
-        net.ransac, net.cost = Rough(*scene.near(0.03)), lambda _: torch.ones(4, 150, 150, dtype=torch.float64)
-        prediction = net(scene.batch())
-        assignment = prediction.assignment if prediction.rematched is None else prediction.rematched
-        mass = (assignment * (scene.permutation() > 0)).sum((1, 2))
-        found[rounds] = rotation_error(prediction.poses["pnp"].rotation, scene.rotation), mass
-        assert torch.equal(prediction.assignment, net.match(scene.batch()).assignment)
-    assert found[0][0].min() > 5
-    assert found[8][0].max() < 0.3
-    assert found[0][1].max() < 0.01
-    assert found[8][1].min() > 0.7
 
 
 def test_the_cost_is_the_distance_between_unit_features() -> None:

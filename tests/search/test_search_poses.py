@@ -16,6 +16,7 @@ from bpnp.models.evaluation import best_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Schedule, SearchSettings
+from bpnp.search.starts import PosePrior
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +50,17 @@ def test_what_fixes_no_pose_has_none(problem, lacking):
     assert translation.isnan().all()
     assert stats.residual.isinf().all()
     assert not stats.converged.any()
+
+
+@pytest.mark.parametrize("off", [0.05, 1.0])
+def test_a_guess_from_the_same_points_is_tried_first_and_not_believed(problem, off):
+    """One near the true pose and one 57 degrees off: the search goes everywhere unless the matches are unique."""
+    rotation, translation = (values[0].numpy() for values in problem.near(off, seed=1))
+    sets = PointSets(problem.bearings[0].numpy(), problem.points3d[0].numpy())
+    result = search_poses(sets, around=PosePrior(rotation, translation, 4.0, 0.1))
+    assert result.verdict == "confident"
+    assert rotation_error(torch.as_tensor(result.best[0])[None], problem.rotation[:1]) < 0.5
+    assert (result.batches <= DEFAULT.schedule.around) == (off < 0.1)
 
 
 @pytest.mark.parametrize(
