@@ -79,11 +79,16 @@ def search_poses(
         counts = f"{len(sets.bearings)} 2D and {len(sets.points3d)} 3D points"
         return no_pose(f"no pose fits: {counts}, too few or all on one line")
     scene = entered()
-    lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
-    if any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking):
+    if lacks_partners(scene):
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, sets, enumerated)
     return _until_certain(pool, turns(pool, around, proposals if many else None), tell)
+
+
+def lacks_partners(scene: Scene) -> bool:
+    """Whether the points with a label of the other side are too few, or all on one line."""
+    lacking = (side for side in (scene.image, scene.seen) if not side.weights.all())
+    return any(degenerate(side.points[side.weights > 0].astype(np.float64)) for side in lacking)
 
 
 def _until_certain(

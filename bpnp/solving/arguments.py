@@ -242,20 +242,23 @@ def unit_bearings(rays: Array) -> Array:
 
 def normalised(points2d: Array, camera: Camera | None) -> Array:
     """Points (m, 2) on the normalised image plane, undistorted."""
+    check_unit(points2d, camera)
+    return points2d if camera is None else camera.normalise(points2d)
+
+
+def check_unit(points2d: Array, camera: Camera | None) -> None:
+    """Raise ValueError for pixels without a camera, or the reverse."""
     largest = np.abs(points2d).max()
-    if camera is None:
-        if np.median(np.linalg.norm(points2d, axis=-1)) > WIDEST:
-            raise ValueError(
-                f"expected normalised image coordinates without a `camera`, got values up to {largest:g}, which look "
-                "like pixels; try camera=K"
-            )
-        return points2d
-    if largest < INSIDE_ONE_PIXEL and camera.focal > 100:
+    if camera is None and np.median(np.linalg.norm(points2d, axis=-1)) > WIDEST:
+        raise ValueError(
+            f"expected normalised image coordinates without a `camera`, got values up to {largest:g}, which look "
+            "like pixels; try camera=K"
+        )
+    if camera is not None and largest < INSIDE_ONE_PIXEL and camera.focal > 100:
         raise ValueError(
             f"expected pixels with a `camera`, got values up to {largest:g}, which look normalised; try without the "
             "camera"
         )
-    return camera.normalise(points2d)
 
 
 def unit_vectors(name: str, vectors: Array, hint: str = "try to divide by the lengths") -> Array:

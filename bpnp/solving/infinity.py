@@ -19,6 +19,7 @@ from bpnp.search.infinity.settings import DEFAULT, InfinitySettings
 from bpnp.solving.arguments import (
     Array,
     check_points,
+    check_unit,
     checked_scores,
     image_points,
     normalised,
@@ -33,6 +34,7 @@ from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 
 FEWEST = 3  # two fix a rotation and are no evidence
+HALF = 0.5  # pixel, of which the angle is measured
 NOMINAL = 1e-3  # of the spread of bearings without a camera: what a pixel is taken to be
 
 
@@ -185,8 +187,8 @@ def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]
             bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
         spread = math.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean())
         return bearings, in_front(bearings)[:, :2], np.full(len(bearings), max(NOMINAL * spread, 1e-12))
-    normalised(image, camera)  # raises for what are no pixels
+    check_unit(image, camera)
     bearings = camera.bearings(image)
-    steps = (camera.bearings(image + step) - camera.bearings(image - step) for step in ([0.5, 0.0], [0.0, 0.5]))
+    steps = ((camera.bearings(image + step) - bearings) / HALF for step in ([HALF, 0.0], [0.0, HALF]))
     pixel = np.sqrt(sum((step**2).sum(-1) for step in steps) / 2)
     return bearings, in_front(bearings)[:, :2], pixel

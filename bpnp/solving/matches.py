@@ -196,8 +196,9 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tu
         distance = np.sqrt(((image[:, None] - projected[seen]) ** 2).sum(-1))
         matches = np.argwhere(distance <= radius)
     else:
-        forward, backward = _neighbours(image, projected[seen], radius), _neighbours(projected[seen], image, radius)
-        both = np.concatenate([forward, backward[:, ::-1]])
+        both = _neighbours(image, projected[seen], radius)
+        if np.bincount(both[:, 0]).max(initial=0) == NEIGHBOURS:  # there may be more
+            both = np.concatenate([both, _neighbours(projected[seen], image, radius)[:, ::-1]])
         # One number a match: unique rows would be sorted as records, ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
     matches[:, 1] = seen[matches[:, 1]]

@@ -34,7 +34,7 @@ the evidence of dense points, whose neighbours lie as close as their residuals.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -89,7 +89,8 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
             own, rough = _is_own(ratio), ratio >= ROUGH
             # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
             fewer = np.maximum(cells + share[k], 0.0) - none[k]
-            evidence = _log_evidence(sets, seen, int(own.argmax())) - math.log(10) * fewer
+            finest = int(own.argmax())
+            evidence = _log_evidence(sets, _terms(sets, seen, finest), finest) - math.log(10) * fewer
             result.own[k] -= np.logaddexp.reduce(evidence[own]) / math.log(10)
             result.rough[k] -= np.logaddexp.reduce(evidence[rough], initial=-math.inf) / math.log(10)
     return result
@@ -150,15 +151,17 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
     return seen
 
 
-def log_evidence_of(sets: PointSets, seen: Array, scale: float, fixing: int) -> Array:
-    """(2,) log of the evidence of one camera for points seen in directions (n, 3): at the scales of the residuals, and
-    at rougher ones; without the `fixing` largest terms."""
+def log_evidence_of(sets: PointSets, seen: Array, scale: float | None, fixing: Sequence[int]) -> Array:
+    """(f, 2) log of the evidence of one camera for points seen in directions (n, 3), without each of these numbers of
+    largest terms: at the scales of the residuals, or all of them if that is None, and at rougher ones."""
     if len(sets.bearings) <= FIXING or int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
-        return np.zeros(2)
-    ratio = _ratio(sets.image, scale)
+        return np.zeros((len(fixing), 2))
+    ratio = np.ones(len(sets.image.scales)) if scale is None else _ratio(sets.image, scale)
     own, rough = _is_own(ratio), ratio >= ROUGH
-    evidence = _log_evidence(sets, seen, int(own.argmax()), fixing)
-    return np.array([np.logaddexp.reduce(evidence[some], initial=-math.inf) for some in (own, rough)])
+    finest = int(own.argmax())
+    terms = _terms(sets, seen, finest)
+    every = (_log_evidence(sets, terms, finest, count) for count in fixing)
+    return np.array([[np.logaddexp.reduce(one[some], initial=-math.inf) for some in (own, rough)] for one in every])
 
 
 def own_evidence(sets: PointSets, rotation: Array, translation: Array, scale: float) -> Array:
@@ -175,7 +178,7 @@ def likeliest_scale(sets: PointSets, rotation: Array, translation: Array) -> flo
     seen = directions_of(sets, rotation, translation)
     if int(np.isfinite(seen[:, 0]).sum()) <= FIXING or len(sets.bearings) <= FIXING:
         return float(sets.image.scales[-1])
-    return float(sets.image.scales[_log_evidence(sets, seen, 0).argmax()])
+    return float(sets.image.scales[_log_evidence(sets, _terms(sets, seen, 0), 0).argmax()])
 
 
 def _ratio(image: ImageStatistics, scale: float) -> Array:
@@ -194,16 +197,23 @@ def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
     return np.asarray(image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], SHARES))
 
 
-def _log_evidence(sets: PointSets, seen: Array, finest: int, left_out: int | None = None) -> Array:
+def _log_evidence(sets: PointSets, terms: Array, finest: int, left_out: int | None = None) -> Array:
     """log of sum_w prod_i x_i^(1 / c_i) / (S W), clumps weighted and the largest x_i left out, at each of S scales, of
-    points seen in directions (n, 3); -inf at the scales before the finest one, which are not looked at."""
-    image, terms = sets.image, _terms(sets, seen, finest)
-    count = _fixing(sets) if left_out is None else left_out
-    largest = len(terms) - max(count, 1)
-    fixing = np.partition(terms * image.together[:, finest:, None], largest, 0)[len(terms) - count :]
-    evidence = terms.sum(0) - np.maximum(fixing, 0).sum(0)
+    `_terms` (k, S', W); -inf at the scales before the finest one, which are not looked at."""
+    image, count = sets.image, _fixing(sets) if left_out is None else left_out
+    evidence = terms.sum(0) - sum_of_largest(terms * image.together[:, finest:, None], count)
     total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
     return np.r_[np.full(finest, -math.inf), total]
+
+
+def sum_of_largest(values: Array, count: int) -> Array:
+    """Of the `count` largest of values (k, ...), as far as positive; a partition stumbles over so many equal ones."""
+    rest, total = values.copy(), np.zeros(values.shape[1:])
+    for _ in range(count):
+        largest = rest.argmax(0)[None]
+        total += np.maximum(np.take_along_axis(rest, largest, 0)[0], 0)
+        np.put_along_axis(rest, largest, -math.inf, 0)
+    return total
 
 
 def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *, even: bool = False) -> Array:

@@ -26,6 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
+from bpnp.search.evidence.false_alarms import sum_of_largest
 from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS
 from bpnp.search.kernels.neighbours import sums_near
 
@@ -71,11 +72,7 @@ def log10_false_alarms(squared: Array, density: Array, known: Background) -> tup
     width = known.scales * known.pixel[:, None]
     ratio = np.exp(-0.5 * squared[:, None] / known.scales**2) / (2 * math.pi * width**2 * density[:, None])
     terms = np.log(1 - SHARES + SHARES * ratio[:, :, None]) / known.together[:, :, None]
-    evidence, rest = terms.sum(0) - known.log_tests[:, None], terms.copy()
-    for _ in range(FIXING):
-        largest = rest.argmax(0)[None]
-        evidence -= np.maximum(np.take_along_axis(rest, largest, 0)[0], 0)
-        np.put_along_axis(rest, largest, -math.inf, 0)
+    evidence = terms.sum(0) - sum_of_largest(terms, FIXING) - known.log_tests[:, None]
     best = np.unravel_index(evidence.argmax(), evidence.shape)
     mean = np.logaddexp.reduce(evidence, None) - math.log(evidence.size)
     return -float(mean) / math.log(10), terms[:, best[0], best[1]] / math.log(10)

@@ -79,6 +79,7 @@ class Sight(NamedTuple):
     sky: Sky
     known: Background
     reach: float
+    density: float
     sample: Labels
     settings: InfinitySettings
 
@@ -151,13 +152,18 @@ def _sight(
     cell = settings.cell * reach * float(np.median(image.pixel))
     background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise, zooms)
     sample = np.random.default_rng(seed).permutation(len(image.bearings))[: settings.sample]
-    return Sight(image, catalogue, catalogue.sky(cell), background, reach, sample, settings)
+    density = float(np.median(catalogue.density))
+    return Sight(image, catalogue, catalogue.sky(cell), background, reach, density, sample, settings)
 
 
 def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> RotationResult:
     settings, count = sight.settings, len(sight.image.bearings)
     found: list[Rotated] = []
-    order, tree, tried = np.random.default_rng(seed).permutation(count), cKDTree(sight.image.bearings), 0
+    order, tree, tried = (
+        np.random.default_rng(seed).permutation(count),
+        cKDTree(sight.image.bearings, balanced_tree=False),
+        0,
+    )
     if scores is not None:
         order = order[np.argsort(-scores[order], kind="stable")]
     result = _judged(found, sight, tried)
@@ -166,8 +172,10 @@ def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -
         if len(around) < FIXING:
             continue
         tried += 1
+        near = np.r_[i, around]
+        some = np.union1d(near, sight.sample)
         for rotation, farthest in _agreeing(sight, i, around, rays, bins):
-            one = _fitted(sight, rotation, np.r_[i, around], farthest, found)
+            one = _fitted(sight, rotation, near, farthest, some, found)
             found = found if one is None else _merged(found, one, sight)
         result = _judged(found, sight, tried)
         least = max(math.ceil(settings.least_share * count), FIXING + 1)
@@ -193,8 +201,7 @@ def _rays(sight: Sight, i: int, tree: cKDTree) -> tuple[Labels, Rays, int]:
     if not len(around):
         return around, Rays(*np.empty((4, 0))), 0
     bins = 1 << int(np.clip(math.log2(2 * math.pi / float((slack / chord).max())), *BINS))
-    density = float(np.median(sight.catalogue.density))
-    chance = np.minimum(density * 2 * slack * 2 * chord * 2 * math.pi / bins, CROWDED)
+    chance = np.minimum(sight.density * 2 * slack * 2 * chord * 2 * math.pi / bins, CROWDED)
     azimuth = azimuths(bearings[i : i + 1], bearings[around][None])[0]
     low, high, nats = (x.astype(np.float32) for x in (chord - slack, chord + slack, np.log(0.5 / chance)))
     return around, Rays(low, high, azimuth, nats), bins
@@ -229,8 +236,10 @@ def _aligned(seen: Array, directions: Array) -> Array:
     return np.asarray(left * [1, 1, np.linalg.det(left @ right)] @ right)
 
 
-def _fitted(sight: Sight, rotation: Array, near: Labels, farthest: int, found: list[Rotated]) -> Rotated | None:
-    """A rotation fitted to the points near a first one, then to others, and to all of them; None where it does not
+def _fitted(
+    sight: Sight, rotation: Array, near: Labels, farthest: int, some: Labels, found: list[Rotated]
+) -> Rotated | None:
+    """A rotation fitted to the points near a first one, then to some others, and to all of them; None where it does not
     contest the best one that was found, or is one of those.
 
     It is known as well as two points fix it, the first and the farthest that agrees.
@@ -238,13 +247,12 @@ def _fitted(sight: Sight, rotation: Array, near: Labels, farthest: int, found: l
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
     known = _information(image, np.array([near[0], farthest]))
     state, scratch = Fit(rotation, known, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
-    some, every = np.union1d(near, sight.sample), np.arange(m)
     fit(image, near, sight.sky, sight.reach, settings.rounds, state, scratch)
     nats = fit(image, some, sight.sky, sight.reach, settings.last_rounds, state, scratch)
     best = max(settings.contests * found[0].nats * len(some) / m, 0.0) if found else 0.0
     if nats <= best or any(_is_same(sight, one.rotation, state.rotation, some) for one in found):
         return None
-    nats = fit(image, every, sight.sky, sight.reach, settings.last_rounds, state, scratch)
+    nats = fit(image, np.arange(m), sight.sky, sight.reach, settings.last_rounds, state, scratch)
     if (state.match >= 0).sum() <= FIXING:
         return None
     left, _, right = np.linalg.svd(state.rotation)

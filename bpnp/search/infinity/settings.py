@@ -25,11 +25,11 @@ class InfinitySettings:
     noise: tuple[float, ...] = (0.35, 1.4)
     reach: float = 3.2
     cell: float = 4.0
-    around: int = 20
+    around: int = 24
     narrowest: float = 10.0
     first: int = 8
-    promising: int = 256
-    refined: int = 6
+    promising: int = 384
+    refined: int = 4
     sample: int = 200
     rounds: int = 6
     last_rounds: int = 3

@@ -1,0 +1,1 @@
+"""One pose of several cameras that are fixed to each other."""

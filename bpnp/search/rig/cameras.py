@@ -1,0 +1,149 @@
+"""Cameras that are fixed to each other: their common pose, what is evidence for it, and the optimum beside it.
+
+The image points of the cameras are independent, so the logs of their likelihood ratios add up. Three matches fix the
+pose of all: the three largest terms are left out once, in that camera where they count most. The tests are those of all
+cameras together, for each of them proposes poses from its own triples.
+
+Image points do not tell the unit of the scene, but cameras that are apart tell it in units of the rig. Translations of
+the rig are homogeneous, (t, u) in units of the scene with u of them in a unit of the rig, so that camera k has the
+translation [C_k | c_k] (t, u). Where u is not known one more match is left out and counted in the tests, in another
+camera than the three.
+"""
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
+from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance, share_bound
+from bpnp.search.point_sets import PointSets
+
+Array = NDArray[np.float64]
+Pose = tuple[Array, Array]
+WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
+STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the last of them that are weighed
+SAME_CENTRE = 1e-6  # of the farthest centre from the origin of the rig
+
+
+class Rig:
+    """Cameras with their points, all of the same scene; `mounts`, camera_k = C_k rig + c_k. Its translations are
+    homogeneous; is_metric: whether their last number is 1, else it is looked for."""
+
+    def __init__(self, sets: Sequence[PointSets], mounts: Sequence[Pose], *, is_metric: bool = True) -> None:
+        self.sets, self.mounts = sets, mounts
+        self.floor = max(each.floor or float(each.image.scales[0]) for each in self.sets)
+        self.unknowns = 6 if is_metric else 7
+        centres = np.array([-turn.T @ shift for turn, shift in mounts])
+        least = SAME_CENTRE * np.abs(centres).max()
+        pairs = combinations(range(len(mounts)), 2)
+        self.apart = [(k, other) for k, other in pairs if np.linalg.norm(centres[k] - centres[other]) > least]
+
+    def pose_of(self, k: int, rotation: Array, translation: Array) -> Pose:
+        """Of camera k, for poses (..., 3, 3), (..., 4) of the rig."""
+        turn, shift = self.mounts[k]
+        return turn @ rotation, translation[..., :3] @ turn.T + translation[..., 3:] * shift
+
+    def rig_of(self, k: int, rotation: Array, translation: Array, unit: Array | float = 1.0) -> Pose:
+        """Of the rig, for those of camera k, whose scene has this many of its units in one of the rig."""
+        turn, shift = self.mounts[k]
+        units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
+        return turn.T @ rotation, np.concatenate([(translation - units * shift) @ turn, units], -1)
+
+    def seen(self, k: int, poses: Candidates) -> Candidates:
+        """Poses of the rig as those of camera k, whose alternatives that need a derivative are asked of one camera."""
+        turns, shifts = self.pose_of(k, poses.rotation, poses.translation)
+        share = poses.matched / min(len(self.sets[k].bearings), len(self.sets[k].points3d))
+        return replace(poses, rotation=turns, translation=shifts, matched=share)
+
+    def linearised(self, rotation: Array, translation: Array, scale: float) -> list[tuple[Array, Linearised]]:
+        """Each camera that sees a point near an image point, and the matrix (6, unknowns) that makes a step of the rig
+        one of it; the seventh number is the logarithm of the scale."""
+        found = []
+        for k, sets in enumerate(self.sets):
+            linear = linearised(sets, *self.pose_of(k, rotation, translation), scale)
+            if linear is not None:
+                turn, shift = self.mounts[k]
+                by_scale = np.r_[np.zeros(3), -translation[3] * shift]
+                step = np.column_stack([np.kron(np.eye(2), turn), by_scale])[:, : self.unknowns]
+                found.append((np.asarray(step, np.float64), linear))
+        return found
+
+    def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
+        """The optimum beside a pose at ever smaller scales, radians, with that scale and the number of matches."""
+        middle = self.sets[0].middle
+        for scale in np.geomspace(WIDE, 1.0, STEPS) * self.floor:
+            information, gradient, count = np.zeros((self.unknowns, self.unknowns)), np.zeros(self.unknowns), 0.0
+            for turn, linear in self.linearised(rotation, translation, scale):
+                rows = linear.jacobian @ turn
+                information = information + np.einsum("k,kia,kib->ab", linear.probability, rows, rows)
+                gradient = gradient + np.einsum("k,kia,ki->a", linear.probability, rows, linear.residual)
+                count += float(linear.probability.sum()) * len(linear.sets.bearings) / len(linear.sets.image.chosen)
+            if count <= self.unknowns - 3:
+                return
+            step = np.linalg.lstsq(information, gradient, rcond=None)[0]
+            moved = rotation @ middle + translation[:3] + step[3:6]
+            rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
+            unit = translation[3:] * np.exp(-np.clip(step[6:], -1, 1).sum())
+            translation = np.r_[moved - rotation @ middle, unit]
+            yield rotation, translation, float(scale), count
+
+    def alarms(self, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+        """log10 of the number of false alarms at the scale of the residuals, and at rougher ones."""
+        tests = math.log10(sum(10 ** log10_tests(each) for each in self.sets))
+        if self.unknowns == 7:
+            tests += math.log10(sum(len(each.bearings) * len(each.points3d) for each in self.sets))
+        terms = []
+        for k, sets in enumerate(self.sets):
+            seen = directions_of(sets, *self.pose_of(k, rotation, translation))
+            terms.append(log_evidence_of(sets, seen, scale, (0, 3, 1)[: self.unknowns - 4]))
+        every, *without = np.array(terms).transpose(1, 2, 0)  # (own and rough, cameras) each
+        three, *one = (np.where(np.isfinite(every), every, 0) - np.where(np.isfinite(x), x, 0) for x in without)
+        fixing = three.max(1)
+        if self.unknowns == 7:  # three matches in one camera, one in another that is apart from it
+            either = [*self.apart, *(pair[::-1] for pair in self.apart)]
+            fixing = np.max([three[:, k] + one[0][:, other] for k, other in either], 0)
+        own, rough = tests - (every.sum(1) - fixing) / math.log(10)
+        return float(own), float(rough)
+
+    def evidence(self, rotation: Array, translation: Array) -> float:
+        """log of how much likelier the bearings of all cameras are under a pose than by chance, each at any scale."""
+        seen = (directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets))
+        return sum(float(log_evidence_of(*each, None, (0,))[0, 0]) for each in zip(self.sets, seen, strict=True))
+
+    def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
+        """Covariance of the turn, of the shift of the middle of the scene, in the axes of the rig, and of the logarithm
+        of the scale if that is unknown."""
+        information = np.zeros((self.unknowns, self.unknowns))
+        for turn, linear in self.linearised(rotation, translation, scale):
+            own = local_covariance(linear)
+            if own is not None:
+                information += turn.T @ np.linalg.solve(own, turn)
+        is_fixed = np.linalg.matrix_rank(information) == self.unknowns
+        return np.asarray(np.linalg.inv(information), np.float64) if is_fixed else None
+
+    def scale_bound(self, rotation: Array, translation: Array, scale: float, matches: float) -> float:
+        """Share by which the scale of a pose's scene may be wrong, exceeded once in a thousand."""
+        covariance = self.covariance(rotation, translation, scale)
+        return math.inf if covariance is None else share_bound(covariance[6:, 6:], 2 * matches - 7)
+
+    def candidates(self, rotations: Array, translations: Array) -> Candidates:
+        """Poses refined on all cameras to the scale at which their false alarms are fewest; `matched` is an expected
+        number of matches."""
+        ends = []
+        for rotation, translation in zip(rotations, translations, strict=True):
+            last = list(self.refined(rotation, translation))[-WEIGHED:]
+            if last:
+                ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda weighed: weighed[0]))
+        if not ends:
+            return Candidates.unscored(rotations[:0], translations[:0])
+        own, rough, rotations, translations, scales, counts = map(np.array, zip(*ends, strict=True))
+        return replace(
+            Candidates.unscored(rotations, translations),
+            matched=counts, scale=scales, score=-own, log10_false_alarms=own, log10_rough=rough,
+        )  # fmt: skip

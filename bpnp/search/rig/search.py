@@ -1,0 +1,184 @@
+"""One pose of several cameras that are fixed to each other: proposed by each alone, refined and judged on all of them.
+
+Few points of a camera are enumerated. Cameras with many search in turns, each as if it were alone; of what a turn finds
+those poses are refined that all cameras together agree with best, and the search ends where the best is certain.
+"""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bpnp.distinct_poses import distinct
+from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.enumeration.poses import enumerate_poses
+from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
+from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.point_sets import PointSets
+from bpnp.search.pool import Pool
+from bpnp.search.rig.cameras import Rig
+from bpnp.search.rig.proposals import agreement, proposals_of
+from bpnp.search.scene import Scene
+from bpnp.search.schedule import turns
+from bpnp.search.search import lacks_partners
+from bpnp.search.settings import DEFAULT
+from bpnp.search.verdict import SearchResult, judged, missed, no_pose
+
+Array = NDArray[np.float64]
+PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all that are refined
+A_TURN = 2  # poses that a turn of a camera finds and that are refined
+COMPARED = 64  # proposals of which it is asked how much evidence they have
+SAME = (1.0, 0.02)  # degrees and distances of the scene within which a pose is not refined twice
+BEFORE = 1e9  # nats, more than any pose explains: of those that were refined before
+
+
+@one_blas_thread
+def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadline: Deadline = NEVER) -> SearchResult:
+    """Distinct poses of the rig, best first, and the verdict on the first one; arguments as for `search_poses`."""
+    settings = DEFAULT if clutter is None else DEFAULT.expecting(clutter)
+    together, searches, few = Together(rig), dict[int, Iterator[Candidates]](), dict[int, Candidates]()
+    for k, sets in enumerate(rig.sets):
+        if is_enumerable(sets):
+            until = Deadline((Deadline.after(0.0).at * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k))
+            few[k], is_exhausted = _enumerated(sets, until)
+            together.exhaustive &= is_exhausted
+            continue
+        together.exhaustive = False
+        scene = Scene(sets, seed + k, settings, deadline)
+        if not lacks_partners(scene):
+            together.pools[k] = Pool(scene, sets, no_pose("no pose was found"))
+            searches[k] = turns(together.pools[k], None, None)
+    together.take(few, REFINED)
+    while searches and not deadline.passed():
+        for k in list(searches):
+            pool, found = together.pools[k], next(searches[k], None)
+            if found is None or pool.turns == settings.schedule.turns or deadline.passed():
+                del searches[k]
+                continue
+            pool.turns += 1
+            pool.merge(found)
+            together.take({k: in_user_frame(found, pool.scene)}, A_TURN)
+            if together.may_be_certain():
+                result = together.result()
+                if result.verdict == "confident" or result.settled:
+                    return result
+    return together.result()
+
+
+def _enumerated(sets: PointSets, deadline: Deadline) -> tuple[Candidates, bool]:
+    """Poses of few points, and whether every hypothesis was tried."""
+    radius = ENUMERATION.radius if sets.floor is None else ENUMERATION.floors * sets.floor
+    chosen = replace(ENUMERATION, kept=PROPOSED)
+    poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=lambda _: False, settings=chosen)
+    return Candidates.unscored(poses.rotation, poses.translation), poses.ended == "exhausted"
+
+
+class Together:
+    """What the cameras of a rig have proposed, and the best of it refined on all.
+
+    met: of each camera all poses, in the user's coordinates. pools: of those that search. best: distinct poses of the
+    rig, best first, their `matched` an expected number of matches. exhaustive: whether every pose was looked at.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        self.rig, self.rule, self.exhaustive = rig, DEFAULT.evidence, True
+        empty = np.empty((0, 3, 3))
+        self.met = [Candidates.unscored(empty, np.empty((0, 3))) for _ in rig.sets]
+        self.starts = Candidates.unscored(empty, np.empty((0, 4)))
+        self.best, self.pools = self.starts, dict[int, Pool]()
+
+    def take(self, new: Mapping[int, Candidates], most: int) -> None:
+        """Refine at most so many of the poses that cameras propose, those that all agree with best."""
+        rotation, translation = proposals_of(self.rig, new, self.met)
+        for k, poses in new.items():
+            self.met[k] = Candidates.concatenated([self.met[k], poses])
+        if len(rotation) > COMPARED:
+            best = np.argsort(-agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
+            rotation, translation = rotation[best], translation[best]
+        score = np.array([self.rig.evidence(*pose) for pose in zip(rotation, translation, strict=True)])
+        known, every = (
+            len(self.starts),
+            Candidates.concatenated([self.starts, Candidates.unscored(rotation, translation)]),
+        )
+        order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
+        self.starts = every[np.r_[:known, order]]
+        self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
+
+    def _add(self, refined: Candidates) -> None:
+        every = Candidates.concatenated([self.best, refined])
+        self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
+
+    def _distinct(self, poses: Candidates, score: Array, count: int) -> NDArray[np.int64]:
+        """The places of the best poses, of which no two show the middle of the scene to all cameras alike."""
+        places = []
+        for k, sets in enumerate(self.rig.sets):
+            turns, shifts = self.rig.pose_of(k, poses.rotation, poses.translation)
+            middle = turns @ sets.middle + shifts
+            distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
+            places += [middle / distance, np.log(distance)]
+        return distinct(poses.rotation, np.concatenate(places, -1), score, count, *SAME)
+
+    def _hits(self) -> int:
+        """Independent starts of all cameras that ended at the best pose."""
+        return sum(int(poses.hits[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met))
+
+    def _looks(self) -> int:
+        """How often its surroundings were searched in vain."""
+        return sum(
+            int(self._as_best(k, in_user_frame(pool.surrounded, pool.scene)).sum()) for k, pool in self.pools.items()
+        )
+
+    def _as_best(self, k: int, poses: Candidates) -> NDArray[np.bool_]:
+        """Which poses of a camera are the best one."""
+        turn, shift = self.rig.pose_of(k, self.best.rotation[:1], self.best.translation[:1])
+        both = np.concatenate([turn, poses.rotation]), np.concatenate([shift, poses.translation])
+        return self.rig.sets[k].same_pose(*both, self.rule.other_deg, self.rule.other_shift)[1:]
+
+    def may_be_certain(self) -> bool:
+        """Whether chance is excluded, and that a better pose was missed."""
+        if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
+            return False
+        self.best.hits[0] = self._hits()
+        strongest, seen = self._strongest()
+        return missed(seen, self.rig.sets[strongest], self._looks(), self.rule) <= self.rule.missed
+
+    def _strongest(self) -> tuple[int, Candidates]:
+        """The camera with most points, and the poses as its own."""
+        k = max(range(len(self.rig.sets)), key=lambda k: len(self.rig.sets[k].bearings))
+        return k, self.rig.seen(k, self.best)
+
+    def result(self) -> SearchResult:
+        if not len(self.best):
+            return no_pose("no pose was found")
+        result = self._judged()
+        if result.verdict == "confident":
+            strongest, seen = self._strongest()
+            best = seen.rotation[0], seen.translation[0]
+            (turns, shifts), _ = repeated_poses(self.rig.sets[strongest], *best, float(seen.scale[0]), self.rule)
+            self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
+            result = self._judged()
+        if result.verdict == "confident" and self.rig.unknowns == 7:
+            first = self.best[:1]
+            known = first.rotation[0], first.translation[0], float(first.scale[0]), float(first.matched[0])
+            if self.rig.scale_bound(*known) > self.rule.focal:
+                off = f"it may be more than {100 * self.rule.focal:.0f} % off"
+                reason = f"the scale of the scene cannot be told: {off}"
+                result = replace(result, verdict="ambiguous", reason=reason)
+        poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
+        return replace(result, candidates=poses)
+
+    def _judged(self) -> SearchResult:
+        self.best.hits[0] = self._hits()
+        strongest, seen = self._strongest()
+        return judged(
+            seen,
+            self.rig.sets[strongest],
+            batches=sum(pool.turns for pool in self.pools.values()),
+            looks=self._looks(),
+            exhaustive=self.exhaustive,
+            rule=self.rule,
+            rig=[(self.rig.seen(k, self.best), sets) for k, sets in enumerate(self.rig.sets)],
+        )
