@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +26,16 @@ from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]
+
+
+class Companion(NamedTuple):
+    """Another camera that sees the same points, fixed to that of a scene: x' = turn x + shift, in the units of both."""
+
+    scene: "Scene"
+    turn: Array
+    shift: Array
+
+
 SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
 ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
@@ -45,6 +56,7 @@ class Scene:
         bearings, points3d = sets.bearings, sets.points3d
         self.settings, self.deadline = settings, deadline
         self.rasters: dict[tuple[RasterShape, float], Raster] = {}
+        self.companions: list[Companion] = []
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)
@@ -68,6 +80,11 @@ class Scene:
     def outlier_density(self, share: float) -> np.float32:
         """o / s^2, o = 2 pi s^2 w / ((1 - w) A): the density of outliers against that of a kernel (Myronenko, Song)."""
         return np.float32(2 * math.pi * share / ((1 - share) * self.solid_angle))
+
+    def join(self, other: "Scene", turn: NDArray[np.float64], shift: NDArray[np.float64]) -> None:
+        """Add a companion with the same points: in the user's coordinates x' = turn x + shift."""
+        turned, moved = other.frame @ turn @ self.frame.T, other.frame @ shift / self.size
+        self.companions.append(Companion(other, turned.astype(np.float32), moved.astype(np.float32)))
 
     def enter_prior(self, prior: Prior) -> Prior:
         """The prior in this frame."""

@@ -35,5 +35,5 @@ def warm_up() -> None:
     start = Candidates.unscored(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start, DEFAULT.coarse, start)
     raster, (_, seen) = raster_of(scene, DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale), scene.sides()
-    looked_up(scene, start, raster, seen, 1)
+    looked_up(scene, start, DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale, 50, 1)
     best_shifts(start, raster, seen)

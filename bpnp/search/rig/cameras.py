@@ -11,9 +11,9 @@ camera than the three.
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import combinations, permutations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
 from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance, share_bound
 from bpnp.search.point_sets import PointSets
+from bpnp.search.scene import Scene
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
@@ -54,6 +55,12 @@ class Rig:
         turn, shift = self.mounts[k]
         units = np.broadcast_to(unit, (*translation.shape[:-1], 1))
         return turn.T @ rotation, np.concatenate([(translation - units * shift) @ turn, units], -1)
+
+    def join(self, scenes: Mapping[int, Scene]) -> None:
+        """Make the scenes of cameras companions of each other, if their unit is known."""
+        for k, other in permutations(scenes, 2) if self.unknowns == 6 else ():
+            (turn, shift), (others, moved) = self.mounts[k], self.mounts[other]
+            scenes[k].join(scenes[other], others @ turn.T, moved - others @ turn.T @ shift)
 
     def seen(self, k: int, poses: Candidates) -> Candidates:
         """Poses of the rig as those of camera k, whose alternatives that need a derivative are asked of one camera."""
@@ -111,10 +118,11 @@ class Rig:
         own, rough = tests - (every.sum(1) - fixing) / math.log(10)
         return float(own), float(rough)
 
-    def evidence(self, rotation: Array, translation: Array) -> float:
-        """log of how much likelier the bearings of all cameras are under a pose than by chance, each at any scale."""
-        seen = (directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets))
-        return sum(float(log_evidence_of(*each, None, (0,))[0, 0]) for each in zip(self.sets, seen, strict=True))
+    def evidence(self, rotation: Array, translation: Array, scale: float | None = None) -> Array:
+        """log (cameras,) of how much likelier the bearings of each are under a pose than by chance, at the scale of the
+        residuals, or of each camera at any."""
+        seen = [directions_of(sets, *self.pose_of(k, rotation, translation)) for k, sets in enumerate(self.sets)]
+        return np.array([log_evidence_of(*each, scale, (0,))[0, 0] for each in zip(self.sets, seen, strict=True)])
 
     def covariance(self, rotation: Array, translation: Array, scale: float) -> Array | None:
         """Covariance of the turn, of the shift of the middle of the scene, in the axes of the rig, and of the logarithm

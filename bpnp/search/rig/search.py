@@ -4,6 +4,7 @@ Few points of a camera are enumerated. Cameras with many search in turns, each a
 those poses are refined that all cameras together agree with best, and the search ends where the best is certain.
 """
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 
 from bpnp.distinct_poses import distinct
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.candidates import Candidates, in_user_frame
+from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
 from bpnp.search.enumeration.poses import enumerate_poses
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
@@ -25,6 +26,7 @@ from bpnp.search.scene import Scene
 from bpnp.search.schedule import turns
 from bpnp.search.search import lacks_partners
 from bpnp.search.settings import DEFAULT
+from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
 
 Array = NDArray[np.float64]
@@ -51,20 +53,22 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
         if not lacks_partners(scene):
             together.pools[k] = Pool(scene, sets, no_pose("no pose was found"))
             searches[k] = turns(together.pools[k], None, None)
+    rig.join({k: pool.scene for k, pool in together.pools.items()})
     together.take(few, REFINED)
-    while searches and not deadline.passed():
+    while searches and together.turns < settings.schedule.turns and not deadline.passed():
         for k in list(searches):
-            pool, found = together.pools[k], next(searches[k], None)
-            if found is None or pool.turns == settings.schedule.turns or deadline.passed():
+            found = next(searches[k], None)
+            if found is None or deadline.passed():
                 del searches[k]
                 continue
-            pool.turns += 1
-            pool.merge(found)
-            together.take({k: in_user_frame(found, pool.scene)}, A_TURN)
+            together.pools[k].turns += 1
+            together.pools[k].merge(found)
+            together.take({k: found}, A_TURN)
             if together.may_be_certain():
                 result = together.result()
                 if result.verdict == "confident" or result.settled:
                     return result
+        together.look_around()
     return together.result()
 
 
@@ -79,8 +83,9 @@ def _enumerated(sets: PointSets, deadline: Deadline) -> tuple[Candidates, bool]:
 class Together:
     """What the cameras of a rig have proposed, and the best of it refined on all.
 
-    met: of each camera all poses, in the user's coordinates. pools: of those that search. best: distinct poses of the
-    rig, best first, their `matched` an expected number of matches. exhaustive: whether every pose was looked at.
+    met: of each camera all poses, in the user's coordinates. pools: of those that search. starts: poses of the rig that
+    were refined, with their evidence. looked: those around which was searched. best: distinct poses, best first, their
+    `matched` an expected number of matches. exhaustive: whether every pose was looked at.
     """
 
     def __init__(self, rig: Rig) -> None:
@@ -88,24 +93,49 @@ class Together:
         empty = np.empty((0, 3, 3))
         self.met = [Candidates.unscored(empty, np.empty((0, 3))) for _ in rig.sets]
         self.starts = Candidates.unscored(empty, np.empty((0, 4)))
-        self.best, self.pools = self.starts, dict[int, Pool]()
+        self.best, self.looked, self.pools = self.starts, self.starts, dict[int, Pool]()
+
+    @property
+    def turns(self) -> int:
+        """Of all cameras."""
+        return sum(pool.turns for pool in self.pools.values())
 
     def take(self, new: Mapping[int, Candidates], most: int) -> None:
-        """Refine at most so many of the poses that cameras propose, those that all agree with best."""
+        """Refine at most so many of the poses that cameras propose, in the frames of their scenes if they have one,
+        those that all agree with best."""
+        new = {k: in_user_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
         rotation, translation = proposals_of(self.rig, new, self.met)
         for k, poses in new.items():
             self.met[k] = Candidates.concatenated([self.met[k], poses])
         if len(rotation) > COMPARED:
             best = np.argsort(-agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
             rotation, translation = rotation[best], translation[best]
-        score = np.array([self.rig.evidence(*pose) for pose in zip(rotation, translation, strict=True)])
+        score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
         known, every = (
             len(self.starts),
             Candidates.concatenated([self.starts, Candidates.unscored(rotation, translation)]),
         )
         order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
+        every = replace(every, score=np.r_[self.starts.score, score])
         self.starts = every[np.r_[:known, order]]
         self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
+
+    def look_around(self) -> None:
+        """Search around the pose with most evidence, if none exceeds chance, around none twice."""
+        if not self.pools or not len(self.starts) or self.best.log10_false_alarms[:1].min(initial=math.inf) < 0:
+            return
+        poses = Candidates.concatenated([self.looked, self.starts])
+        score = np.r_[np.full(len(self.looked), BEFORE), self.starts.score]
+        apart = DEFAULT.schedule.apart_deg
+        order = distinct(poses.rotation, poses.translation, score, len(self.looked) + 1, apart, math.inf)
+        new = poses[order[len(self.looked) :]]
+        self.looked = Candidates.concatenated([self.looked, new])
+        k = max(self.pools, key=lambda k: len(self.rig.sets[k].bearings))
+        turn, shift = self.rig.pose_of(k, new.rotation, new.translation)
+        if len(new):
+            scene = self.pools[k].scene
+            pose = in_scene_frame(Candidates.unscored(turn, shift), scene)
+            self.take({k: search_beside(scene, pose, scene.settings.beside)}, A_TURN)
 
     def _add(self, refined: Candidates) -> None:
         every = Candidates.concatenated([self.best, refined])
@@ -146,8 +176,8 @@ class Together:
         return missed(seen, self.rig.sets[strongest], self._looks(), self.rule) <= self.rule.missed
 
     def _strongest(self) -> tuple[int, Candidates]:
-        """The camera with most points, and the poses as its own."""
-        k = max(range(len(self.rig.sets)), key=lambda k: len(self.rig.sets[k].bearings))
+        """The camera in which the best pose has most evidence, and the poses as its own."""
+        k = int(self.rig.evidence(self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])).argmax())
         return k, self.rig.seen(k, self.best)
 
     def result(self) -> SearchResult:
@@ -176,7 +206,7 @@ class Together:
         return judged(
             seen,
             self.rig.sets[strongest],
-            batches=sum(pool.turns for pool in self.pools.values()),
+            batches=self.turns,
             looks=self._looks(),
             exhaustive=self.exhaustive,
             rule=self.rule,

@@ -25,8 +25,7 @@ from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
-from bpnp.search.kernels.sides import WeightedPoints
-from bpnp.search.scene import Scene
+from bpnp.search.scene import Companion, Scene
 from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior, draw_poses
 
@@ -48,16 +47,14 @@ def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None
 
 def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
-    raster = raster_of(scene, rule.raster, rule.narrowing.first_scale)
     for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
-        poses, _ = looked_up(scene, poses, raster, scene.sides(points=points)[1], kept)
+        poses, _ = looked_up(scene, poses, rule.raster, rule.narrowing.first_scale, points, kept)
     return narrowed(scene, poses, rule)
 
 
 def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
     """Distinct poses from those that are left at the first scale: step by step to the last one, annealed."""
     steps, scale = rule.narrowing, rule.narrowing.first_scale
-    again = scene.sides(points=steps.points)[1]
     origin = np.arange(len(poses))  # the start that each pose is a copy of
     for step in range(1, steps.steps + 1):
         if scene.deadline.passed():
@@ -66,7 +63,7 @@ def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
         copies, family, kept = moved(scene, poses, scale, steps.copies), 1, rule.screens.kept[-1]
         if steps.halved:
             family, kept = steps.copies, kept // 2**step
-        poses, chosen = looked_up(scene, copies, raster_of(scene, rule.raster, scale), again, kept, family)
+        poses, chosen = looked_up(scene, copies, rule.raster, scale, steps.points, kept, family)
         origin = origin[chosen // steps.copies]
     poses, origin = poses[: rule.annealed], origin[: rule.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
@@ -147,15 +144,20 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
 
 
 def looked_up(
-    scene: Scene, poses: Candidates, raster: Raster, points: WeightedPoints, kept: int, family: int = 1
+    scene: Scene, poses: Candidates, shape: RasterShape, scale: float, points: int, kept: int, family: int = 1
 ) -> tuple[Candidates, NDArray[np.int64]]:
-    """The `kept` poses under which the points fall best, best first, and their places; of `family` in a row the best
-    one only."""
-    score = poses.score.copy()
+    """The `kept` poses under which so many points fall best on the bearings, of all companions too, best first, and
+    their places; of `family` in a row the best one only."""
+    score = np.zeros(len(poses), np.float32)
+    cameras = [Companion(scene, np.eye(3, dtype=np.float32), np.zeros(3, np.float32)), *scene.companions]
+    sides = [(raster_of(each.scene, shape, scale), each.scene.sides(points=points)[1]) for each in cameras]
 
     def look_up(i: int, j: int) -> None:
-        weight, cell = np.empty_like(points.b), np.empty(len(points.b), np.int32)
-        add_up(raster, points, poses.rotation[i:j], poses.translation[i:j], score[i:j], weight, cell)
+        for (_, turn, shift), (raster, seen) in zip(cameras, sides, strict=True):
+            weight, cell, own = np.empty_like(seen.b), np.empty(len(seen.b), np.int32), np.empty(j - i, np.float32)
+            rotation, translation = turn @ poses.rotation[i:j], poses.translation[i:j] @ turn.T + shift
+            add_up(raster, seen, rotation, translation, own, weight, cell)
+            score[i:j] += own
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
     best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
