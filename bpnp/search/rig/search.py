@@ -1,7 +1,9 @@
 """One pose of several cameras that are fixed to each other: proposed by each alone, refined and judged on all of them.
 
-Few points of a camera are enumerated. Cameras with many search in turns, each as if it were alone; of what a turn finds
-those poses are refined that all cameras together agree with best, and the search ends where the best is certain.
+Few points of a camera are enumerated. Cameras with many search in turns, each as if it were alone but that raster
+searches look points up in all of them; of what a turn finds those poses are refined that have most evidence in all
+cameras together, and the search ends where the best is certain. As long as none exceeds chance, each round ends with a
+raster search around that with most evidence.
 """
 
 import math
@@ -111,12 +113,9 @@ class Together:
             best = np.argsort(-agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
-        known, every = (
-            len(self.starts),
-            Candidates.concatenated([self.starts, Candidates.unscored(rotation, translation)]),
-        )
+        poses, known = replace(Candidates.unscored(rotation, translation), score=score), len(self.starts)
+        every = Candidates.concatenated([self.starts, poses])
         order = self._distinct(every, np.r_[np.full(known, BEFORE), score], known + most)[known:]
-        every = replace(every, score=np.r_[self.starts.score, score])
         self.starts = every[np.r_[:known, order]]
         self._add(self.rig.candidates(every.rotation[order], every.translation[order]))
 
@@ -181,6 +180,7 @@ class Together:
         return k, self.rig.seen(k, self.best)
 
     def result(self) -> SearchResult:
+        """The verdict on the best poses, beside those that a repeated structure would confuse with a confident one."""
         if not len(self.best):
             return no_pose("no pose was found")
         result = self._judged()
