@@ -135,6 +135,11 @@ def test_a_method_that_was_interrupted_starts_again(recipes: list[str], tmp_path
     assert len(read_results(tmp_path / "out" / "it").rows) == 5
 
 
+def test_a_limit_of_time_reaches_the_methods(recipes: list[str], tmp_path: Path) -> None:
+    main(["table", recipes[1], "--methods", "search", recipes[-1], "--limit=1", "--time_limit=1e-6"])
+    assert not read_results(tmp_path / "out" / "search").rows[0].found
+
+
 def test_an_outlier_sweep_adds_points_and_draws_its_curves(recipes: list[str], tmp_path: Path) -> None:
     main([*recipes, "--limit=2", "--rho", "0", "0.5"])
     clean = read_results(tmp_path / "out" / "rho-0" / "blind").rows[0]
