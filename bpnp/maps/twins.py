@@ -97,10 +97,10 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
     ends = polished(scene, rotations[apart], translations[apart], scale)
     ends = ends[different(ends.rotation, ends.translation)]
+    if not len(ends):
+        return None
     twins = ends.rotation, ends.translation
     behind = decades_behind(sets, best, twins, twins, scale)
-    if not len(behind):
-        return None
     k = int(np.argmin(behind))
     return float(behind[k]), _candidate(problem, solution, ends, k, float(behind[k]))
 
