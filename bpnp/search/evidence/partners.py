@@ -19,6 +19,7 @@ OUTLIERS = 0.3  # share of the image points without a partner that the assignmen
 FEW_PARTNERS = 2  # scene points that may be the partner of each, where the focal length is fitted
 MOST_ZOOM, SAME_ZOOM = 0.2, 0.01  # step of the logarithm, at most; change that is none
 MOST_ROUNDS = 4
+FITTED_POINTS = 400  # image points, about, by which most of these steps are taken
 FITTED_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # of the residuals, for steps of a pose with its focal length
 
 
@@ -116,15 +117,21 @@ def _zoomed(
 
 def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: float) -> Zoomed | None:
     """A pose with residuals of `scale`, and the focal length that fits it best, after Gauss-Newton steps of both until
-    the focal length stays; None if nothing matches. middle: (3,) of the scene, seen from the camera."""
+    the focal length stays, by some of the image points, and the last ones by all; None if nothing matches.
+
+    middle: (3,) of the scene, seen from the camera.
+    """
     chosen = sets.image.chosen
-    step = _zoomed(sets, chosen, FITTED_WIDTHS[0] * scale, rotation, middle, 1.0)
+    some = chosen[:: max(len(chosen) // FITTED_POINTS, 1)]
+    step = _zoomed(sets, some, FITTED_WIDTHS[0] * scale, rotation, middle, 1.0)
     for _ in range(MOST_ROUNDS):
         before = 0.0 if step is None else math.log(step.zoom)
         for width in FITTED_WIDTHS:
-            step = None if step is None else _stepped(sets, chosen, width * scale, step)
+            step = None if step is None else _stepped(sets, some, width * scale, step)
         if step is None or abs(math.log(step.zoom) - before) < SAME_ZOOM:
             break
+    for _ in range(2 if len(some) < len(chosen) else 0):  # the first one is of the matches of some still
+        step = None if step is None else _stepped(sets, chosen, scale, step)
     return step
 
 

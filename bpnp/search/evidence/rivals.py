@@ -67,30 +67,37 @@ def _at_other_focal_lengths(
     decades = -result.log10_false_alarms / match_count(result.candidates, sets)
     if -rule.independent * decades > rule.missed:
         scene = entered()
-        poses = [near_focal_length(sets, rotation, middle, zoom, scale, scene) for zoom in rule.zoomed.zooms]
-        zoom, there, pose = min(poses, key=lambda one: one[2].log10_false_alarms.min(initial=math.inf))
-        if not len(pose):  # after the deadline
+        zooms = [(zoom, *near_focal_length(sets, rotation, middle, zoom, scale, scene)) for zoom in rule.zoomed.zooms]
+        zoom, there, poses = max(zooms, key=lambda one: _likelihood(*one[1:]))
+        if not len(poses):  # after the deadline
             return
-        seen = pose.rotation[0] @ sets.middle + pose.translation[0]
-        fitted = with_focal_length(there, pose.rotation[0], seen, max(float(pose.scale[0]), there.image.scales[0]))
+        seen = poses.rotation[0] @ sets.middle + poses.translation[0]
+        fitted = with_focal_length(there, poses.rotation[0], seen, max(float(poses.scale[0]), there.image.scales[0]))
         yield None if fitted is None else fitted._replace(zoom=zoom * fitted.zoom)
 
 
 def near_focal_length(
     sets: PointSets, rotation: Array, middle: Array, zoom: float, scale: float, scene: Scene
-) -> tuple[float, PointSets, Candidates]:
-    """The pose that annealing reaches at `zoom` times the focal length from the one that sees the scene as large, with
-    its false alarms; and the focal length and the points there.
+) -> tuple[PointSets, Candidates]:
+    """The points at `zoom` times the focal length, and the pose that annealing reaches there from the one that sees the
+    scene as large, by some of the bearings; none after the deadline.
 
     middle: (3,) of the scene, seen from the camera. scale: of the residuals, radians. scene: whose settings and
     deadline hold.
     """
-    zoomed, rule = at_focal_length(sets, zoom), scene.settings.evidence.zoomed
-    there = Scene(zoomed, 0, scene.settings, scene.deadline)
+    zoomed, settings = at_focal_length(sets, zoom), scene.settings
+    rule = settings.evidence.zoomed
+    few = replace(settings, fine=replace(settings.fine, bearings=rule.bearings))
+    there = Scene(zoomed, 0, few, scene.deadline)
     wide = max(scale, rule.width * abs(math.log(zoom)) * sets.image.spread)
     poses = rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None]
     ends = anneal_on_points(there, Candidates.unscored(*there.enter(*poses)), 2 * wide)
-    return zoom, zoomed, with_false_alarms(in_user_frame(ends, there), zoomed)
+    return zoomed, in_user_frame(ends[:1], there)
+
+
+def _likelihood(sets: PointSets, poses: Candidates) -> float:
+    """Of the bearings under the first pose, nats each, against an even density over the view; -inf without a pose."""
+    return float(poses.score[0]) + math.log(sets.image.solid_angle) if len(poses) else -math.inf
 
 
 def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:
