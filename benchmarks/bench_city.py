@@ -3,10 +3,11 @@
     python -m benchmarks city --views 477 1000 3000 10000 --limit 12
     python -m benchmarks city --twice 0.1
 
-The models of the data lie at random places, rotations and scales; changed copies of them make up the number of views:
-other places with the statistics of real ones, mirrored or not, the points moved along a smooth field by a tenth of the
-distance from which they are seen, and a third of them dropped. Photos of five scenes are left out with all
-points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
+The models of the data, or those that are named, lie at random places, rotations and scales; changed copies of them make
+up the number of views: other places with the statistics of real ones, mirrored or not, the points moved along a smooth
+field by a tenth of the distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos
+are left out with all points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of
+the distance.
 --twice: every place is there twice, this share of the points of the second one gone; a confident pose in it is wrong,
 and no pose there is right. A row begins with the rank of the views (`bpnp.maps.ranking`): of how many photos one of the
 first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
@@ -232,8 +233,9 @@ def localized(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> list[O
 
 
 def rows(options: argparse.Namespace) -> Rows:
-    scenes = [model_of(options.data, path.name) for path in sorted((options.data / "colmap").iterdir())]
-    wanted = dict.fromkeys(REPORTED, -(-options.limit // len(REPORTED)))
+    names = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
+    scenes = [model_of(options.data, name) for name in names]
+    wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
     for views in options.views if options.twice is None else [0]:
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
         name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
@@ -242,6 +244,8 @@ def rows(options: argparse.Namespace) -> Rows:
 
 def main() -> None:
     options = parser(__doc__)
+    options.add_argument("scenes", nargs="*", metavar="SCENE", help="models of the city (default: all of the data)")
+    options.add_argument("--photos", nargs="+", default=REPORTED, metavar="SCENE", help="scenes of the photos")
     options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
     options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
     chosen = options.parse_args()

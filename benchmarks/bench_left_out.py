@@ -3,8 +3,9 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Rows of a scene: views (the three views that share most points are named), map (none is); views-sift and map-sift, the
-same with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each photo on the first run and keeps it
-in --maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
+same with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words
+retrieves. pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of
+all photos, aligned by the views that both models have.
 """
 
 import argparse
@@ -43,6 +44,8 @@ def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dic
     for method, named in (("views", views), ("map", None)):
         searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **known)
         searches[f"{method}-sift"] = partial(described.localize, photo, CAMERA, named)
+    _ = described.words  # made before the first photo
+    searches["words-sift"] = lambda: described.localize(photo, CAMERA, described.retrieved(photo))
     name, pose = f"{scene.photos.name}/{photo}", alignment.pose(true.rotation, true.translation)
     return {
         method: Problem(name, search, [pose], distance=far * alignment.scale) for method, search in searches.items()

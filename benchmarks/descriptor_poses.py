@@ -1,6 +1,8 @@
-"""The yardstick of localisation with descriptors: nearest SIFT descriptors, ratio test, RANSAC of PoseLib."""
+"""The yardstick of localisation with descriptors: nearest SIFT descriptors, ratio test, RANSAC of PoseLib; and the
+views by a bag of visual words (Sivic and Zisserman, ICCV 2003)."""
 
 from collections.abc import Iterable
+from functools import cached_property
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,12 +12,15 @@ import poselib
 import pycolmap
 from numpy.typing import NDArray
 from record import Array
+from scipy.cluster.vq import kmeans2, vq
 
 from bpnp.datamodules.colmap.model_files import read_records
 
 RATIO = 0.8  # largest ratio of the distances to the nearest descriptor and to that of another point (Lowe 2004)
 THRESHOLD_PX = 8.0  # of an inlier
 LEAST_INLIERS = 12  # of a pose that counts as confident, the limit of hloc
+WORDS, ROUNDS, EVERY = 512, 5, 4  # of the vocabulary; rounds of k-means; one descriptor of so many makes it
+RETRIEVED = 10  # views
 AT_ONCE = 256  # descriptors of the photo in one product
 
 
@@ -31,6 +36,21 @@ class DescribedMap:
             _, descriptors = self._features(image.name)
             seen = image.point_ids >= 0
             self._views[image.name] = descriptors[seen], image.point_ids[seen]
+
+    @cached_property
+    def words(self) -> tuple[Array, Array, Array]:
+        """Centres of the words (w, 128), the rarity of each, and of each view its words by rarity, a unit vector."""
+        rows = np.concatenate([descriptors for descriptors, _ in self._views.values()])[::EVERY].astype(np.float64)
+        centres, _ = kmeans2(rows, min(WORDS, len(rows)), iter=ROUNDS, minit="points", seed=0)
+        counts = np.array([word_counts(descriptors, centres) for descriptors, _ in self._views.values()])
+        rarity = np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
+        return centres, rarity, counts * rarity / np.linalg.norm(counts * rarity, axis=1, keepdims=True)
+
+    def retrieved(self, photo: str) -> list[str]:
+        """The views whose words are most like those of the photo."""
+        centres, rarity, bags = self.words
+        likeness = bags @ (rarity * word_counts(self._features(photo)[1], centres))
+        return [list(self._views)[i] for i in np.argsort(-likeness, kind="stable")[:RETRIEVED]]
 
     def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
         """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""
@@ -55,6 +75,10 @@ class DescribedMap:
             descriptors = content.read_descriptors(number).data.astype(np.float32)
             pixels = content.read_keypoints(number)[:, :2].astype(np.float64)
         return pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+
+
+def word_counts(descriptors: NDArray[np.float32], centres: Array) -> NDArray[np.int64]:
+    return np.bincount(vq(descriptors, centres)[0], minlength=len(centres))
 
 
 def descriptor_matches(
