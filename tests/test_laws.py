@@ -86,7 +86,7 @@ def by_matcher(frame: str) -> Callable[[Batch], tuple[torch.Tensor, ...]]:
 LAYERS = {
     "sinkhorn": by_sinkhorn,
     "pnp": by_pnp,
-    **{f"ransac of {backend}": by_ransac(backend) for backend in ("poselib", "opencv")},
+    **{f"ransac of {backend}": by_ransac(backend) for backend in ("poselib", "opencv", "torch")},
     **{f"matcher in {frame} frame": by_matcher(frame) for frame in ("any", "view")},
 }
 

@@ -38,7 +38,7 @@ def table(
 
     Args:
         data: name or file of a configuration with `data`.
-        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, hungarian, bpnpnet,
+        methods: [LABEL=]METHOD[@CHECKPOINT]; METHOD is softposit, ransac, gosma, gopac, hungarian, bpnpnet,
             matcher, search, a class path, or a .yaml file with model.solver. bpnpnet, matcher and hungarian need a
             CHECKPOINT (a file, or the name of packaged weights) to be more than untrained.
         limit: problems, a fixed random choice; all by default.

@@ -9,12 +9,12 @@ from torch import Tensor, nn
 from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.backends import BACKENDS, each_sample
+from bpnp.robust.backends import BACKENDS
 from bpnp.robust.matches import Matches, in_scene, normalised, residuals
 from bpnp.robust.minimal_solvers import take
 from bpnp.types import SolveStats
 
-Backend = Literal["auto", "poselib", "opencv"]
+Backend = Literal["auto", "poselib", "opencv", "torch"]
 
 
 def top_matches(
@@ -55,9 +55,9 @@ def ransac_pnp(
     """Pose from the k = matches_factor * min(m, n) most probable matches by RANSAC with a P3P solver.
 
     assignment: P; only the order of its entries matters. points2d: normalised image coordinates. points3d: scene units.
-    backend: "poselib", which "auto" means, LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with
-        1000 iterations, then EPnP on its inliers, the paper's, or SQPnP where EPnP loses inliers, as it may on points
-        of one plane. Both run on the CPU.
+    backend: "poselib", LO-RANSAC that samples in the order of P (PROSAC); "opencv", P3P-RANSAC with 1000 iterations,
+        then EPnP on its inliers, the paper's, or SQPnP where EPnP loses inliers, as it may on points of one plane;
+        "torch", a whole batch at once on its device, in the order of P too; "auto", torch on cuda, else poselib.
     threshold: largest reprojection error of an inlier, normalised units (0.01 is 8 px at a focal length of 800).
     seed: of the sampling, the same for each sample, so that a pose does not depend on the other samples.
 
@@ -73,17 +73,19 @@ def ransac_pnp(
     >>> torch.allclose(translation, torch.tensor([[0.0, 0.0, 4.0]]), atol=1e-3)
     True
     """
-    if backend not in BACKENDS:
-        raise ValueError(f"expected `backend` {' or '.join(BACKENDS)}, got {backend!r}")
+    if backend not in ("auto", *BACKENDS):
+        raise ValueError(f"expected `backend` auto, poselib, opencv or torch, got {backend!r}")
     check_positive(matches_factor=matches_factor, threshold=threshold, max_iterations=max_iterations)
+    if backend == "auto":
+        backend = "torch" if assignment.device.type == "cuda" else "poselib"
     index2d, index3d, real = top_matches(assignment, mask2d, mask3d, matches_factor)
     matches = Matches(take(points2d, index2d).double(), take(points3d, index3d).double(), real)
     local, centre, scale = normalised(matches)
-    poses, iterations = each_sample(BACKENDS[backend], local, threshold, max_iterations, seed)
+    poses, iterations = BACKENDS[backend](local, threshold, max_iterations, seed)
     rotation, translation = (values.squeeze(1) for values in in_scene(poses.unsqueeze(1), centre, scale))
     # The returned pose itself is scored: a refit to the inliers of another pose may have lost them.
-    poses = torch.cat([rotation, translation.unsqueeze(-1)], -1)
-    squared, inlier = residuals(poses, matches, threshold**2)
+    poses = torch.cat([rotation, translation.unsqueeze(-1)], -1).unsqueeze(1)
+    squared, inlier, *_ = (values.squeeze(1) for values in residuals(poses, matches, threshold**2))
     count = inlier.sum(-1)
     found = count >= MIN_POINTS
     error = torch.where(inlier, squared, 0).sqrt().sum(-1) / count
@@ -96,7 +98,8 @@ class RansacPnP(nn.Module):
     """`ransac_pnp` with its options as a module.
 
     Args:
-        backend: poselib, which auto means (LO-RANSAC, PROSAC order), or opencv (the paper's P3P-RANSAC and EPnP).
+        backend: poselib (LO-RANSAC, PROSAC order), opencv (the paper's P3P-RANSAC and EPnP), torch (the whole batch on
+            its device), or auto (torch on cuda, else poselib).
         matches_factor: RANSAC sees the matches_factor * min(m, n) most probable matches.
         threshold: inlier threshold, normalised image coordinates.
         max_iterations: most hypotheses; the paper has 1000.

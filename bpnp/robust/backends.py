@@ -1,6 +1,7 @@
-"""RANSAC of other libraries on candidate matches: one signature, one pose a sample."""
+"""RANSAC of this and of other libraries on candidate matches: one signature, one pose a sample."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import cv2
@@ -12,23 +13,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.geometry import MIN_POINTS
+from bpnp.robust.consensus import consensus
 from bpnp.robust.matches import Matches, residuals
 
 FEWEST = 25  # hypotheses of PoseLib; it ends after three times as many as meet a true triple with probability 0.9999
 KEPT_SHARE = 0.9  # of its inliers that OpenCV's refit must keep
 Array = NDArray[np.float64]
 # points2d (k, 2), points3d (k, 3), threshold, most hypotheses, seed -> pose [R | t] and hypotheses, None for no pose
-Estimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
+SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | None]
+Estimator = Callable[[Matches, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]
 
 
-def each_sample(
-    estimate: Estimator, matches: Matches, threshold: float, max_iterations: int, seed: int
+def _each(
+    estimate: SingleEstimator, matches: Matches, threshold: float, max_iterations: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
-    """One sample after the other: poses [R | t], NaN for none, and hypotheses, or the bound on them where the library
-    does not tell. Samples with fewer than 4 matches have no pose and no iterations.
-
-    matches: as `bpnp.robust.matches.normalised` gives them, most probable first.
-    """
+    """One sample after the other; those with fewer than 4 matches have no pose and no iterations."""
     poses, iterations = matches.points3d.new_full((len(matches.real), 3, 4), torch.nan), matches.real.sum(-1)
     for i, count in enumerate(iterations.tolist()):
         iterations[i] = 0 if count < MIN_POINTS else max_iterations
@@ -76,7 +75,13 @@ def _opencv(x: Array, p: Array, threshold: float, max_iterations: int, seed: int
 
 def _count_inliers(pose: NDArray[Any], x: Array, p: Array, threshold: float) -> int:
     matches = Matches(*(torch.as_tensor(values)[None] for values in (x, p, np.ones(len(x), bool))))
-    return int(residuals(torch.as_tensor(pose)[None], matches, threshold**2)[1].sum())
+    return int(residuals(torch.as_tensor(pose)[None, None], matches, threshold**2).inlier.sum())
 
 
-BACKENDS: dict[str, Estimator] = {"auto": _poselib, "poselib": _poselib, "opencv": _opencv}
+# Matches as `bpnp.robust.matches.normalised` gives them, most probable first, threshold, most hypotheses, seed ->
+# poses [R | t], NaN for none, and hypotheses, or the bound on them where the library does not tell.
+BACKENDS: dict[str, Estimator] = {
+    "poselib": partial(_each, _poselib),
+    "opencv": partial(_each, _opencv),
+    "torch": consensus,
+}

@@ -58,6 +58,15 @@ class Matches(NamedTuple):
     real: Bool[Tensor, "b k"]
 
 
+class Residuals(NamedTuple):
+    """Of c poses on k matches. inlier: real, in front of the camera, and with an error below the threshold."""
+
+    squared: Float[Tensor, "b c k"]
+    inlier: Bool[Tensor, "b c k"]
+    residual: Float[Tensor, "b c k 2"]
+    camera: Float[Tensor, "b c k 3"]
+
+
 def normalised(matches: Matches) -> tuple[Matches, Float[Tensor, "b 3"], Float[Tensor, "b 1"]]:
     """The matches in float64 with 3D points q, centred and of unit variance; centre and scale in p = scale q + centre.
 
@@ -104,11 +113,11 @@ def truncated_scores(
     return torch.cat(scores, 1)
 
 
-def residuals(
-    poses: Float[Tensor, "b 3 4"], matches: Matches, threshold2: float
-) -> tuple[Float[Tensor, "b k"], Bool[Tensor, "b k"]]:
-    """Squared reprojection error of every match under a pose, in the type of the points; and the inliers: the real
-    matches in front of the camera with one below `threshold2`."""
-    camera = transform(poses[..., :3], poses[..., 3], matches.points3d)
-    squared = (camera[..., :2] / camera[..., 2:] - matches.points2d).square().sum(-1)
-    return squared, (squared < threshold2) & (camera[..., 2] > 0) & matches.real
+def residuals(poses: Float[Tensor, "b c 3 4"], matches: Matches, threshold2: float) -> Residuals:
+    """Reprojection error of every match under every pose, in the type of the points."""
+    points3d = matches.points3d.unsqueeze(1).expand(-1, poses.shape[1], -1, -1)
+    camera = transform(poses[..., :3], poses[..., 3], points3d)
+    residual = camera[..., :2] / camera[..., 2:] - matches.points2d.unsqueeze(1)
+    squared = residual.square().sum(-1)
+    inlier = (squared < threshold2) & (camera[..., 2] > 0) & matches.real.unsqueeze(1)
+    return Residuals(squared, inlier, residual, camera)

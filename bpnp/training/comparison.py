@@ -26,6 +26,7 @@ SHORT_NAMES = {
     "softposit": "bpnp.models.baselines.SoftPOSIT",
     "ransac": "bpnp.models.baselines.RandomRansac",
     "gosma": "bpnp.models.baselines.GOSMA",
+    "gopac": "bpnp.models.baselines.GOPAC",
     "hungarian": "bpnp.models.baselines.Hungarian",
     "bpnpnet": "bpnp.models.BPnPNet",
     "matcher": "bpnp.models.Matcher",

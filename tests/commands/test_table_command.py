@@ -215,7 +215,7 @@ def test_names_in_latex_are_text() -> None:
 @pytest.mark.parametrize(
     ("name", "limited"),
     [
-        *((name, True) for name in ("softposit", "ransac", "gosma", "search")),
+        *((name, True) for name in ("softposit", "ransac", "gosma", "gopac", "search")),
         *((name, False) for name in ("hungarian", "bpnpnet", "matcher")),
     ],
 )

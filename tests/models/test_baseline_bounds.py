@@ -1,12 +1,15 @@
-"""Branch and bound: the searches end at planted optima, with bounds that no pose of a grid beats."""
+"""Branch and bound: no pose turns a direction beyond its box's uncertainty, and the searches end at planted optima."""
 
 import math
 
 import roma
 import torch
+from planted import plant
 from torch import Tensor
 
-from bpnp.models.baselines.branch_and_bound import Boxes
+from bpnp.geometry import angle_between, camera_centre
+from bpnp.models.baselines.branch_and_bound import Boxes, rotation_uncertainty, translation_uncertainty
+from bpnp.models.baselines.gopac import maximise_inliers, within
 from bpnp.models.baselines.gosma import RayMixture, SceneMixture, align_mixtures, distance, squared_norm
 
 
@@ -14,6 +17,26 @@ def whole(turn: Tensor, turn_half: float, place: Tensor, place_half: float) -> B
     return Boxes(
         turn.reshape(1, 3), turn.new_full((1,), turn_half), place.reshape(1, 3), turn.new_full((1, 3), place_half)
     )
+
+
+def test_no_pose_of_a_box_turns_a_direction_by_more_than_its_uncertainty() -> None:
+    generator = torch.Generator().manual_seed(0)
+    turn, place, points = (torch.randn(k, 3, generator=generator).double() for k in (1000, 1000, 20))
+    halves = 10 ** (-2 * torch.rand(1000, 1, generator=generator).double()) * torch.tensor([[0.3, 1.0, 0.6]]).double()
+    boxes = Boxes(turn, halves[:, 0], 3 * place, halves)
+    turning, moving = rotation_uncertainty(boxes), translation_uncertainty(boxes, points)
+    towards = points - boxes.place.unsqueeze(1)
+    largest = torch.zeros(2)
+    for trial in range(32):
+        turned, moved = (2 * torch.rand(1000, 3, generator=generator).double() - 1 for _ in range(2))
+        if trial % 2:  # corners
+            turned, moved = turned.sign(), moved.sign()
+        rotation = roma.rotvec_to_rotmat(boxes.turn + turned * boxes.turn_half.unsqueeze(-1))
+        angles = angle_between(towards @ rotation.mT, towards @ boxes.rotation.mT) / turning.unsqueeze(-1)
+        shifts = angle_between(points - (boxes.place + moved * halves).unsqueeze(1), towards) / moving
+        largest = torch.maximum(largest, torch.stack([angles.max(), shifts.max()]))
+    assert (largest <= 1).all()
+    assert (largest > 0.9).all()  # bounds far above everything would pass as well
 
 
 def planted_mixtures() -> tuple[SceneMixture, RayMixture, Tensor, Tensor]:
@@ -52,3 +75,24 @@ def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() 
         lowest = min(lowest, float(values.min()) / norm + 1)
     assert found.bound <= lowest
     assert found.value <= lowest  # no grid point beats it
+
+
+def test_gopac_finds_the_planted_inliers_with_a_certificate_that_a_grid_confirms() -> None:
+    problem = plant(1, 7, seed=3, outliers2d=2, outliers3d=2)
+    rays, points = problem.bearings[0], problem.points3d[0]
+    centre = camera_centre(*problem.pose)[0]
+    turn = roma.rotmat_to_rotvec(problem.rotation)[0]
+    domain = whole(turn + 0.05, 0.15, centre + 0.05, 0.15)
+    found = maximise_inliers(rays, points, domain, angle=0.01, max_boxes=3_000_000)
+    assert found.rotation is not None
+    assert found.value == found.bound
+    assert found.value >= 7
+    assert int(within(rays, points, found.rotation, found.place, 0.01).any(-1).sum()) == found.value
+    steps = torch.linspace(-1, 1, 7).double()
+    grid = torch.cartesian_prod(steps, steps, steps)
+    most = 0
+    for shift in grid:
+        directions = torch.nn.functional.normalize(points - domain.place[0] - 0.15 * shift, dim=-1)
+        cosine = (rays @ roma.rotvec_to_rotmat(domain.turn + 0.15 * grid)) @ directions.mT
+        most = max(most, int((cosine >= math.cos(0.01)).any(-1).sum(-1).max()))
+    assert most <= found.value

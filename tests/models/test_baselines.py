@@ -12,7 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from bpnp import Batch, BPnPNet
 from bpnp.loops.parallel import NEVER
 from bpnp.metrics import rotation_error, translation_error
-from bpnp.models.baselines import GOSMA, Hungarian, RandomRansac, SoftPOSIT
+from bpnp.models.baselines import GOPAC, GOSMA, Hungarian, RandomRansac, SoftPOSIT
 from bpnp.models.baselines.blind_p3p import probability_of_true_triple
 from bpnp.models.baselines.hungarian import hungarian
 from bpnp.models.baselines.single_problem import SingleSolver
@@ -23,6 +23,7 @@ QUICK: dict[str, SingleSolver] = {
     "softposit": SoftPOSIT(max_steps=25, time_limit=None),
     "random_ransac": RandomRansac(max_hypotheses=512, time_limit=None),
     "gosma": GOSMA(max_boxes=400, batch=64, time_limit=None),
+    "gopac": GOPAC(max_boxes=400, time_limit=None, angle=0.02),
 }
 each_solver = pytest.mark.parametrize("name", QUICK)
 

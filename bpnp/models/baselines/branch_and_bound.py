@@ -14,6 +14,12 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from bpnp.geometry import bearings
+from bpnp.loops.parallel import Deadline
+from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
+
+DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
+
 
 class Boxes(NamedTuple):
     """Centres and half sides. The cubes of rotation vectors cover the ball of radius pi."""
@@ -31,23 +37,74 @@ class Boxes(NamedTuple):
         return Boxes(*(values[index] for values in self))
 
 
+class Found(NamedTuple):
+    """The best pose, camera = R (p - c), and its value; `certified`: no pose of the domain is better than `bound`, and
+    this one is as good, or within the gap that is asked for."""
+
+    rotation: Float[Tensor, "3 3"] | None
+    place: Float[Tensor, "3"]
+    value: float
+    bound: float
+    boxes: int
+    certified: bool
+
+
+class BranchAndBound(SingleSolver):
+    """Searches the camera centre in a cube around the scene's centre and the rotation everywhere."""
+
+    def __init__(self, max_boxes: int | None, time_limit: float | None) -> None:
+        super().__init__(time_limit)
+        self.max_boxes = math.inf if max_boxes is None else max_boxes
+
+    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
+        centre = problem.points3d.mean(0)
+        radius = root_mean_square((problem.points3d - centre).norm(dim=-1))
+        points = (problem.points3d - centre) / radius
+        away = weak_perspective_distance(problem.points2d, points)
+        zero = points.new_zeros(1, 3)
+        domain = Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * away))
+        found = self.search(bearings(problem.points2d), points, domain, away, deadline)
+        if found.rotation is None:
+            return Answer(iterations=found.boxes)
+        translation = -found.rotation @ (radius * found.place + centre)
+        return Answer((found.rotation, translation), found.boxes, found.value, found.certified)
+
+    def search(
+        self, rays: Float[Tensor, "m 3"], points: Float[Tensor, "n 3"], domain: Boxes, away: float, deadline: Deadline
+    ) -> Found:
+        """The best pose for a scene of root mean square radius 1 at the origin; its value is the pose's residual.
+
+        away: weak-perspective distance of the camera.
+        """
+        raise NotImplementedError
+
+
+def root_mean_square(distances: Float[Tensor, " k"]) -> float:
+    """Root mean square; 1 where it is zero."""
+    value = float(distances.square().mean().sqrt())
+    return value if value > 0 and math.isfinite(value) else 1.0
+
+
 def best_first(
     boxes: Boxes,
     bounds: Float[Tensor, " b"],
-    expand: Callable[[Boxes], tuple[Boxes, Float[Tensor, " c"], float]],
+    expand: Callable[[Boxes], tuple[Boxes, Float[Tensor, " c"], int | float]],
     *,
     at_once: int,
     until: Callable[[int], bool],
+    small: Callable[[Boxes], Bool[Tensor, " b"]] | None = None,
 ) -> tuple[float, int]:
     """Expand the `at_once` boxes of highest bound together until no box can hold anything better than was found.
 
     bounds: no pose of a box is better. expand: boxes to their children, the bounds of these, and the value that a bound
-    must exceed for its box to be kept. until: whether to stop after so many children.
+    must exceed for its box to be kept. until: whether to stop after so many children. small: which boxes are kept for
+    their bound but not expanded.
     Returns the highest bound of the boxes that are left, -inf if none is, and the number of children.
     """
-    done = 0
+    done, aside = 0, bounds.new_tensor([-math.inf])
     while len(bounds) and not until(done):
-        chosen = bounds.topk(min(at_once, len(bounds))).indices
+        # One at a time: of equal bounds the oldest.
+        chosen = bounds.topk(min(at_once, len(bounds))).indices if at_once > 1 else bounds.argmax().unsqueeze(0)
         rest = torch.ones_like(bounds, dtype=torch.bool)
         rest[chosen] = False
         children, upper, least = expand(boxes.pick(chosen))
@@ -56,7 +113,11 @@ def best_first(
         bounds = torch.cat([bounds[rest], torch.minimum(upper, bounds.max())])
         promising = bounds > least
         boxes, bounds = boxes.pick(promising), bounds[promising]
-    return float(bounds.max()) if len(bounds) else -math.inf, done
+        if small is not None:
+            final = small(boxes)
+            aside = torch.cat([aside, bounds[final]])
+            boxes, bounds = boxes.pick(~final), bounds[~final]
+    return float(torch.cat([aside, bounds]).max()), done
 
 
 def rotation_uncertainty(boxes: Boxes) -> Float[Tensor, " b"]:

@@ -16,19 +16,20 @@ from torch import Tensor
 from torch.nn.functional import normalize, one_hot
 
 from bpnp.checks import check_positive
-from bpnp.geometry import angle_between, bearings, retract
+from bpnp.geometry import angle_between, retract
 from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.models.baselines.branch_and_bound import (
     Boxes,
+    BranchAndBound,
+    Found,
     best_first,
     distance_range,
+    root_mean_square,
     rotation_uncertainty,
     split,
     translation_uncertainty,
 )
-from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
 
-DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
 CLOSEST = 0.5  # distance of a camera centre from the scene's, weak-perspective distances
 GAP = 0.1  # share of the image mixture's squared norm by which the answer may miss the optimum
 POLISH_STEPS = 50
@@ -60,25 +61,12 @@ class SceneMixture(NamedTuple):
         return normalize(towards, dim=-1), towards.square().sum(-1) / self.variances + 1
 
 
-class Alignment(NamedTuple):
-    """The best pose, camera = R (p - c), and its distance; `certified`: no pose of the domain is nearer than `bound`,
-    and this one is within the gap that is asked for."""
-
-    rotation: Float[Tensor, "3 3"]
-    place: Float[Tensor, "3"]
-    value: float
-    bound: float
-    boxes: int
-    certified: bool
-
-
-class GOSMA(SingleSolver):
+class GOSMA(BranchAndBound):
     """Branch and bound on the distance between the mixtures of both point sets; no matching, no initial pose.
 
-    The camera centre is searched in a cube around the scene's centre, no closer to it than CLOSEST, and the rotation
-    everywhere. `residual` of the pose is its distance as a share of the image mixture's squared norm (0 for mixtures
-    that coincide); `converged` is the certificate that no pose of the domain is better by more than GAP. It certifies
-    the mixtures' alignment, which need not be that of the points.
+    Camera centres are no closer to the scene's centre than CLOSEST. `residual` of the pose is its distance as a share
+    of the image mixture's squared norm (0 for mixtures that coincide); `converged` is the certificate that no pose of
+    the domain is better by more than GAP. It certifies the mixtures' alignment, which need not be that of the points.
 
     Args:
         cluster2d: largest angle from an image cluster's mean, in root mean square angles of all rays to theirs.
@@ -99,35 +87,21 @@ class GOSMA(SingleSolver):
         max_boxes: int | None = None,
         time_limit: float | None = 30.0,
     ) -> None:
-        super().__init__(time_limit)
+        super().__init__(max_boxes, time_limit)
         check_positive(cluster2d=cluster2d, cluster3d=cluster3d)
         self.cluster2d, self.cluster3d, self.batch = cluster2d, cluster3d, batch
-        self.max_boxes = math.inf if max_boxes is None else max_boxes
 
-    def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        centre = problem.points3d.mean(0)
-        radius = root_mean_square((problem.points3d - centre).norm(dim=-1))
-        points, rays = (problem.points3d - centre) / radius, bearings(problem.points2d)
-        away = weak_perspective_distance(problem.points2d, points)
+    def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
         angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
-        zero = points.new_zeros(1, 3)
-        found = align_mixtures(
+        return align_mixtures(
             scene_mixture(points, self.cluster3d),
             ray_mixture(rays, self.cluster2d * angle),
-            Boxes(zero, points.new_full((1,), math.pi), zero, points.new_full((1, 3), DOMAIN * away)),
+            domain,
             closest=CLOSEST * away,
             batch=self.batch,
             max_boxes=self.max_boxes,
             deadline=deadline,
         )
-        translation = -found.rotation @ (radius * found.place + centre)
-        return Answer((found.rotation, translation), found.boxes, found.value, found.certified)
-
-
-def root_mean_square(distances: Float[Tensor, " k"]) -> float:
-    """Root mean square; 1 where it is zero."""
-    value = float(distances.square().mean().sqrt())
-    return value if value > 0 and math.isfinite(value) else 1.0
 
 
 def align_mixtures(
@@ -140,7 +114,7 @@ def align_mixtures(
     batch: int = 512,
     max_boxes: int | float = math.inf,
     deadline: Deadline = NEVER,
-) -> Alignment:
+) -> Found:
     """Smallest d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
 
     The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the less certain;
@@ -186,7 +160,7 @@ def align_mixtures(
     value, rotation, place = best
     certified = -left >= value - gap * norm
     bound = value - gap * norm if certified else -left
-    return Alignment(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
+    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
 
 
 def descend(

@@ -1,0 +1,119 @@
+"""Random sample consensus on candidate matches for a whole batch at once, on its device: one pose a sample.
+
+No shape depends on the data: the minimal problems alone are solved on the CPU, of all samples at once.
+"""
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from bpnp.geometry import bearings, retract
+from bpnp.robust.matches import Matches, distinct_triples, residuals, truncated_scores
+from bpnp.robust.minimal_solvers import poses_of_triples, take
+
+SMALLEST_POOL = 16  # matches of largest weight, from which the first triples of a growing pool are drawn
+SUBSET = 512  # matches of largest weight, on which all hypotheses are scored; with 256, poses are lost at 10 % inliers
+SHORTLIST = 256  # hypotheses that are then scored on all matches
+REFINED = 16  # hypotheses that are refined locally on the subset
+LOCAL_STEPS, FINAL_STEPS = 4, 6  # Gauss-Newton steps of these, and of the best one on all matches
+DAMPING = 1e-9  # share of the Hessian's mean diagonal
+
+
+def growing_pool(count: Int[Tensor, " b"], draws: int) -> Float[Tensor, "b d"]:
+    """Size of the pool of each draw: it grows geometrically from SMALLEST_POOL to `count`."""
+    progress = (torch.arange(draws, device=count.device, dtype=torch.float64) + 0.5) / draws
+    last = count.clamp(min=3).unsqueeze(-1).double()
+    first = last.clamp(max=SMALLEST_POOL)
+    return (first * (last / first) ** progress).ceil()
+
+
+def consensus(
+    matches: Matches, threshold: float, hypotheses: int, seed: int
+) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
+    """Pose [R | t] of lowest truncated squared reprojection error sum_i min(r_i^2, threshold^2), and `hypotheses`.
+
+    matches: as `bpnp.robust.matches.normalised` gives them, most probable first. A point may be in many matches.
+    hypotheses: triples for each sample. They come from a pool of the most probable matches that grows to all matches
+    (PROSAC; Chum, Matas, CVPR 2005), `p3p` solves each, all poses are scored (MSAC; a point behind the camera is an
+    outlier), and the best are refined. A last fit uses Cauchy's loss with a scale of four times the median squared
+    residual of the inliers (95 % efficient for normal noise), which reduces the influence of wrong matches below the
+    threshold. Computed in float64 but for the scores. A sample without a pose may hold any, or NaN.
+    """
+    threshold2 = threshold**2
+    subset = Matches(*(values[:, :SUBSET] for values in matches))
+    triples = distinct_triples(growing_pool(matches.real.sum(-1), hypotheses), seed)
+    # Fewer than three matches: repeated ones, no pose.
+    triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
+    rays, scene = (
+        take(v, triples).unflatten(1, (hypotheses, 3)) for v in (bearings(matches.points2d), matches.points3d)
+    )
+    poses = poses_of_triples(rays, scene)
+    poses = _best(poses, truncated_scores(poses, subset, threshold2), SHORTLIST)
+    poses = _best(poses, truncated_scores(poses, matches, threshold2), REFINED)
+    poses = refine_locally(poses, subset, threshold2, LOCAL_STEPS)
+    pose = _best(poses, truncated_scores(poses, matches, threshold2), 1)
+    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS)
+    squared, inlier, *_ = residuals(pose, matches, threshold2)
+    median = torch.where(inlier, squared, torch.nan).nanmedian(-1).values.nan_to_num(threshold2)
+    pose = refine_locally(pose, matches, threshold2, FINAL_STEPS, cauchy=4 * median)
+    return pose.squeeze(1), matches.real.sum(-1).fill_(hypotheses)
+
+
+def _best(poses: Float[Tensor, "b c 3 4"], score: Float[Tensor, "b c"], size: int) -> Float[Tensor, "b s 3 4"]:
+    """The poses of lowest score; NaN, that of a slot without a pose, counts as the highest."""
+    return take(poses, score.topk(min(size, score.shape[1]), largest=False).indices)
+
+
+def refine_locally(
+    poses: Float[Tensor, "b c 3 4"],
+    matches: Matches,
+    threshold2: float,
+    steps: int,
+    *,
+    cauchy: Float[Tensor, "b c"] | None = None,
+) -> Float[Tensor, "b c 3 4"]:
+    """Reduce sum_i min(r_i^2, threshold2), or with Cauchy's loss sum_i min(s log(1 + r_i^2 / s), s log(1 + t / s)).
+
+    Each step is a Gauss-Newton step on the inliers of the current pose, weighted by the derivative of the loss in r^2.
+    Poses are refined independently, and the best one met on the way is returned, the initial pose included.
+
+    threshold2: squared reprojection error t of an inlier. cauchy: scale s, squared residual units; None for r^2.
+    """
+    scale = None if cauchy is None else cauchy.clamp(min=1e-24).unsqueeze(-1)
+    best = poses
+    lowest = torch.full(poses.shape[:2], torch.inf, dtype=poses.dtype, device=poses.device)
+    damping = DAMPING * torch.eye(6, dtype=poses.dtype, device=poses.device)
+    for _ in range(steps + 1):
+        squared, inlier, residual, camera = residuals(poses, matches, threshold2)
+        loss, weight = torch.where(inlier, squared, threshold2), inlier.to(squared.dtype)
+        if scale is not None:
+            loss, weight = scale * (loss / scale).log1p(), weight / (1 + loss / scale)
+        score = loss.mul(matches.real.unsqueeze(1)).sum(-1)
+        better = score < lowest
+        best, lowest = torch.where(better[..., None, None], poses, best), torch.where(better, score, lowest)
+        jacobian = _jacobian(camera, camera - poses[..., None, :, 3], inlier)
+        residual = torch.where(inlier.unsqueeze(-1), residual, 0)
+        weighted = jacobian * weight.repeat(1, 1, 2).unsqueeze(-2)
+        hessian = weighted @ jacobian.mT
+        gradient = weighted @ residual.mT.flatten(-2).unsqueeze(-1)
+        hessian = hessian + damping * (1e-9 + hessian.diagonal(dim1=-2, dim2=-1).mean(-1)[..., None, None])
+        step = -torch.cholesky_solve(gradient, torch.linalg.cholesky_ex(hessian).L).squeeze(-1)
+        rotation, translation = retract(step, poses[..., :3], poses[..., 3])
+        poses = torch.cat([rotation, translation.unsqueeze(-1)], -1)
+    return best
+
+
+def _jacobian(
+    camera: Float[Tensor, "b c k 3"], turned: Float[Tensor, "b c k 3"], inlier: Bool[Tensor, "b c k"]
+) -> Float[Tensor, "b c 6 2*k"]:
+    """Derivatives of x/z, then of y/z, by the step (w, s) of `retract`; zero for outliers.
+
+    camera: y = R p + t, which a step moves by w x R p + s. turned: R p.
+    """
+    inverse = torch.where(inlier, 1 / camera[..., 2], 0)
+    u, v = camera[..., 0] * inverse, camera[..., 1] * inverse
+    a, b, c = (turned * inverse.unsqueeze(-1)).unbind(-1)
+    zero = torch.zeros_like(u)
+    along_x = torch.stack([-u * b, c + u * a, -b, inverse, zero, -u * inverse], -2)
+    along_y = torch.stack([-c - v * b, v * a, a, zero, inverse, -v * inverse], -2)
+    return torch.cat([along_x, along_y], -1)
