@@ -305,7 +305,8 @@ def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
         doubt = f", but a better rotation was missed with a probability of up to {number(missed)}"
     else:  # what costs more is asked only where the verdict depends on it
         matches = _matches(sight, best)
-        known, strain = how_well_known(*matches), strain_of(*matches, sight.image.bearings)
+        some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
+        known, strain = how_well_known(*matches), strain_of(*(x[some] for x in matches), sight.image.bearings)
         if strain > sight.reach:
             doubt = f", but a camera other than the given one, by {strain:.2g} pixels, explains the points better"
         elif not math.isfinite(known.bound):

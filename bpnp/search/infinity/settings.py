@@ -18,6 +18,7 @@ class InfinitySettings:
     contests: share of the nats of the best rotation that one of a sample of the points has to have to be fitted to all.
     power: share of the true matches that give their rotation. turns: image points that are tried, at most.
     rougher: of the noise that is searched for, how much more matches may show before a larger one is.
+    strained: matches, at most, that are asked whether another camera explains them better.
     least_share: of the image points that a rotation explains, for which those that were tried have to be enough
         where chance explains all that was found.
     """
@@ -37,6 +38,7 @@ class InfinitySettings:
     power: float = 0.9
     turns: int = 200
     rougher: float = 1.2
+    strained: int = 1000
     least_share: float = 0.25
     zoom: float = 1.02
     zoom_noise: float = 3.0
