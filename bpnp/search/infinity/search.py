@@ -304,9 +304,10 @@ def _judged(found: list[Rotated], sight: Sight, turns: int) -> RotationResult:
     elif missed > rule.missed:
         doubt = f", but a better rotation was missed with a probability of up to {number(missed)}"
     else:  # what costs more is asked only where the verdict depends on it
-        matches = _matches(sight, best)
+        seen, bearings, pixel = _matches(sight, best)
         some = np.linspace(0, len(hit) - 1, min(len(hit), sight.settings.strained)).astype(np.int64)
-        known, strain = how_well_known(*matches), strain_of(*(x[some] for x in matches), sight.image.bearings)
+        known = how_well_known(seen, bearings, pixel)
+        strain = strain_of(seen[some], bearings[some], pixel[some], sight.image.bearings)
         if strain > sight.reach:
             doubt = f", but a camera other than the given one, by {strain:.2g} pixels, explains the points better"
         elif not math.isfinite(known.bound):

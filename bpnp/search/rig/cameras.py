@@ -28,7 +28,8 @@ from bpnp.search.scene import Scene
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 WIDE = 60.0  # smallest believable scales, at which proposals are compared: a pose of one camera is off in another
-STEPS, WEIGHED = 9, 7  # Gauss-Newton steps, each at a smaller scale, and the last of them that are weighed
+STEPS, AGAIN = 9, 2  # scales, each smaller than the one before, and Gauss-Newton steps at each
+WEIGHED = 7  # scales, the last ones, at which poses are weighed
 SAME_CENTRE = 1e-6  # of the farthest centre from the origin of the rig
 
 
@@ -84,7 +85,7 @@ class Rig:
     def refined(self, rotation: Array, translation: Array) -> Iterator[tuple[Array, Array, float, float]]:
         """The optimum beside a pose at ever smaller scales, radians, with that scale and the number of matches."""
         middle = self.sets[0].middle
-        for scale in np.geomspace(WIDE, 1.0, STEPS) * self.floor:
+        for scale in np.geomspace(WIDE, 1.0, STEPS).repeat(AGAIN) * self.floor:
             information, gradient, count = np.zeros((self.unknowns, self.unknowns)), np.zeros(self.unknowns), 0.0
             for turn, linear in self.linearised(rotation, translation, scale):
                 rows = linear.jacobian @ turn
@@ -145,7 +146,7 @@ class Rig:
         number of matches."""
         ends = []
         for rotation, translation in zip(rotations, translations, strict=True):
-            last = list(self.refined(rotation, translation))[-WEIGHED:]
+            last = list(self.refined(rotation, translation))[AGAIN - 1 :: AGAIN][-WEIGHED:]
             if last:
                 ends.append(min(((*self.alarms(*end[:3]), *end) for end in last), key=lambda weighed: weighed[0]))
         if not ends:
