@@ -188,30 +188,6 @@ def test_the_list_has_every_benchmark_and_a_sentence_for_each(monkeypatch, capsy
     assert "usage: python -m benchmarks stars" in capsys.readouterr().out
 
 
-FIGURES = {
-    "problems": 20, "seed": 9, "rotation_q_deg": [0.1, 0.2, 0.4], "right": 0.95, "confident": 0.5,
-    "confident_and_wrong": 0, "cpu_seconds": 1.0, "median_cpu_seconds": 1.0,
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(
-    ("change", "differs"),
-    [
-        ({}, False),
-        ({"cpu_seconds": 9.0}, False),
-        ({"right": 0.9}, False),
-        ({"right": 0.85}, True),
-        ({"confident": 0.6}, True),
-        ({"rotation_q_deg": [0.1, 0.25, 0.9]}, False),
-        ({"rotation_q_deg": [0.1, 0.35, 0.4]}, True),
-        ({"confident_and_wrong": 1}, True),
-        ({"seed": 8}, True),
-    ],
-)
-def test_results_differ_beyond_the_tolerance(change: dict[str, object], differs: bool) -> None:
-    assert bool(results.differences(FIGURES | change, FIGURES)) == differs
-
-
 def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made, here, guide, file = SimpleNamespace(), results, tmp_path / "guide.md", tmp_path / "results.json"
     rows = [here.Row("leds", "two rings", lambda *_: [made.outcome] * 2, (2, 1), 3.0)]
