@@ -2,8 +2,9 @@
 
 Annealing on clusters loses a pose among many outliers even if it begins there: at scales at which 64 clusters stand for
 a thousand points the true pose is no optimum. At a scale of a few hundredths of the view it is one, in a basin so
-narrow that it takes some 10^5 starts to hit within the range of a prior. They are affordable because each is only
-looked up, not annealed: a point that falls at x adds
+narrow that it takes some 10^5 starts to hit within the range of a prior; at a coarser one, where chance does not fill
+the view yet, thousands do. They are affordable because each is only looked up, not annealed: a point that falls at x
+adds
 
     log(w + (1 - w) d_s(x) / d_b(x)) - its mean near x,
 
