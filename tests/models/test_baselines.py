@@ -23,7 +23,7 @@ QUICK: dict[str, SingleSolver] = {
     "softposit": SoftPOSIT(max_steps=25, time_limit=None),
     "random_ransac": RandomRansac(max_hypotheses=512, time_limit=None),
     "gosma": GOSMA(max_boxes=400, batch=64, time_limit=None),
-    "gopac": GOPAC(max_boxes=400, time_limit=None, angle=0.02),
+    "gopac": GOPAC(max_boxes=400, time_limit=None, angle=0.05),
 }
 each_solver = pytest.mark.parametrize("name", QUICK)
 
