@@ -36,6 +36,7 @@ def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directo
         job_type="test",
         config={"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written},
         mode=mode,
+        reinit="create_new",  # a run that is open goes on
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
     )
     try:

@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+import wandb
 from report_data import write_run
 from small_data import is_written
 
@@ -27,8 +28,10 @@ def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:
 
 
 def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Path) -> None:
-    results = write_run(tmp_path, 20, 0)
+    results, open_run = write_run(tmp_path, 20, 0), wandb.init(mode="offline", dir=str(tmp_path))
     run = log_results(tmp_path / "test", name="planted", directory=tmp_path / "wandb")
+    assert wandb.run is open_run  # of the user, who goes on with it
+    open_run.finish()
     assert run.name.startswith("offline-run-")
     media = run / "files" / "media"
 
