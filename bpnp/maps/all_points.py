@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.maps.localize import Region, in_picture, problem_near, with_ids
-from bpnp.maps.views import Array, Cones
+from bpnp.loops.parallel import one_blas_thread
+from bpnp.maps.localize import Photo, in_picture, problem_near, with_ids
+from bpnp.maps.views import Cones
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.rivals import against_rivals
@@ -19,18 +19,16 @@ from bpnp.solving.solution import Solution
 
 
 @one_blas_thread
-def on_all_points(
-    solution: Solution, every: Region, keypoints: Array, seed: int, deadline: Deadline
-) -> Solution | None:
-    """A confident solution fitted to all points of a region that its camera sees, and judged by them; None where they
-    explain the keypoints no better."""
-    seen = in_picture(problem_near(every, keypoints, solution.camera, None), solution)
-    cones = Cones(every.cones.axes[seen], every.cones.cosines[seen])
-    region = replace(every, points3d=every.points3d[seen], point_ids=every.point_ids[seen], cones=cones)
+def on_all_points(solution: Solution, photo: Photo) -> Solution | None:
+    """A confident solution fitted to all points of a photo's place that its camera sees, and judged by them; None where
+    they explain the keypoints no better."""
+    place, seen = photo.place, in_picture(photo.problem, solution)
+    cones = Cones(place.cones.axes[seen], place.cones.cosines[seen])
+    region = replace(place, points3d=place.points3d[seen], point_ids=place.point_ids[seen], cones=cones)
     if len(region.points3d) < len(solution.matches):
         return None
-    problem = problem_near(region, keypoints, solution.camera, None)
-    scene = Scene(problem.sets, seed, DEFAULT, deadline)
+    problem = problem_near(region, photo.keypoints, photo.camera, None)
+    scene = Scene(problem.sets, photo.seed, DEFAULT, photo.deadline)
     rotation, shift = solution.rotation, solution.translation + solution.rotation @ problem.origin
     scale = max(solution.stats.residual, problem.sets.image.scales[0])
     ends = polished(scene, rotation[None], shift[None], scale)
@@ -45,7 +43,7 @@ def on_all_points(
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     rule = DEFAULT.evidence
     same = problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]
-    if deadline.passed() or not (better and same):
+    if photo.deadline.passed() or not (better and same):
         return None
     fitted = finished(problem, result, solution.seconds, None)
     stats = replace(fitted.stats, iterations=solution.stats.iterations)

@@ -1,13 +1,16 @@
 """The pose of a photo from its keypoints without descriptors near one view of a map, and which of several is best."""
 
 import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import camera_from
+from bpnp.loops.parallel import Deadline
 from bpnp.maps.views import Cones, View
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.settings import DEFAULT
@@ -66,6 +69,24 @@ def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | No
     else:
         solution = solutions_of({0: problem_near(region, keypoints, camera, expected)}, options)[0]
     return with_ids(solution, region)
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """What is localised, among which points, and near which views of the map, by their rank for image points (k, 2);
+    `deadline` and `seed` are of the search."""
+
+    keypoints: Array
+    camera: Any
+    place: Region
+    regions: Callable[[NDArray[np.float64]], Iterable[Region]]
+    seed: int = 0
+    deadline: Deadline = Deadline()
+
+    @cached_property
+    def problem(self) -> Problem:
+        """Of the keypoints and all points of the place."""
+        return problem_near(self.place, self.keypoints, self.camera, None)
 
 
 def with_ids(solution: Solution, region: Region) -> Solution:

@@ -25,6 +25,7 @@ from bpnp.maps.localize import (
     LIKELY,
     LONGER,
     PROMISING,
+    Photo,
     Region,
     among_all,
     counted,
@@ -34,7 +35,7 @@ from bpnp.maps.localize import (
 )
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
 from bpnp.maps.ranking import RUNG, STEP, Pictures, pictures_of_views, places_first, scores_of_views
-from bpnp.maps.twins import Photo, without_twins
+from bpnp.maps.twins import without_twins
 from bpnp.maps.views import Array, Cones, View, viewing_cones
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import check_inside, pixels_from, source_from
@@ -270,14 +271,14 @@ class SceneMap:
             solution = near(place.lens, options, region, prior)
             if solution.verdict == "confident":
                 every = self._region(place.view, np.arange(len(self.points3d)))
+                regions = partial(self._regions, views, solution.camera)
+                photo = Photo(used, solution.camera, every, regions, seed, deadline)
                 if isinstance(lens, Camera):
-                    fitted = on_all_points(solution, every, used, seed, deadline)
+                    fitted = on_all_points(solution, photo)
                     solution = solution if fitted is None else counted(fitted, tries)
                 if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
-                    regions = partial(self._regions, views, solution.camera)
-                    among = every if views is None else region
-                    photo = Photo(used, solution.camera, among, regions, seed, deadline)
-                    search = partial(near, solution.camera, options)
+                    search = partial(near, photo.camera, options)
+                    photo = photo if views is None else replace(photo, place=region)
                     solution = without_twins(photo, solution, met, search)
                 best = [(place, solution)]
                 break

@@ -6,16 +6,15 @@ other points finds for the image points that it explains.
 """
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.distinct_poses import same_pose, turned_by
-from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.maps.localize import Region, in_picture, problem_near
+from bpnp.loops.parallel import one_blas_thread
+from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array
 from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
@@ -58,24 +57,11 @@ class TwinSettings:
 TWINS = TwinSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class Photo:
-    """What is localised, among which points, and near which views of the map, by their rank for image points (k, 2);
-    `deadline` and `seed` are of the search."""
-
-    keypoints: Array
-    camera: Any
-    place: Region
-    regions: Callable[[NDArray[np.float64]], Iterable[Region]]
-    seed: int = 0
-    deadline: Deadline = Deadline()
-
-
 @one_blas_thread
 def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tuple[float, Candidate] | None:
     """The different pose that explains the image points of a solution best, and by how many decades it explains all of
     them worse; None if there is none. met: solutions with the points of other views."""
-    problem, rule = problem_near(photo.place, photo.keypoints, photo.camera, None), DEFAULT.evidence
+    problem, rule = photo.problem, DEFAULT.evidence
     sets, scale = problem.sets, max(solution.stats.residual, problem.sets.image.scales[0])
     best = solution.rotation, solution.translation + solution.rotation @ problem.origin
     repeated, _ = repeated_poses(sets, *best, scale, rule)
@@ -118,7 +104,7 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
     order of the rank that these image points give to the views."""
     places = np.flatnonzero(np.isin(problem.usable, solution.matches[:, 0]))
     explained, looks = photo.keypoints[problem.usable[places]], 0
-    seen = _seen(photo, problem, solution)
+    seen = _seen(photo, solution)
     rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
     for region in photo.regions(explained) if len(explained) >= TWINS.fewest else ():
         if looks == TWINS.looks or photo.deadline.passed():
@@ -160,7 +146,7 @@ def without_twins(
         return solution
     behind, twin = rival
     if again and behind <= -DEFAULT.evidence.lead:
-        seen = _seen(photo, problem_near(photo.place, photo.keypoints, photo.camera, None), twin)
+        seen = _seen(photo, twin)
         region = max(photo.regions(photo.keypoints), key=lambda one: int(np.isin(one.point_ids, seen).sum()))
         distance = float(np.linalg.norm(twin.rotation @ np.median(region.points3d, 0) + twin.translation))
         better = search(region, PosePrior(twin.rotation, twin.translation, TWINS.degrees, TWINS.share * distance))
@@ -173,6 +159,6 @@ def without_twins(
     return replace(solution, verdict="ambiguous", reason=reason, candidates=candidates)
 
 
-def _seen(photo: Photo, problem: Problem, pose: Solution | Candidate) -> NDArray[np.int64]:
+def _seen(photo: Photo, pose: Solution | Candidate) -> NDArray[np.int64]:
     """Ids of the points that a pose sees where the image points are."""
-    return photo.place.point_ids[in_picture(problem, pose)]
+    return photo.place.point_ids[in_picture(photo.problem, pose)]

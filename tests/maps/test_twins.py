@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
-from bpnp.maps.twins import Photo, best_rival
+from bpnp.maps.localize import Photo
+from bpnp.maps.twins import best_rival
 from bpnp.maps.views import View
 
 FOCAL, ALIKE, DIFFERENT = 800.0, 150, 40  # pixels; points of a face
