@@ -26,6 +26,8 @@ from bpnp.search.settings import RasterShape, SearchSettings
 from bpnp.search.starts import Array, GravityPrior, Prior, turned_to
 
 Sides = tuple[WeightedBearings, WeightedPoints]
+SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
+ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Companion(NamedTuple):
@@ -34,10 +36,6 @@ class Companion(NamedTuple):
     scene: "Scene"
     turn: Array
     shift: Array
-
-
-SHIFT_ALONG = 5.0  # spreads: what a shift along the view counts against one across it, at most 1
-ON_A_LINE = 1e-6  # second singular value over the first, below which points lie on a line
 
 
 class Scene:
@@ -58,6 +56,7 @@ class Scene:
         self.rasters: dict[tuple[RasterShape, float], Raster] = {}
         self.companions: list[Companion] = []
         self._tiles: dict[int, tuple[Tiles, WeightedPoints]] = {}
+        self._points: dict[int, WeightedPoints] = {}
         self.rng = np.random.default_rng(seed)
         in_bulk = _in_bulk(points3d, settings.bulk)
         bulk = points3d[in_bulk]
@@ -123,6 +122,12 @@ class Scene:
     def sides(self, bearings: int | None = None, points: int | None = None) -> Sides:
         """All points of both sides, or so many of them."""
         return kernel_sides(self.image.at(slice(bearings)), self.seen.at(slice(points)), self.settings.facing)
+
+    def seen_points(self, count: int) -> WeightedPoints:
+        """So many of the points, as they are looked up; kept."""
+        if count not in self._points:
+            self._points[count] = self.sides(points=count)[1]
+        return self._points[count]
 
     def tiles(self, bearings: int | None = None) -> tuple[Tiles, WeightedPoints]:
         """All points, and all bearings or so many of them in tiles; both are kept."""

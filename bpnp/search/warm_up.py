@@ -34,6 +34,6 @@ def warm_up() -> None:
     scene = Scene(sets, 0, DEFAULT)
     start = Candidates.unscored(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
     run_batch(scene, start, DEFAULT.coarse, start)
-    raster, (_, seen) = raster_of(scene, DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale), scene.sides()
-    looked_up(scene, start, DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale, 50, 1)
-    best_shifts(start, raster, seen)
+    looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale
+    looked_up(scene, start, *looks, POINTS, 1)
+    best_shifts(start, raster_of(scene, *looks), scene.seen_points(POINTS))

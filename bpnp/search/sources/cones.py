@@ -30,7 +30,7 @@ def within_cones(scene: Scene, rule: RasterSearch) -> Candidates:
     """Distinct poses from starts within the cones of the points, of which there must be some."""
     starts = drawn_in_cones(scene, rule.draws.starts)
     raster = raster_of(scene, replace(rule.raster, cells=scene.settings.cones.aim_cells), rule.narrowing.first_scale)
-    points = scene.sides(points=rule.screens.points[0])[1]
+    points = scene.seen_points(rule.screens.points[0])
     score, shift = np.empty(len(starts), np.float32), np.empty((len(starts), 2), np.float32)
 
     def aim(i: int, j: int) -> None:

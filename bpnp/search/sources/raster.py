@@ -27,7 +27,7 @@ from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
 from bpnp.search.kernels.raster import Raster, add_up
-from bpnp.search.scene import Companion, Scene
+from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
 from bpnp.search.starts import PosePrior, Prior, draw_poses
 
@@ -152,14 +152,14 @@ def looked_up(
     """The `kept` poses under which so many points fall best on the bearings, of all companions too, best first, and
     their places; of `family` in a row the best one only."""
     score = np.zeros(len(poses), np.float32)
-    cameras = [Companion(scene, np.eye(3, dtype=np.float32), np.zeros(3, np.float32)), *scene.companions]
-    sides = [(raster_of(each.scene, shape, scale), each.scene.sides(points=points)[1]) for each in cameras]
+    cameras = [(scene, poses.rotation, poses.translation)]
+    cameras += [(x.scene, x.turn @ poses.rotation, poses.translation @ x.turn.T + x.shift) for x in scene.companions]
+    views = [(raster_of(one, shape, scale), one.seen_points(points), r, t) for one, r, t in cameras]
 
     def look_up(i: int, j: int) -> None:
-        for (_, turn, shift), (raster, seen) in zip(cameras, sides, strict=True):
+        for raster, seen, rotation, translation in views:
             weight, cell, own = np.empty_like(seen.b), np.empty(len(seen.b), np.int32), np.empty(j - i, np.float32)
-            rotation, translation = turn @ poses.rotation[i:j], poses.translation[i:j] @ turn.T + shift
-            add_up(raster, seen, rotation, translation, own, weight, cell)
+            add_up(raster, seen, rotation[i:j], translation[i:j], own, weight, cell)
             score[i:j] += own
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
