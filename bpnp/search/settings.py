@@ -83,10 +83,10 @@ class Draws:
     few gaps over the width of a basin. A narrower one gets as many as lie as densely, and `least_starts` at least.
     """
 
-    starts: int = 2**17
+    starts: int = 2**16
     wide_deg: float = 12.0
     wide_shift: float = 0.12
-    least_starts: int = 2**15
+    least_starts: int = 2**14
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Screens:
     """Which starts go on: `kept` of them each time that so many 3D `points` are looked up in the raster."""
 
     points: tuple[int, ...] = (300, 5000)
-    kept: tuple[int, ...] = (2**14, 2**11)
+    kept: tuple[int, ...] = (2**13, 2**10)
 
 
 @dataclass(frozen=True)
@@ -236,21 +236,16 @@ class SearchSettings:
     fine: FineStage = FineStage()
     shaking: Shaking = Shaking()
     near: tuple[RasterSearch, ...] = tuple(
-        RasterSearch(
-            Draws(2**16, least_starts=2**14),
-            Screens((100, 1000), (2**13, 2**10)),
-            Narrowing(first, points=600),
-            annealed=12,
-        )
+        RasterSearch(screens=Screens((100, 1000)), narrowing=Narrowing(first, points=600), annealed=12)
         for first in (0.06, 0.03)  # the finer one where keypoints are dense and few points are seen
     )
     beside: RasterSearch = RasterSearch(
         Draws(2**13, 10.0, 0.1, 2**13),
         Screens((50, 300), (2**11, 2**8)),
-        Narrowing(0.08, 0.015, steps=5, copies=16, points=600),
+        Narrowing(0.08, 0.015, points=600),
         annealed=12,
     )
-    proposed: RasterSearch = RasterSearch(screens=Screens(kept=(2**13, 2**10)))
+    proposed: RasterSearch = RasterSearch()
     everywhere: RasterSearch = RasterSearch(
         Draws(2**15), Screens((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
     )
