@@ -12,6 +12,8 @@ from torch import Tensor
 
 from bpnp.geometry import transform
 
+CHUNK = 2**18  # residuals scored at a time: 1 MiB in float32, which stays in the cache of a core
+
 
 def distinct_triples(pool: Float[Tensor, "b d"], seed: int, *, skip: int = 0) -> Int[Tensor, "b d 3"]:
     """Three different indices below the pool size of each draw, uniform and in random order.
@@ -45,9 +47,6 @@ def hashed_uniform(size: int, seed: int, device: torch.device, *, skip: int = 0)
             state = ((state ^ (state >> shift)) * factor) & 0xFFFFFFFF
         state = state ^ (state >> 15)
     return (state + 0.5) / 2.0**32
-
-
-CHUNK = 2**18  # residuals scored at a time: 1 MiB in float32, which stays in the cache of a core
 
 
 class Matches(NamedTuple):

@@ -10,7 +10,7 @@ from scipy.special import stdtrit
 
 from bpnp.cameras import camera_from
 from bpnp.loops.parallel import Clock, Deadline
-from bpnp.search.evidence.uncertainty import ONE_SIGMA
+from bpnp.search.evidence.uncertainty import ONE_SIGMA, crossed
 from bpnp.search.rig.cameras import Pose, Rig
 from bpnp.search.rig.search import search_rig
 from bpnp.search.verdict import SearchResult, no_pose
@@ -118,10 +118,9 @@ def _finished(rig: Rig, problems: Sequence[Problem], result: SearchResult, inlie
 def _about_origin(covariance: Array, middle: Array, shift: Array, scale: float, free: int) -> Array:
     """That of a turn, the translation in units of the rig, and the scale if it is unknown, from that of the shift of
     the middle of the scene in its units and of the logarithm of the scale; with Student's t."""
-    x, y, z = middle
     moved = np.eye(7)
     moved[3:, 3:] *= scale
-    moved[3:6, :3] = scale * np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    moved[3:6, :3] = scale * crossed(middle)
     moved[3:6, 6] = scale * shift
     moved = moved[: len(covariance), : len(covariance)]
     return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)

@@ -62,7 +62,7 @@ def search_by_enumeration(
         return certain is not None
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        radius = rule.radius if sets.floor is None else rule.floors * sets.floor
+        radius = rule.radius_at(sets.floor)
         poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
         return poses, _candidates(poses, annotated, settings, rule) if certain is None else certain
 

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
+from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.point_sets import PointSets, faces
 
 Array = NDArray[np.float64]
@@ -19,7 +20,6 @@ OUTLIERS = 0.3  # share of the image points without a partner that the assignmen
 FEW_PARTNERS = 2  # scene points that may be the partner of each, where the focal length is fitted
 MOST_ZOOM, SAME_ZOOM = 0.2, 0.01  # step of the logarithm, at most; change that is none
 MOST_ROUNDS = 4
-FITTED_POINTS = 400  # image points, about, by which most of these steps are taken
 FITTED_WIDTHS = (4.0, 2.0, 2.0, 1.0, 1.0)  # of the residuals, for steps of a pose with its focal length
 
 
@@ -122,7 +122,7 @@ def with_focal_length(sets: PointSets, rotation: Array, middle: Array, scale: fl
     middle: (3,) of the scene, seen from the camera.
     """
     chosen = sets.image.chosen
-    some = chosen[:: max(len(chosen) // FITTED_POINTS, 1)]
+    some = chosen[:: max(len(chosen) // OtherFocal.bearings, 1)]
     step = _zoomed(sets, some, FITTED_WIDTHS[0] * scale, rotation, middle, 1.0)
     for _ in range(MOST_ROUNDS):
         before = 0.0 if step is None else math.log(step.zoom)

@@ -91,7 +91,7 @@ def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, 
         return None
     free = max(2 * count - sets.fitted, 1.0)
     moved = np.eye(len(covariance))  # the shift of the middle, as that of the origin: v = s + (R m) x w
-    moved[3:POSE, :3] = _crossed(linear.rotation @ (sets.middle + origin))
+    moved[3:POSE, :3] = crossed(linear.rotation @ (sets.middle + origin))
     return np.asarray(float(stdtrit(free, ONE_SIGMA)) ** 2 * moved @ covariance @ moved.T)
 
 
@@ -102,7 +102,7 @@ def centre_covariance(covariance: Array, translation: Array, scale: float | None
     translation: of the point about which the pose turns: t for the scene's origin. scale: where the centre is -R^T t /
     scale, of which `covariance` has the error too.
     """
-    moved = np.concatenate([_crossed(translation), np.eye(3)], 1)
+    moved = np.concatenate([crossed(translation), np.eye(3)], 1)
     if scale is not None:
         moved = np.column_stack([moved, -translation / scale]) / scale
     known = covariance[: moved.shape[1], : moved.shape[1]]
@@ -222,12 +222,12 @@ def _known(linear: Linearised) -> Array:
     elif isinstance(prior, PosePrior):
         information[:3, :3] = np.eye(3) / math.radians(prior.rotation_sigma_deg) ** 2
         if prior.translation is not None:
-            moved = np.concatenate([_crossed(linear.rotation @ linear.sets.middle), np.eye(3)], 1)
+            moved = np.concatenate([crossed(linear.rotation @ linear.sets.middle), np.eye(3)], 1)
             information[:POSE, :POSE] += moved.T @ moved / prior.translation_sigma**2
     return information
 
 
-def _crossed(vector: Array) -> Array:
+def crossed(vector: Array) -> Array:
     """The matrix (3, 3) that gives the cross product of `vector` with another."""
     x, y, z = vector
     return np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])

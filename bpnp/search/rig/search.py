@@ -76,8 +76,7 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
 
 def _enumerated(sets: PointSets, deadline: Deadline) -> tuple[Candidates, bool]:
     """Poses of few points, and whether every hypothesis was tried."""
-    radius = ENUMERATION.radius if sets.floor is None else ENUMERATION.floors * sets.floor
-    chosen = replace(ENUMERATION, kept=PROPOSED)
+    radius, chosen = ENUMERATION.radius_at(sets.floor), replace(ENUMERATION, kept=PROPOSED)
     poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=lambda _: False, settings=chosen)
     return Candidates.unscored(poses.rotation, poses.translation), poses.ended == "exhausted"
 
