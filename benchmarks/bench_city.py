@@ -9,37 +9,27 @@ field by a tenth of the distance from which they are seen, and a third of them d
 are left out with all points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of
 the distance.
 --twice: every place is there twice, this share of the points of the second one gone; a confident pose in it is wrong,
-and no pose there is right. A row begins with the rank of the views (`bpnp.maps.ranking`): of how many photos one of the
-first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
+and no pose there is right. A row begins with what it takes to open the map as a COLMAP model, and again, with the index
+of a large one: CPU seconds and peak memory of a new process before the first photo; then the rank of the views
+(`bpnp.maps.ranking`): of how many photos one of the first 1, 10 and 50 views is turned by less than 30 degrees and lies
+within half the distance.
 """
 
 import argparse
-import resource
+import multiprocessing
+import tempfile
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
-from record import (
-    TIME_LIMIT,
-    Array,
-    Outcome,
-    Pose,
-    Problem,
-    Rows,
-    Similarity,
-    degrees,
-    measured,
-    outcomes,
-    parser,
-    spread,
-)
+from record import TIME_LIMIT, Array, Pose, Problem, Row, Similarity, degrees, parser, run, spread
 from scipy.spatial.transform import Rotation
-from view_problems import REPORTED, median_distance, model_of
+from view_problems import REPORTED, map_of, median_distance, model_of, part_of
 
-from bpnp import SceneMap
+from bpnp import SceneMap, warm_up
 from bpnp.cameras import camera_from
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction
 from bpnp.maps.views import View
@@ -52,7 +42,6 @@ MOVED, WAVES = 0.1, 6  # root mean square of the field, in distances of the view
 DROPPED = 0.3  # share of a copy's points
 APART = 40.0  # side of the cube in which places lie, in distances of a view, for 10 of them
 CAMERA = camera_from(np.eye(3))  # views are looked near by pose alone
-NONE = np.empty(0, np.int32)  # track lengths: nothing here asks for them
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,36 +55,12 @@ class CityPhoto:
     poses: tuple[Pose, ...]
     distance: float
 
-    @property
-    def camera(self) -> Array:
-        return np.diag([self.focal, self.focal, 1.0])
-
-
-def place_of(scene: Reconstruction, left_out: Sequence[ImagePoints] = ()) -> SceneMap:
-    """A model without some views, and without the points that then fewer than two see."""
-    names = {image.name for image in left_out}
-    views = tuple(
-        View(f"{scene.name}/{image.name}", CAMERA, image.rotation, image.translation, image.observed.astype(np.int32))
-        for image in scene.images
-        if image.name not in names
-    )
-    return SceneMap(scene.points3d, scene.point_ids, NONE, views).seen_by(2)
-
 
 def moved(place: SceneMap, to: Similarity) -> SceneMap:
     """The place in another frame."""
     poses = [to.pose(view.rotation, view.translation) for view in place.views]
     views = (replace(view, rotation=r, translation=t) for view, (r, t) in zip(place.views, poses, strict=True))
     return replace(place, points3d=to.points(place.points3d), views=tuple(views))
-
-
-def part_of(place: SceneMap, chosen: NDArray[np.bool_], name: str = "") -> SceneMap:
-    """Some points, and all views with those of them that they see; `name` begins the names of the views."""
-    number = np.cumsum(chosen, dtype=np.int32) - 1
-    views = tuple(
-        replace(view, name=name + view.name, points=number[view.points[chosen[view.points]]]) for view in place.views
-    )
-    return SceneMap(place.points3d[chosen], place.point_ids[chosen], NONE, views)
 
 
 def distance_of(place: SceneMap) -> float:
@@ -119,7 +84,7 @@ def changed(place: SceneMap, rng: np.random.Generator, name: str) -> SceneMap:
         for view in place.views
     )
     turned = replace(place, points3d=(points + field) @ mirror, views=views)
-    return part_of(turned, rng.random(len(points)) > DROPPED, name)
+    return part_of(turned, np.flatnonzero(rng.random(len(points)) > DROPPED), name)
 
 
 def anywhere(rng: np.random.Generator, places: int, unit: float) -> Similarity:
@@ -146,14 +111,14 @@ def city(
     """
     rng = np.random.default_rng(seed)
     left_out = {scene.name: photos_of(scene, photos.get(scene.name, 0)) for scene in scenes}
-    first = [place_of(scene, left_out[scene.name]) for scene in scenes]
+    first = [map_of(scene, [image.name for image in left_out[scene.name]]).seen_by(2) for scene in scenes]
     places, found = [], []
     for place, scene in zip(first, scenes, strict=True):
         unit = distance_of(place)
         moves = [anywhere(rng, len(scenes), unit) for _ in range(1 if twice is None else 2)]
         places.append(moved(place, moves[0]))
         if twice is not None:
-            again = part_of(place, rng.random(len(place.points3d)) >= twice, "again/")
+            again = part_of(place, np.flatnonzero(rng.random(len(place.points3d)) >= twice), "again/")
             places.append(moved(again, moves[1]))
         for image in left_out[scene.name]:
             poses = tuple(move.pose(image.rotation, image.translation) for move in moves)
@@ -185,14 +150,44 @@ def merged(places: Sequence[SceneMap]) -> SceneMap:
         for view in place.views
     )
     points = np.concatenate([place.points3d for place in places])
-    return SceneMap(points, np.arange(len(points)), NONE, views).seen_by(1)
+    return SceneMap(points, np.arange(len(points)), np.empty(0, np.int32), views).seen_by(1)
 
 
-def opened(scene: SceneMap) -> float:
-    """CPU seconds of what a map does before its first photo."""
+def written(scene: SceneMap, folder: Path) -> None:
+    """A map in COLMAP's binary files, all keypoints in a corner."""
+    counts = np.array([len(view.points) for view in scene.views])
+    (folder / "cameras.bin").write_bytes(np.array([1, 1, 2, 2], "<u8").tobytes() + np.ones(3).tobytes())
+    keypoints = np.zeros(counts.sum(), [("xy", "<f8", 2), ("id", "<u8")])
+    keypoints["id"] = np.concatenate([view.points for view in scene.views]) + 1
+    with (folder / "images.bin").open("wb") as file:
+        file.write(np.uint64(len(counts)).tobytes())
+        for number, (view, rows) in enumerate(zip(scene.views, np.split(keypoints, counts.cumsum()[:-1]), strict=True)):
+            turn = Rotation.from_matrix(view.rotation).as_quat(scalar_first=True)
+            file.write(np.uint32(number + 1).tobytes() + np.r_[turn, view.translation].tobytes())
+            file.write(
+                np.uint32(1).tobytes() + f"{number:06d}\0".encode() + np.uint64(len(rows)).tobytes() + rows.tobytes()
+            )
+    fields = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
+    points = np.zeros(len(scene.points3d), fields)
+    points["id"], points["xyz"] = np.arange(1, len(points) + 1), scene.points3d
+    points["length"] = np.bincount(keypoints["id"].astype(np.int64) - 1, minlength=len(points))
+    tracks = np.column_stack([np.repeat(np.arange(1, len(counts) + 1), counts), np.zeros(len(keypoints))])
+    tracks = tracks.astype("<u4")[np.argsort(keypoints["id"], kind="stable")]
+    with (folder / "points3D.bin").open("wb") as file:
+        file.write(np.uint64(len(points)).tobytes())
+        for point, track in zip(points, np.split(tracks, points["length"].cumsum()[:-1].astype(np.int64)), strict=True):
+            file.write(point.tobytes() + track.tobytes())
+
+
+def opened(folder: Path) -> str:
+    """What this process needs for a map before the first photo."""
+    warm_up()
     start = time.process_time()
+    scene = SceneMap.from_colmap(folder)
     _ = scene.cones, scene.pictures
-    return time.process_time() - start
+    seconds = time.process_time() - start
+    status = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    return f"{seconds:.2g} CPU s, {int(status['VmHWM'].split()[0]) / 1e6:.2g} GB"  # ru_maxrss is the parent's too
 
 
 def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
@@ -217,29 +212,27 @@ def is_near(view: View, photo: CityPhoto) -> bool:
     )
 
 
-def localized(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> list[Outcome]:
-    seconds, rank = opened(scene), ranked(scene, photos)
-    search = partial(scene.localize, seed=seed, time_limit=TIME_LIMIT)
-    found = outcomes(
-        Problem(
-            photo.name, partial(search, photo.focal * photo.points2d, photo.camera), photo.poses,
-            distance=photo.distance,
-        )
-        for photo in photos
-    )  # fmt: skip
-    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20
-    print(f"opened in {seconds:.2g} CPU s, {memory:.2g} GB, {rank}", end="; ")
-    return found
+def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> Iterator[Problem]:
+    with tempfile.TemporaryDirectory() as folder, multiprocessing.get_context("spawn").Pool(1, None, (), 1) as pool:
+        written(scene, Path(folder))
+        first, again = pool.map(opened, [Path(folder)] * 2, chunksize=1)
+    print(f"opened in {first}, again {again}, {ranked(scene, photos)}", end="; ", flush=True)
+    _ = scene.cones  # before the first photo
+    for photo in photos:
+        pixels, camera = photo.focal * photo.points2d, np.diag([photo.focal, photo.focal, 1.0])
+        search = partial(scene.localize, pixels, camera, seed=seed, time_limit=TIME_LIMIT)
+        yield Problem(photo.name, search, photo.poses[:1], distance=photo.distance)
 
 
-def rows(options: argparse.Namespace) -> Rows:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
     names = options.scenes or sorted(path.name for path in (options.data / "colmap").iterdir())
     scenes = [model_of(options.data, name) for name in names]
     wanted = dict.fromkeys(options.photos, -(-options.limit // len(options.photos)))
     for views in options.views if options.twice is None else [0]:
         scene, photos = city(scenes, wanted, views, options.seed, twice=options.twice)
         name = f"{len(scene.views):,} views, {len(scene.points3d):,} points"
-        yield name, partial(localized, scene, photos[: options.limit], options.seed)
+        drawn = partial(problems, scene, photos[: options.limit], options.seed)
+        yield Row(name, drawn, RIGHT_DEG, RIGHT_SHIFT)
 
 
 def main() -> None:
@@ -249,4 +242,4 @@ def main() -> None:
     options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
     options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
     chosen = options.parse_args()
-    measured(rows(chosen), chosen, RIGHT_DEG, RIGHT_SHIFT)
+    run(rows(chosen), chosen)

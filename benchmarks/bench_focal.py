@@ -1,4 +1,4 @@
-"""The focal length unknown: photos in whole maps, beside it with the focal length known; and LEDs.
+"""The focal length unknown: photos in whole maps, and LEDs.
 
     python -m benchmarks focal maps --limit 6 --seed 42
 
@@ -13,11 +13,10 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from leds import Setting, picture
-from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
+from leds import Setting, picture, problem
+from record import TIME_LIMIT, Array, Problem, Row, parser, run
 from view_problems import REPORTED, ViewProblem, median_distance, scene_problems
 
-from bpnp import solve
 from bpnp.cameras import image_size
 
 RIGHT_DEG = {"maps": 1.5, "leds": 3.0}
@@ -25,16 +24,12 @@ SCENES = (*REPORTED, "statue_of_liberty")
 LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in ("ring", "headset") for n in (0, 3)]
 
 
-def of_photos(photos: list[ViewProblem], known: bool, seed: int) -> Iterator[Problem]:
-    """With their camera, or with the image's size alone."""
-    for photo in photos:
-        pixels, size = image_of(photo)
-        matrix = np.array([[photo.focal, 0, size[0] / 2], [0, photo.focal, size[1] / 2], [0, 0, 1]])
-        camera: dict[str, Any] = {"camera": matrix} if known else {"image_size": size}
-        yield Problem(
-            photo.name, partial(photo.scene.localize, pixels, **camera, seed=seed, time_limit=TIME_LIMIT), [photo.pose],
-            distance=median_distance(photo.seen, photo.pose), focal=np.nan if known else photo.focal,
-        )  # fmt: skip
+def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
+    known: dict[str, Any] = {"limit": options.limit, "against": "map", "outliers": 1.0, "seed": options.seed}
+    for photo in (photo for name in options.scenes for photo in scene_problems(options.data, name, **known)):
+        (pixels, size), distance = image_of(photo), median_distance(photo.seen, photo.pose)
+        search = partial(photo.scene.localize, pixels, image_size=size, seed=options.seed, time_limit=TIME_LIMIT)
+        yield Problem(photo.name, search, [photo.pose], distance=distance, focal=photo.focal)
 
 
 def image_of(photo: ViewProblem) -> tuple[Array, tuple[int, int]]:
@@ -51,21 +46,16 @@ def of_leds(setting: Setting, k: int, limit: int, seed: int) -> Iterator[Problem
     rng = np.random.default_rng([seed, k])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
-        points = shown.pixels, shown.device.points3d
-        size = (shown.camera.size, shown.camera.size)
-        search = partial(solve, *points, normals3d=shown.device.normals3d, image_size=size, seed=seed)
-        pose, distance = (shown.rotation, shown.translation), float(np.linalg.norm(shown.translation))
-        yield Problem(f"{i}", search, [pose], distance=distance, focal=shown.camera.focal)
+        known = {"normals3d": shown.device.normals3d, "image_size": (shown.camera.size, shown.camera.size)}
+        yield problem(f"{i}", shown, **known, seed=seed)
 
 
-def rows(options: argparse.Namespace) -> Rows:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
     if options.what == "leds":
-        yield from ((one.name, partial(of_leds, one, k, options.limit, options.seed)) for k, one in enumerate(LEDS))
+        for k, one in enumerate(LEDS):
+            yield Row(one.name, partial(of_leds, one, k, options.limit, options.seed), RIGHT_DEG["leds"])
         return
-    chosen = {"against": "map", "outliers": 1.0, "limit": options.limit, "seed": options.seed}
-    photos = [photo for name in options.scenes for photo in scene_problems(options.data, name, **chosen)]
-    for known in (True, False):
-        yield f"whole map, {'known' if known else 'unknown'}", partial(of_photos, photos, known, options.seed)
+    yield Row("whole map", partial(of_photos, options), RIGHT_DEG["maps"])
 
 
 def main() -> None:
@@ -73,4 +63,4 @@ def main() -> None:
     options.add_argument("what", choices=RIGHT_DEG)
     options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
     chosen = options.parse_args()
-    measured(rows(chosen), chosen, RIGHT_DEG[chosen.what])
+    run(rows(chosen), chosen)

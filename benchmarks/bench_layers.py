@@ -1,25 +1,22 @@
-"""The layers and a training step against the paper's method (`paper_layers.py`), on the same inputs in the same run.
+"""The layers against the paper's method (`paper_layers.py`), on the same inputs in the same run.
 
-    python -m benchmarks layers [--points 200 --rounds 3] [--threads 1]
+    python -m benchmarks layers [--points 200 --rounds 3]
 
 Ours and the paper's take turns; times are medians over the rounds, of processor time, which other programs hardly
 change; ratios are medians of the rounds' ratios. Inputs (`problems.py`) are told by the kind of the features
 and the share of the assignment on the true matches.
 """
 
-import os
-import sys
 import time
 from collections.abc import Callable, Iterator
-from copy import deepcopy
 from functools import partial
 from typing import Any
 
 import numpy as np
 import roma
 import torch
-from paper_layers import SINKHORN_TOLERANCE, PaperPnP, PaperSinkhorn, paper_losses
-from problems import Kind, diagonal_mass, planted, planted_network, training_losses, training_step
+from paper_layers import SINKHORN_TOLERANCE, PaperPnP, PaperSinkhorn
+from problems import Kind, diagonal_mass, planted
 from record import parser, write
 from torch import Tensor
 
@@ -77,14 +74,6 @@ def rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]
         back = [gradient_of(each, cost, 1 - 2 * torch.eye(points).expand_as(plan))
                 for each in (plan, PaperSinkhorn.apply(cost, MU))]  # fmt: skip
         yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", race(*back, rounds=rounds)
-    problem = planted(batch, points, kind="smooth", level=10)
-    net = planted_network(problem)
-    for poses, what in ((False, "correspondence loss"), (True, "with pose loss")):
-        steps = [
-            training_step(deepcopy(net), partial(losses, batch=problem.batch, poses=poses))
-            for losses in (training_losses, paper_losses)
-        ]
-        yield f"training step, {what}", "smooth", race(*steps, rounds=rounds)
 
 
 def pnp_rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:
@@ -113,26 +102,12 @@ def main() -> None:
     options.add_argument("--points", type=int, default=1000, help="on each side (default: 1000)")
     options.add_argument("--rounds", type=int, default=7, help="timings of each side in a row (default: 7)")
     options.add_argument("--batch", type=int, default=4, help="problems in a batch (default: 4)")
-    options.add_argument("--threads", type=int, default=1)
     chosen = options.parse_args()
-    restart_with_settings()
-    torch.set_num_threads(chosen.threads)
+    keep_freed_memory()
+    torch.set_num_threads(1)
     found = []
     for what, inputs, (ours, papers, ratio) in rows(chosen.points, chosen.batch, chosen.rounds):
         print(f"{what}; {inputs}: ours {ours:.3g} CPU ms, the paper's {papers:.3g}, ratio {ratio:.3g}", flush=True)
         found.append({"what": what, "inputs": inputs, "ms": [ours, papers], "ratio": ratio})
     if chosen.output:
         write(chosen.output, {"points": chosen.points, "batch": chosen.batch, "rows": found})
-
-
-def restart_with_settings() -> None:
-    """Start the program again with the settings that are read before its first line, unless the environment has them.
-
-    OMP_WAIT_POLICY=passive: by default waiting threads spin. Where another program wants one of the cores, a step of
-    two threads then takes 30 times as long, and processor time says nothing.
-    THP_MEM_ALLOC_ENABLE=1: torch asks for large pages. Freed memory is kept, as in `bpnp fit`.
-    """
-    settings = {"OMP_WAIT_POLICY": "passive", "THP_MEM_ALLOC_ENABLE": "1"}
-    if not settings.keys() <= os.environ.keys():
-        os.execve(sys.executable, sys.orig_argv, settings | dict(os.environ))
-    keep_freed_memory()

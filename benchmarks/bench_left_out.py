@@ -9,7 +9,7 @@ all photos, aligned by the views that both models have.
 """
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from descriptor_poses import DescribedMap
 from rebuilt_maps import PhotoScene, aligned
-from record import TIME_LIMIT, Problem, Rows, measured, parser, spread
+from record import TIME_LIMIT, Problem, Row, parser, run, spread
 from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
@@ -52,7 +52,7 @@ def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dic
     }
 
 
-def rows(options: argparse.Namespace) -> Rows:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
     for name in options.scenes:
         kept = options.maps / f"{name}-{FEATURES}"
         scene = PhotoScene(options.data / "photos" / name, kept, CAMERA, FEATURES)
@@ -60,7 +60,7 @@ def rows(options: argparse.Namespace) -> Rows:
         chosen = spread([photo for photo in scene.names() if photo in full.view_numbers], options.limit)
         drawn = [problems_of(scene, photo, full, options.seed) for photo in chosen]
         for method in drawn[0]:
-            yield f"{name}, {method}", partial(list, [one[method] for one in drawn])
+            yield Row(f"{name}, {method}", partial(list, [one[method] for one in drawn]), RIGHT_DEG)
 
 
 def main() -> None:
@@ -68,4 +68,4 @@ def main() -> None:
     options.add_argument("scenes", nargs="+", metavar="SCENE")
     options.add_argument("--maps", type=Path, default=Path("runs/left-out"), help="folder of the maps that are built")
     chosen = options.parse_args()
-    measured(rows(chosen), chosen, RIGHT_DEG)
+    run(rows(chosen), chosen)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from leds import Camera, device
-from record import TIME_LIMIT, Array, Problem, Rows, measured, parser
+from record import TIME_LIMIT, Array, Problem, Row, parser, run
 from scipy.spatial.transform import Rotation
 from view_problems import LEAST_MATCHES, MOST_POINTS, REPORTED, images_of, model_of, overlapping, view_problem
 
@@ -66,7 +66,7 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
         scene = model_of(options.data, name)
         for query in images_of(scene, options.limit):
             shown = view_problem(scene, query, against="view", outliers=1.0, seed=options.seed)
-            beside = [view for _, view in overlapping(scene, query) if view.name != shown.view][:2]
+            beside = [view for _, view in overlapping(scene, query) if f"{name}/{view.name}" != shown.view][:2]
             if len(beside) < 2 or shown.matches < LEAST_MATCHES:
                 continue
             rng, pixels = np.random.default_rng([options.seed, query.image_id]), [shown.pixels[0]]
@@ -96,8 +96,8 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
     chosen = options.parse_args()
-    rows: Rows = [
-        (f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, is_metric))
+    rows = [
+        Row(f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, is_metric), RIGHT_DEG)
         for name, cameras, used, is_metric in (
             ("2 cameras", 2, 2, True),
             ("4 cameras", 4, 4, True),
@@ -106,7 +106,7 @@ def main() -> None:
             ("4 cameras, scale unknown", 4, 4, False),
         )
     ] + [
-        (f"photos, {name}", partial(of_photos, slice(*used), chosen))
+        Row(f"photos, {name}", partial(of_photos, slice(*used), chosen), RIGHT_DEG)
         for name, used in (("camera 1", (0, 1)), ("camera 2", (1, 2)), ("camera 3", (2, 3)), ("3 cameras", (0, 3)))
     ]
-    measured(rows, chosen, RIGHT_DEG)
+    run(rows, chosen)

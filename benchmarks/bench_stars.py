@@ -12,12 +12,13 @@ import tempfile
 import time
 from collections.abc import Iterator
 from functools import lru_cache, partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import numpy as np
 from leds import Camera
 from numpy.typing import NDArray
-from record import TIME_LIMIT, Array, Outcome, Problem, Rows, degrees, measured, parser
+from record import TIME_LIMIT, Array, Outcome, Problem, Row, degrees, parser, run
 from scipy.spatial.transform import Rotation
 
 import bpnp
@@ -122,16 +123,16 @@ def by_tetra(count: int, field: float, limit: int, seed: int) -> Iterator[Outcom
         yield Outcome("", degrees(turned, shown.rotation), 0.0, "confident" if found else "failed", seconds)
 
 
-def rows(limit: int, seed: int, *, peers: bool) -> Rows:
-    for count in CATALOGUES:
-        for field in FIELDS:
-            yield f"{count}, {field:.0f} deg", partial(problems, count, field, limit, seed)
-            if peers and field < WIDE:
-                yield f"tetra3rs: {count}, {field:.0f} deg", partial(by_tetra, count, field, limit, seed)
+def rows(limit: int, seed: int, *, peers: bool) -> Iterator[Row]:
+    for count, field in product(CATALOGUES, FIELDS):
+        yield Row(f"{count}, {field:.0f} deg", partial(problems, count, field, limit, seed), RIGHT_DEG)
+        if peers and field < WIDE:
+            drawn = partial(by_tetra, count, field, limit, seed)
+            yield Row(f"tetra3rs: {count}, {field:.0f} deg", drawn, RIGHT_DEG)
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--peers", action="store_true", help="tetra3rs too")
     chosen = options.parse_args()
-    measured(rows(chosen.limit, chosen.seed, peers=chosen.peers), chosen, RIGHT_DEG)
+    run(rows(chosen.limit, chosen.seed, peers=chosen.peers), chosen)

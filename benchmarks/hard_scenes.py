@@ -18,13 +18,6 @@ NOISE = 0.5  # pixels
 WINDOW = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0], [0.25, 0.9, 0.15]])
 
 
-def lattice(rng: np.random.Generator) -> Drawn:
-    """Part of a lattice of 25 x 25 points, exact or with a jitter of a thirtieth or an eighth of its step."""
-    points = _grid(25, 25) * 0.15
-    points[:, :2] += rng.choice([0.0, 0.005, 0.02]) * rng.standard_normal((len(points), 2))
-    return _in_frame(points, points, _facing(rng, 50, (2, 3), aside=1.0), rng)
-
-
 def board(rng: np.random.Generator) -> Drawn:
     """Part of a lattice of 14 x 10 points."""
     points = _grid(14, 10) * 0.3
@@ -137,7 +130,7 @@ def wrong_focal_plane(rng: np.random.Generator) -> Drawn:
 
 SCENES: tuple[Callable[[np.random.Generator], Drawn], ...] = (
     ending_facade, colonnade, gappy_facade, row_of_windows, facade_with_door, stretched, hinged, wrong_focal_cloud,
-    wrong_focal_plane, helix, lines, clumps, stairs, board, wallpaper, lattice,
+    wrong_focal_plane, helix, lines, clumps, stairs, board, wallpaper,
 )  # fmt: skip
 
 

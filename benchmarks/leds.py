@@ -7,7 +7,7 @@ drone's frame, or a marker's arms; metres and pixels. Every frame has a new pose
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,8 +193,17 @@ def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
     rng = np.random.default_rng([seed, list(SETTINGS).index(name)])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
-        search = partial(solution, shown, setting, rng)
-        yield Problem(f"{name}/{i}", search, [(shown.rotation, shown.translation)], shown.device.points3d)
+        normals = shown.device.normals3d if setting.normals else None
+        prior = vertical(shown, rng) if setting.gravity else None
+        yield problem(f"{name}/{i}", shown, camera=shown.camera.model, normals3d=normals, prior=prior)
+
+
+def problem(name: str, shown: Frame, **known: Any) -> Problem:
+    """A frame with what `solve` is told of it; its focal length is to be found where the camera is not told."""
+    focal = np.nan if "camera" in known else shown.camera.focal
+    search = partial(bpnp.solve, shown.pixels, shown.device.points3d, **known)
+    distance = float(np.linalg.norm(shown.translation))
+    return Problem(name, search, [(shown.rotation, shown.translation)], shown.device.points3d, distance, focal)
 
 
 def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
@@ -205,9 +214,7 @@ def picture(setting: Setting, seed: int, rng: np.random.Generator) -> Frame:
     raise ValueError(f"expected a device of {setting.name} whose LEDs can be seen, got none of 100")
 
 
-def solution(shown: Frame, setting: Setting, rng: np.random.Generator) -> bpnp.Solution:
-    prior, normals = None, shown.device.normals3d if setting.normals else None
-    if setting.gravity:  # up is the device's z axis
-        tilt = Rotation.from_rotvec(np.radians(1.0) * rng.standard_normal(3)).as_matrix()
-        prior = bpnp.GravityPrior(tilt @ shown.rotation[:, 2], np.array([0.0, 0.0, 1.0]), 1.5)
-    return bpnp.solve(shown.pixels, shown.device.points3d, shown.camera.model, normals3d=normals, prior=prior)
+def vertical(shown: Frame, rng: np.random.Generator) -> bpnp.GravityPrior:
+    """Up, the device's z axis, told to a degree."""
+    tilt = Rotation.from_rotvec(np.radians(1.0) * rng.standard_normal(3)).as_matrix()
+    return bpnp.GravityPrior(tilt @ shown.rotation[:, 2], np.array([0.0, 0.0, 1.0]), 1.5)

@@ -1,9 +1,9 @@
 """The method of Campbell, Liu and Gould (ECCV 2020), written plainly from its formulas: what ours is measured against.
 
 Sinkhorn: scalings of exp(-lambda M), lambda = 1/mu, and the gradient of Lemma 2 through the inverse of the system of
-its m + n - 1 independent constraints, by blocks. RANSAC: OpenCV's P3P, EPnP on the best matches. PnP: L-BFGS on Eq. 7
-over all m n pairs for the whole batch at once, and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian
-from automatic differentiation. Everything stays in the dtype of its input.
+its m + n - 1 independent constraints, by blocks. PnP: L-BFGS on Eq. 7 over all m n pairs for the whole batch at once,
+and the gradient of Lemma 1 with the Hessian and the 6 x m n Jacobian from automatic differentiation. Everything stays
+in the dtype of its input.
 
 The inverse is by Cholesky: the block that is left of the symmetric system is positive definite, and in torch 2.13 on
 the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail inside oneMKL.
@@ -11,21 +11,15 @@ the CPU `torch.linalg.inv`, `solve` and `lu_factor` of a few hundred rows fail i
 
 from typing import Any
 
-import cv2
-import numpy as np
 import roma
 import torch
-from problems import losses_of
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from bpnp.geometry import bearings, transform
-from bpnp.models.bpnpnet import BPnPNet
-from bpnp.types import Batch, Pose, Prediction, SolveStats
+from bpnp.geometry import transform
 
 MU, SINKHORN_ITERATIONS, SINKHORN_TOLERANCE = 0.1, 100, 1e-9
 PNP_ITERATIONS = 75
-THRESHOLD, RANSAC_ITERATIONS = 0.01, 1000
 
 
 class PaperSinkhorn(torch.autograd.Function):
@@ -77,22 +71,6 @@ class PaperSinkhorn(torch.autograd.Function):
         return by_cost, None, None, None
 
 
-def ransac(assignment: Tensor, points2d: Tensor, points3d: Tensor) -> tuple[Tensor, Tensor]:
-    """P3P-RANSAC and EPnP (OpenCV) on the 1.5 min(m, n) most probable matches; the identity where there is no pose."""
-    n = assignment.shape[2]
-    best = assignment.flatten(1).topk(int(1.5 * min(assignment.shape[1:])), dim=-1).indices
-    poses = np.tile(np.eye(3, 4), (len(best), 1, 1))
-    for i, pairs in enumerate(best.numpy()):
-        found, rotvec, translation, _ = cv2.solvePnPRansac(
-            points3d[i].double().numpy()[pairs % n], points2d[i].double().numpy()[pairs // n], np.eye(3), None,
-            iterationsCount=RANSAC_ITERATIONS, reprojectionError=THRESHOLD, flags=cv2.SOLVEPNP_P3P,
-        )  # fmt: skip
-        if found:
-            poses[i] = np.hstack([cv2.Rodrigues(rotvec)[0], translation])
-    solved = torch.as_tensor(poses).to(assignment)
-    return solved[..., :3], solved[..., 3]
-
-
 def objective(pose: Tensor, assignment: Tensor, rays: Tensor, points3d: Tensor) -> Tensor:
     """Eq. 7 over all m n pairs, for each sample; `pose` (b, 6) is the angle-axis vector and the translation."""
     camera = transform(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], points3d)
@@ -139,16 +117,3 @@ class PaperPnP(torch.autograd.Function):
         factor, _ = torch.linalg.cholesky_ex(hessian)
         jacobian = -torch.cholesky_solve(mixed, factor)
         return (gradient.unsqueeze(1) @ jacobian).view_as(assignment), None, None, None
-
-
-def paper_losses(net: BPnPNet, batch: Batch, poses: bool) -> Tensor:
-    """Of each sample (b,), with the paper's layers around the feature nets of `net`."""
-    assignment = PaperSinkhorn.apply(net.cost(batch))
-    if not poses:
-        return losses_of(Prediction(assignment), batch)
-    rotation, translation = ransac(assignment.detach(), batch.points2d, batch.points3d)
-    start = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1)
-    pose = PaperPnP.apply(assignment, bearings(batch.points2d), batch.points3d, start)
-    stats = SolveStats.of(torch.ones(len(pose), dtype=torch.bool))
-    found = Pose(roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:], stats)
-    return losses_of(Prediction(assignment, poses={"pnp": found}), batch)

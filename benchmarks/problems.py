@@ -9,7 +9,6 @@ points in the unit ball. Two kinds of features lead to two kinds of assignments:
   A wrong match is as unlikely as any other; the easy case for every iterative solver.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,16 +16,12 @@ import roma
 import torch
 from torch import Tensor, nn
 
-from bpnp.models.bpnpnet import BPnPNet, pairwise_distance
-from bpnp.models.nets.features import ImageFeatures, SceneFeatures
-from bpnp.training.losses import correspondence_losses, pose_losses
-from bpnp.types import Batch, Prediction
+from bpnp.models.bpnpnet import pairwise_distance
+from bpnp.types import Batch
 
 Kind = Literal["smooth", "independent"]
 
 FOCAL, NOISE_PX, DISTANCE, CHANNELS = 800.0, 2.0, 4.5, 128
-LEARNING_RATE = 1e-5
-NET_SHARE = 0.02  # of the real network's features beside the planted ones
 
 
 @dataclass(frozen=True)
@@ -69,47 +64,3 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0)
 def diagonal_mass(assignment: Tensor) -> float:
     """Share of the assignment on the true matches, the mean over the batch."""
     return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
-
-
-def planted_network(problem: Problem) -> BPnPNet:
-    """BPnPNet whose nets do all their work, forward and backward, but leave the assignment as sharp as planted."""
-    return BPnPNet(
-        _PlantedFeatures(ImageFeatures(centre=True, scale=4.0), problem.features2d),
-        _PlantedFeatures(SceneFeatures(centre=True), problem.features3d),
-    )
-
-
-class _PlantedFeatures(nn.Module):
-    """Unit vector of a planted feature and a small part of that of the network."""
-
-    def __init__(self, inner: nn.Module, planted: Tensor) -> None:
-        super().__init__()
-        self.inner = inner
-        self.register_buffer("planted", planted)
-
-    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
-        planted = self.get_buffer("planted")
-        return nn.functional.normalize(planted + NET_SHARE * self.inner(points, mask), dim=-1)
-
-
-def training_step(net: BPnPNet, losses: Callable[[BPnPNet], Tensor]) -> Callable[[], None]:
-    """Forward, loss, backward and Adam. losses: of each sample."""
-    optimiser = torch.optim.Adam(net.parameters(), lr=LEARNING_RATE)
-
-    def step() -> None:
-        optimiser.zero_grad()
-        losses(net).mean().backward()
-        optimiser.step()
-
-    return step
-
-
-def training_losses(net: BPnPNet, batch: Batch, poses: bool) -> Tensor:
-    """L_c, or L_c + L_p, of each sample (b,)."""
-    return losses_of(net(batch) if poses else net.match(batch), batch)
-
-
-def losses_of(prediction: Prediction, batch: Batch) -> Tensor:
-    losses = correspondence_losses(prediction, batch, angle=None)
-    assert losses is not None
-    return losses + pose_losses(prediction.poses["pnp"], batch) if "pnp" in prediction.poses else losses

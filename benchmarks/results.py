@@ -21,13 +21,12 @@ from pathlib import Path
 from typing import Any
 
 import leds
+import record
 import shapes
 import torch
-import view_problems
-from record import ROOT, Outcome, Problem, line, outcomes, parser, summary, write
-from view_problems import REPORTED
+from record import ROOT, Outcome, Problem, measured, parser, write
+from view_problems import photos
 
-from bpnp import warm_up
 from bpnp.datamodules import MeshDataModule, Outliers
 from bpnp.metrics import rotation_error, translation_error
 from bpnp.models import TrainedNet
@@ -46,9 +45,8 @@ TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 class Row:
     """A line of a table.
 
-    measure: a number of problems or their outcomes, from a seed and the folder of the data. problems: in
-    full, and quickly.
-    right_deg, right_shift: up to which a pose is right. data: the folder, below that of the data, that it needs.
+    measure: a number of problems or their outcomes, from a seed and the folder of the data. problems: in full, and
+    quickly. right_deg, right_shift: up to which a pose is right. data: the folder in that of the data that it needs.
     """
 
     table: str
@@ -61,30 +59,11 @@ class Row:
     in_readme: bool = False
 
 
-def search(name: str, limit: int, seed: int, data: Path) -> Iterator[Problem]:
-    return shapes.problems(name, data, limit, seed)
-
-
-def reported_scenes(suffix: str, limit: int, seed: int, data: Path) -> list[Problem]:
-    each = -(-limit // len(REPORTED))
-    return [one for scene in REPORTED for one in search(scene + suffix, each, seed, data)][:limit]
-
-
-def photos(
-    against: str, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
-) -> Iterator[Problem]:
-    """Photos in their map, or by the points alone; apart: of other places."""
-    drawn = view_problems.photos(limit, data, apart=apart, against=against, outliers=outliers, seed=seed)
-    return view_problems.problems(drawn, in_map=in_map, seed=seed)
-
-
 def lights(name: str, limit: int, seed: int, _: Path) -> Iterator[Problem]:
     return leds.problems(name, limit, seed)
 
 
-def network(
-    weights: str, estimate: str, options: dict[str, Any], limit: int, seed: int, data: Path
-) -> Iterator[Outcome]:
+def network(weights: str, options: dict[str, Any], limit: int, seed: int, data: Path) -> Iterator[Outcome]:
     """Packaged weights on meshes or, without `root`, on procedural shapes."""
     known = {"num_points": 1000, "test_problems": limit, "test_shapes": limit, "batch_size": 1, "seed": seed}
     module = MeshDataModule(**known | options | {"root": str(data / options["root"]) if "root" in options else None})
@@ -93,7 +72,7 @@ def network(
     for batch in module.test_dataloader():
         start = time.process_time()
         with torch.no_grad():
-            pose = net(batch).poses[estimate]
+            pose = net(batch).poses["refined"]
         seconds = time.process_time() - start
         turn = float(rotation_error(pose.rotation, batch.rotation).nan_to_num(nan=180.0))
         shift = float(translation_error(pose.translation, batch.translation).nan_to_num(nan=torch.inf))
@@ -105,15 +84,16 @@ IN_README = ("ring, 3 lights", "headset, 3 lights", "drone, 3 lights")
 ROWS = (
     *(
         Row("search", f"shapes, any rotation, {ratio:g} outliers a match",
-            partial(search, f"shapes-{ratio:.2f}"), (48, 4), 2.0, in_readme=ratio == 0.25)
+            partial(shapes.problems, f"shapes-{ratio:.2f}"), (48, 4), 2.0, in_readme=ratio == 0.25)
         for ratio in (0, 0.25, 0.5)
     ),
-    Row("search", "PSB meshes, the paper's protocol", partial(search, "psb"), (100, 3), *PAPER, data="psb",
-        in_readme=True),
-    Row("search", "PSB meshes, any rotation", partial(search, "psb-so3"), (100, 3), *PAPER, data="psb"),
-    Row("search", "PSB meshes, 0.5 outliers a match", partial(search, "psb-0.50"), (100, 3), *PAPER, data="psb"),
-    Row("search", "photos, the points that they see", partial(reported_scenes, ""), (100, 5), 1.0, data="colmap"),
-    Row("search", "photos, 0.5 outliers a match", partial(reported_scenes, "-0.50"), (100, 5), 1.0, data="colmap"),
+    Row("search", "PSB meshes, the paper's protocol", partial(shapes.problems, "psb"), (100, 3), *PAPER, "psb", True),
+    Row("search", "PSB meshes, any rotation", partial(shapes.problems, "psb-so3"), (100, 3), *PAPER, "psb"),
+    Row("search", "PSB meshes, 0.5 outliers a match", partial(shapes.problems, "psb-0.50"), (100, 3), *PAPER, "psb"),
+    *(
+        Row("search", f"photos, {name}", partial(shapes.problems, chosen), (100, 5), 1.0, data="colmap")
+        for name, chosen in (("the points that they see", "photos"), ("0.5 outliers a match", "photos-0.50"))
+    ),
     Row("maps", "left out of its map, which view is told", partial(photos, "best view", 1.0), (48, 5), 1.0,
         data="colmap"),
     Row("maps", "left out of its map, nothing is told", partial(photos, "map", 1.0), (58, 5), 1.0, data="colmap",
@@ -131,16 +111,14 @@ ROWS = (
                      "headset, 8 lights, 20 % missing", "ring, no normals, 3 lights", "drone, 3 lights")
     ),
     Row("networks", "`procedural-euler`, PSB meshes, the paper's protocol",
-        partial(network, "procedural-euler", "refined", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER,
-        data="psb", in_readme=True),
+        partial(network, "procedural-euler", {"root": "psb", "rotation": "euler"}), (100, 3), *PAPER, "psb", True),
     Row("networks", "`procedural-so3`, PSB meshes, any rotation",
-        partial(network, "procedural-so3", "refined", {"root": "psb", "rotation": "so3"}), (100, 3), *PAPER,
-        data="psb"),
+        partial(network, "procedural-so3", {"root": "psb", "rotation": "so3"}), (100, 3), *PAPER, "psb"),
     Row("networks", "`procedural-so3`, procedural shapes, any rotation",
-        partial(network, "procedural-so3", "refined", {"rotation": "so3"}), (100, 3), *PAPER),
+        partial(network, "procedural-so3", {"rotation": "so3"}), (100, 3), *PAPER),
     Row("networks", "`matcher-clutter`, PSB meshes, 0.5 outliers a match",
-        partial(network, "matcher-clutter", "refined", {"root": "psb", "rotation": "euler",
-        "test_outliers": Outliers(ratio=0.5)}), (40, 2), *PAPER, data="psb"),
+        partial(network, "matcher-clutter", {"root": "psb", "rotation": "euler",
+        "test_outliers": Outliers(ratio=0.5)}), (40, 2), *PAPER, "psb"),
 )  # fmt: skip
 
 
@@ -148,17 +126,13 @@ def key(row: Row) -> str:
     return f"{row.table}: {row.name}"
 
 
-def measure(options: argparse.Namespace) -> Iterator[tuple[Row, dict[str, Any]]]:
+def rows(options: argparse.Namespace) -> Iterator[record.Row]:
     for row in ROWS:
-        if not any(part in key(row) for part in options.only):
-            continue
         if row.data and not (options.data / row.data).is_dir():
             print(f"{key(row)}: left out, needs {options.data / row.data}", flush=True)
             continue
-        count = row.problems[options.quick]
-        found = summary(outcomes(row.measure(count, options.seed, options.data)), row.right_deg, row.right_shift)
-        print(f"{key(row)}: {line(found)}", flush=True)
-        yield row, found | {"seed": options.seed}
+        drawn = partial(row.measure, row.problems[options.quick], options.seed, options.data)
+        yield record.Row(key(row), drawn, row.right_deg, row.right_shift)
 
 
 def differences(new: dict[str, Any], old: dict[str, Any]) -> list[str]:
@@ -213,18 +187,18 @@ def main() -> None:
     options.add_argument("--file", type=Path, default=FILE, help="(default: benchmarks/results.json)")
     chosen = options.parse_args()
     torch.set_num_threads(1)
-    warm_up()
     kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
     part = "quick" if chosen.quick else "full"
     known: dict[str, Any] = kept.get(part, {})
     failures = []
-    for row, result in measure(chosen):
+    for row, found, _ in measured(rows(chosen), chosen.only):
+        result = found | {"seed": chosen.seed}
         if chosen.check:
-            old = known.get(key(row))
+            old = known.get(row.name)
             bad = ["never measured"] if old is None else differences(result, old)
-            failures += [f"{key(row)}: {reason}" for reason in bad]
+            failures += [f"{row.name}: {reason}" for reason in bad]
             continue
-        known[key(row)] = result
+        known[row.name] = result
         write(chosen.file, {name: kept.get(name, {}) for name in ("quick", "full")} | {part: known})
     for document in DOCUMENTS:
         text = document.read_text(encoding="utf-8")

@@ -1,19 +1,20 @@
 """Shapes, meshes and the points that photos see, for `solve` without a prior.
 
-A set is shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3 or the
-name of a COLMAP model; a number after it is the ratio of outliers to matches on either side: random points, of photos
-keypoints without a point and points that the photo does not see.
+A set is shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3 or photos
+(as many of each of the models `REPORTED`); a number after it is the ratio of outliers to matches on either side: random
+points, of photos keypoints without a point and points that the photo does not see.
 """
 
-import re
 from collections.abc import Iterator
 from functools import partial
+from itertools import chain, islice
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 from record import TIME_LIMIT, Array, Problem, spread
 from scipy.spatial.transform import Rotation
+from view_problems import REPORTED
 
 from bpnp import solve
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
@@ -39,8 +40,8 @@ def shapes(ratio: float, limit: int, seed: int) -> Iterator[Points]:
         yield f"shape {k}", points2d, points3d, rotation, translation
 
 
-def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Iterator[Points]:
-    """Meshes or photos, spread evenly over those that there are."""
+def of_data(name: str, ratio: float, limit: int, seed: int, data: Path) -> Iterator[Points]:
+    """Meshes, or photos of a model, spread evenly over those that there are."""
     if name.startswith("psb"):
         rotation: Literal["so3", "euler"] = "so3" if name == "psb-so3" else "euler"
         module: MeshDataModule | ColmapDataModule = MeshDataModule(
@@ -57,14 +58,17 @@ def of_data(name: str, ratio: float, data: Path, limit: int, seed: int) -> Itera
         yield f"{name}/{batch.ids[0]}", *(x[0].double().numpy() for x in values if x is not None)  # type: ignore[misc]
 
 
-def problems(
-    chosen: str, data: Path, limit: int, seed: int, time_limit: float = TIME_LIMIT
-) -> Iterator[Problem]:  # fmt: skip
-    """Those of a set."""
-    match = re.fullmatch(r"(.+?)(?:-(\d+\.\d+))?", chosen)
-    assert match is not None
-    kind, ratio = match[1], float(match[2] or 0)
-    drawn = shapes(ratio, limit, seed) if kind == "shapes" else of_data(kind, ratio, data, limit, seed)
-    for name, points2d, points3d, rotation, translation in drawn:
+def problems(chosen: str, limit: int, seed: int, data: Path, time_limit: float = TIME_LIMIT) -> Iterator[Problem]:
+    """At most `limit` of a set."""
+    kind, _, number = chosen.rpartition("-") if "." in chosen else (chosen, "", "0")
+    ratio = float(number)
+    if kind == "shapes":
+        drawn = shapes(ratio, limit, seed)
+    elif kind == "photos":
+        each = -(-limit // len(REPORTED))
+        drawn = chain.from_iterable(of_data(scene, ratio, each, seed, data) for scene in REPORTED)
+    else:
+        drawn = of_data(kind, ratio, limit, seed, data)
+    for name, points2d, points3d, rotation, translation in islice(drawn, limit):
         search = partial(solve, points2d, points3d, seed=seed, time_limit=time_limit)
         yield Problem(name, search, [(rotation, translation)], points3d)

@@ -3,7 +3,7 @@
 Zhou, Agostinho, Osep, Leal-Taixe, "Is geometry enough for matching in visual localization?", ECCV 2022, section 5.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -120,21 +120,29 @@ def view_problem(
     index3d = index3d[order3d]
     name, pose = f"{scene.name}/{query.name}", (query.rotation, query.translation)
     return ViewProblem(
-        name, points2d[order2d], scene.points3d[index3d], order3d < kept, pose, view.name if view else None,
-        query.camera.focal, map_of(scene, query, index3d),
+        name, points2d[order2d], scene.points3d[index3d], order3d < kept, pose,
+        f"{scene.name}/{view.name}" if view else None, query.camera.focal,
+        part_of(map_of(scene, [query.name]), index3d).seen_by(1),
     )  # fmt: skip
 
 
-def map_of(scene: Reconstruction, query: ImagePoints, points: NDArray[np.int64]) -> SceneMap:
-    """The map of some points, in their order, and of all views but the photo."""
-    place = np.full(len(scene.points3d), -1, np.int32)
-    place[points] = np.arange(len(points))
+def map_of(scene: Reconstruction, left_out: Collection[str] = ()) -> SceneMap:
+    """A model's points, and its views but some."""
     views = []
-    for view in scene.images:
-        if view is not query:
-            seen = np.sort(place[view.observed[place[view.observed] >= 0]])
-            views.append(View(view.name, view.camera, view.rotation, view.translation, seen))
-    return SceneMap(scene.points3d[points], points, np.zeros(len(points), np.int32), tuple(views)).seen_by(1)
+    for image in scene.images:
+        if image.name not in left_out:
+            name, seen = f"{scene.name}/{image.name}", image.observed.astype(np.int32)
+            views.append(View(name, image.camera, image.rotation, image.translation, seen))
+    return SceneMap(scene.points3d, scene.point_ids, np.empty(0, np.int32), tuple(views))
+
+
+def part_of(place: SceneMap, points: NDArray[np.integer], name: str = "") -> SceneMap:
+    """Some points, in this order, and all views with those of them that they see; `name` begins the views' names."""
+    number = np.full(len(place.points3d), -1, np.int32)
+    number[points] = np.arange(len(points))
+    seen = ((view, number[view.points]) for view in place.views)
+    views = tuple(replace(view, name=name + view.name, points=np.sort(own[own >= 0])) for view, own in seen)
+    return SceneMap(place.points3d[points], place.point_ids[points], np.empty(0, np.int32), views)
 
 
 def scene_problems(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewProblem]:
@@ -148,13 +156,6 @@ def model_of(data: Path, name: str) -> Reconstruction:
     return read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
 
 
-def photos(limit: int, data: Path, *, apart: bool = False, **chosen: Any) -> list[ViewProblem]:
-    """Problems of at most `limit` photos of the reported scenes; apart: of other places. chosen: for `view_problem`."""
-    each = -(-limit // len(REPORTED))
-    drawn = [photo for name in REPORTED for photo in scene_problems(data, name, limit=each, **chosen)]
-    return (elsewhere(drawn) if apart else drawn)[:limit]
-
-
 def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:
     """The map of each problem with the photo of the problem that comes half of them later."""
     others = [*photos[len(photos) // 2 :], *photos[: len(photos) // 2]]
@@ -163,10 +164,15 @@ def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:
     ]
 
 
-def problems(photos: Sequence[ViewProblem], *, in_map: bool, seed: int) -> Iterator[Problem]:
-    """Of photos in their map, told the view if it is one, or by their points alone, without a prior. The error of a
-    centre is in distances of the median point."""
-    for photo in photos:
+def photos(
+    against: Against, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
+) -> Iterator[Problem]:
+    """At most `limit` photos of the reported scenes in their maps, told the view if it is one, or by the points alone,
+    without a prior; apart: in maps of other places. The error of a centre is in distances of the median point."""
+    each = -(-limit // len(REPORTED))
+    known: dict[str, Any] = {"limit": each, "against": against, "outliers": outliers, "seed": seed}
+    drawn = [photo for name in REPORTED for photo in scene_problems(data, name, **known)]
+    for photo in (elsewhere(drawn) if apart else drawn)[:limit]:
         pixels, camera = photo.pixels
         search = partial(solve, pixels, photo.points3d, camera)
         if in_map:
