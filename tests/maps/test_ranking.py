@@ -1,7 +1,5 @@
 """The rank of views: planted places of clumped points, photos beside one of them."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -9,9 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
-from bpnp.maps.ranking import STEP, places_first, scores_of_views
+from bpnp.maps.ranking import places_first, scores_of_views
 from bpnp.maps.views import View
-from bpnp.solving.focal_length import UnknownCamera
 
 Array = NDArray[np.float64]
 PLACES, POINTS = 60, 900
@@ -54,20 +51,6 @@ def test_the_view_beside_a_photo_is_among_the_first() -> None:
         ranks.append(int((scores > scores[k]).sum()))
     assert np.median(ranks) < PLACES / 12  # half by chance
     assert max(ranks) < PLACES / 4
-
-
-def test_focal_lengths_take_turns_from_the_likeliest() -> None:
-    scene = city(0)
-    views = [replace(view, camera=camera_from(("SIMPLE_PINHOLE", 800, 600, (960, 400, 300)))) for view in scene.views]
-    scene = replace(scene, views=tuple(views))  # 1.2 of the larger side
-    lens = scene._lens(None, (1000, 1000), None, False)
-    assert isinstance(lens, UnknownCamera)
-    places = scene.places(None, 1200 * photo(scene, 10, 2) + 500, lens)
-    tried = [place.lens.reference.focal * place.lens.usual for place in places]  # type: ignore[union-attr]
-    assert tried[:4] == pytest.approx([1200] * 4)
-    assert set(np.round(tried[:15])) == {1200, 960, 1500}
-    assert len({(place.view.name, round(focal)) for place, focal in zip(places, tried, strict=True)}) == len(places)
-    assert len(places) == PLACES * len(lens.ladder(STEP))
 
 
 def test_views_of_one_place_come_after_all_other_places() -> None:

@@ -10,12 +10,9 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions, view_with_outliers
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.candidates import Candidates
 from bpnp.search.point_sets import PointSets
-from bpnp.search.scene import Scene
 from bpnp.search.search import search_poses
 from bpnp.search.settings import DEFAULT, Schedule
-from bpnp.search.sources.raster import drawn_around, looked_up
 from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]
@@ -83,25 +80,3 @@ def test_a_pose_among_six_outliers_a_match_is_found_from_where_points_are_seen()
     found = search_poses(sets, settings=replace(DEFAULT, schedule=Schedule(patience=0.01, turns=40)))
     np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)
-
-
-def test_companions_are_looked_up_too() -> None:
-    """Poses are ranked by the sum of what two cameras that are fixed to each other see of them."""
-    bearings, points, rotation, translation = cluttered(2, true=100, outliers=100)
-    turn, shift = Rotation.from_rotvec([0.1, -0.2, 0.3]).as_matrix(), np.array([0.3, 0.1, -0.2])
-    moved = (points @ rotation.T + translation) @ turn.T + shift
-    others = moved / np.linalg.norm(moved, axis=-1, keepdims=True)
-    one, other = (Scene(PointSets(f, points), 0, DEFAULT) for f in (bearings, others))
-    poses = drawn_around(one, one.enter_prior(PosePrior(rotation, translation, 10.0, 0.3)), 50)
-    rotations, translations = one.leave(poses.rotation, poses.translation)
-    turned = turn @ rotations, translations @ turn.T + shift
-
-    def ranks(scene: Scene, candidates: Candidates) -> Array:
-        return looked_up(scene, candidates, DEFAULT.beside.raster, 0.06, 100, 50)[1]
-
-    alone = [ranks(one, poses), ranks(other, Candidates.unscored(*other.enter(*turned)))]
-    one.join(other, turn, shift)
-    together = ranks(one, poses)
-    assert together[0] == 0
-    places = np.argsort(alone, -1).sum(0)
-    assert np.corrcoef(places, np.argsort(together))[0, 1] > 0.95 > np.corrcoef(places, np.argsort(alone[0]))[0, 1]

@@ -69,16 +69,3 @@ def test_what_is_known_of_the_points_finds_a_pose_that_the_points_alone_do_not(k
     blind = search_poses(PointSets(sets.bearings, sets.points3d), settings=DEFAULT.limited(9))
     assert degrees_between(blind.best[0], rotation) > 5
     assert blind.verdict == "failed"
-
-
-def test_nothing_known_is_what_equal_scores_and_one_label_say() -> None:
-    bearings, points, rotation, number = cluttered(3, 40)
-    one = np.zeros_like(number)
-    bare = search_poses(PointSets(bearings, points))
-    assert degrees_between(bare.best[0], rotation) < 0.5
-    said = search_poses(
-        PointSets(bearings, points, scores2d=np.ones(140), scores3d=np.ones(140), labels2d=one, labels3d=one)
-    )
-    np.testing.assert_allclose(said.best[0], bare.best[0], atol=1e-4)
-    assert said.candidates.score[0] == pytest.approx(bare.candidates.score[0], abs=1e-3)
-    assert said.candidates.matched[0] == pytest.approx(bare.candidates.matched[0], abs=1e-3)

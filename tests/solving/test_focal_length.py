@@ -1,6 +1,7 @@
 """Pose and focal length together, on planted points and cameras."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -57,6 +58,15 @@ def test_the_verdict_pays_for_the_focal_length(found: tuple[Solution, Array]) ->
     assert known.covariance.shape == (6, 6)
     assert known.focal_length_std == 0
     assert known.centre_std < found[0].centre_std
+
+
+def test_the_verdict_names_a_wrong_focal_length() -> None:
+    pixels, scene, _ = planted(800.0, points=150)
+    right, wrong = (solve(pixels, scene, ("SIMPLE_PINHOLE", (focal, 320.0, 240.0))) for focal in (800.0, 1000.0))
+    assert (right.verdict, wrong.verdict) == ("confident", "ambiguous")
+    named = re.search(r"with ([\d.]+) times the focal length", wrong.reason)
+    assert named is not None
+    assert float(named[1]) == pytest.approx(0.8, rel=0.03)
 
 
 def test_a_plane_seen_from_the_front_leaves_the_focal_length_open() -> None:

@@ -26,13 +26,8 @@ def scene(clutter: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndar
     points = rng.normal(size=(40, 3)) @ VIEW
     rotation, translation = Rotation.from_rotvec([0.1, -0.05, 0.02]).as_matrix() @ VIEW, np.array([0.2, -0.1, 7.0])
     image = seen(points, rotation, translation)
-    others = rng.uniform(image.min(), image.max(), (clutter, 2))
-    return (
-        np.concatenate([image, others]),
-        np.concatenate([points, rng.normal(size=(clutter, 3))]),
-        rotation,
-        translation,
-    )
+    clutter2d, clutter3d = rng.uniform(image.min(), image.max(), (clutter, 2)), rng.normal(size=(clutter, 3))
+    return np.concatenate([image, clutter2d]), np.concatenate([points, clutter3d]), rotation, translation
 
 
 @pytest.mark.parametrize("far", [0.0, 1e4])
