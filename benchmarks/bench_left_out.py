@@ -3,30 +3,96 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Rows of a scene: views (the three views that share most points are named), map (none is); views-sift and map-sift, the
-same with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words
-retrieves. pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth: the pose in the model of
-all photos, aligned by the views that both models have.
+same with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each photo on the first run and keeps it
+in --maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
 """
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
-from descriptor_poses import DescribedMap
+import poselib
+import pycolmap
+from numpy.typing import NDArray
 from rebuilt_maps import PhotoScene, aligned
-from record import TIME_LIMIT, Problem, Row, parser, run, spread
+from record import TIME_LIMIT, Array, Problem, Row, parser, run, spread
 from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
+from bpnp.datamodules.colmap.model_files import read_records
 from bpnp.maps.photos import detected_keypoints
 
 CAMERA = (1379.7, 1382.1, 760.3, 503.4)  # of the photos at half size, pixels
 FEATURES = 2048  # of a photo in the maps, the largest
 VIEWS = 3
 RIGHT_DEG = 1.0
+RATIO = 0.8  # largest ratio of the distances to the nearest descriptor and to that of another point (Lowe 2004)
+THRESHOLD_PX = 8.0  # of an inlier
+LEAST_INLIERS = 12  # of a pose that counts as confident, the limit of hloc
+AT_ONCE = 256  # descriptors of the photo in one product
+
+
+class DescribedMap:
+    """The descriptors of a model's observations, from the database that the model was built from."""
+
+    def __init__(self, model: Path, database: Path) -> None:
+        records = read_records(model)
+        self._points3d = dict(zip(records.point_ids.tolist(), records.points3d, strict=True))
+        self._database = database
+        self._views = {}
+        for image in records.images:
+            _, descriptors = self._features(image.name)
+            seen = image.point_ids >= 0
+            self._views[image.name] = descriptors[seen], image.point_ids[seen]
+
+    def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
+        """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""
+        pixels, own = self._features(photo)
+        theirs, ids = zip(*(self._views[name] for name in views or self._views), strict=True)
+        keypoints, points = descriptor_matches(own, np.concatenate(theirs), np.concatenate(ids))
+        lens = {"model": "PINHOLE", "width": 0, "height": 0, "params": list(camera)}
+        pose, stats = poselib.estimate_absolute_pose(
+            pixels[keypoints], np.array([self._points3d[point] for point in points.tolist()]), lens,
+            {"max_reproj_error": THRESHOLD_PX, "seed": 0}, {},
+        )  # fmt: skip
+        verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
+        return SimpleNamespace(
+            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict,
+            covariance=np.full((6, 6), np.nan), focal_length=np.nan,
+        )  # fmt: skip
+
+    def _features(self, photo: str) -> tuple[Array, NDArray[np.float32]]:
+        """Keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""
+        with pycolmap.Database.open(self._database) as content:
+            (number,) = (image.image_id for image in content.read_all_images() if image.name == photo)
+            descriptors = content.read_descriptors(number).data.astype(np.float32)
+            pixels = content.read_keypoints(number)[:, :2].astype(np.float64)
+        return pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+
+
+def descriptor_matches(
+    own: NDArray[np.float32], theirs: NDArray[np.float32], ids: NDArray[np.int64]
+) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Places in `own` and ids of points, where the nearest descriptor passes the ratio test.
+
+    own: (m, d), theirs: (n, d), unit vectors. ids: (n,) of the points that they describe, several for each.
+    """
+    order = np.argsort(ids, kind="stable")
+    points, starts = np.unique(ids[order], return_index=True)
+    sorted_theirs = np.ascontiguousarray(theirs[order].T)
+    nearest, ratios = [], []
+    for first in range(0, len(own), AT_ONCE):
+        likeness = np.maximum.reduceat(own[first : first + AT_ONCE] @ sorted_theirs, starts, axis=1)
+        two = np.sort(np.partition(likeness, -2, axis=1)[:, -2:], axis=1)
+        squares = np.maximum(2 - 2 * two, 1e-12)
+        nearest.append(likeness.argmax(1))
+        ratios.append(np.sqrt(squares[:, 1] / squares[:, 0]))
+    kept = np.flatnonzero(np.concatenate(ratios) < RATIO)
+    return kept, points[np.concatenate(nearest)[kept]]
 
 
 def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dict[str, Problem]:
@@ -44,8 +110,6 @@ def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dic
     for method, named in (("views", views), ("map", None)):
         searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **known)
         searches[f"{method}-sift"] = partial(described.localize, photo, CAMERA, named)
-    _ = described.words  # made before the first photo
-    searches["words-sift"] = lambda: described.localize(photo, CAMERA, described.retrieved(photo))
     name, pose = f"{scene.photos.name}/{photo}", alignment.pose(true.rotation, true.translation)
     return {
         method: Problem(name, search, [pose], distance=far * alignment.scale) for method, search in searches.items()

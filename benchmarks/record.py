@@ -28,7 +28,6 @@ TIME_LIMIT = 60.0  # seconds: so many that a search ends by its own rules, also 
 NO_POSE_DEG = 180.0
 NEAR_FOCAL = 0.03  # of a focal length that counts as right
 FAR_DEG = 3.0  # from which a confident pose with an unknown focal length is counted, whatever its bound
-NORMAL = (0.6827, 0.9545, 0.9973)  # shares within 1, 2 and 3 standard deviations
 BOUND = 0.999  # share of the confident poses that are within their bound
 
 T = TypeVar("T")
@@ -74,7 +73,7 @@ class Problem:
     """Something to solve, and the poses of which any is right: none where points have no pose in common.
 
     points3d: of the scene, whose middle tells how far a pose is off. distance: unit of the error of the camera's
-    centre. focal: the true focal length in pixels, scale: that of a rig's scene, where it is to be found too.
+    centre. focal: the true focal length in pixels, where it is to be found too.
     """
 
     name: str
@@ -83,7 +82,6 @@ class Problem:
     points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))
     distance: float = 1.0
     focal: float = np.nan
-    scale: float = np.nan
 
 
 @dataclass(frozen=True)
@@ -93,8 +91,7 @@ class Outcome:
     shift: of the camera's centre, in units of the problem's distance. moved: of the middle of the scene as the camera
     sees it, in its distances. verdict: "" of a method that has none. outside: whether the true poses lie beyond the
     bound that the solution claims (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where
-    it was known. sigmas: errors in their own standard deviations (`sigmas`); of the scale alone where it was to be
-    found.
+    it was known. sigmas: errors in their own standard deviations (`sigmas`), of a pose that is near.
     """
 
     problem: str
@@ -132,11 +129,8 @@ def solved(problem: Problem) -> Outcome:
     found = problem.solve()
     seconds = time.process_time() - start
     turn, shift, moved, pose = nearest(problem, found.rotation, found.translation)
-    outside, off = all(beyond_bound(found, *one) for one in problem.poses), list[float]()
-    if np.isfinite(problem.scale):
-        off = [abs(found.scale - problem.scale) / found.scale_std]
-    elif turn < FAR_DEG:
-        off = sigmas(found, pose, np.median(problem.points3d, 0))
+    outside = all(beyond_bound(found, *one) for one in problem.poses)
+    off = sigmas(found, pose, np.median(problem.points3d, 0)) if turn < FAR_DEG else []
     focal = float(found.focal_length / problem.focal)
     return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, off)
 
@@ -198,9 +192,8 @@ def degrees(one: Any, other: Any) -> float:
 
 def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     """Quartiles of the rotation's error, shares right and confident, how many are confident, wrong and beyond their own
-    bound, CPU seconds; which share of the errors of right poses is within 1, 2 and 3 of their standard deviations, and
-    the factors of these with which 68, 95 and 99.7 % would be; where focal lengths were not known the share that are
-    near, and how many are confident and far.
+    bound, CPU seconds; which share of the errors of right poses is within 1, 2 and 3 of their standard deviations;
+    where focal lengths were not known the share that are near, and how many are confident and far.
     """
     turn, focal, seconds = np.array([(o.rotation_deg, o.focal, o.cpu_seconds) for o in found]).T
     right, sure = np.array([row.is_right(o) for o in found]), np.array([o.verdict == "confident" for o in found])
@@ -217,7 +210,6 @@ def summary(found: Sequence[Outcome], row: Row) -> dict[str, Any]:
     }
     if off := [abs(one) for o, good in zip(found, right, strict=True) if good for one in o.sigmas]:
         result["sigmas"] = [round(float((np.array(off) < limit).mean()), 4) for limit in (1, 2, 3)]
-        result["factors"] = [round(float(np.quantile(off, share)) / k, 2) for k, share in enumerate(NORMAL, 1)]
     if np.isfinite(focal).any():
         result["focal_near"] = round(float((np.abs(focal - 1) < NEAR_FOCAL).mean()), 4)
         result["confident_and_far"] = int((sure & (turn > FAR_DEG)).sum())

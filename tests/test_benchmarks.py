@@ -10,9 +10,8 @@ from unittest.mock import Mock
 
 import bench_city
 import bench_layers
-import descriptor_poses
+import bench_left_out
 import numpy as np
-import problems
 import pytest
 import rebuilt_maps
 import record
@@ -48,8 +47,7 @@ def _threads() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def problem() -> SimpleNamespace:
     """40 points in float64: the plan at its optimum and the pose from which RANSAC starts the layer."""
-    planted = problems.planted(2, 40, kind="independent", level=0.9, seed=3)
-    batch, cost = planted.batch.to(torch.float64), planted.cost.double()
+    batch, cost = (x.to(torch.float64) for x in bench_layers.planted(2, 40, kind="independent", level=0.9, seed=3))
     plan, _ = sinkhorn(cost, tolerance=1e-13)
     rotation, translation, _ = ransac_pnp(plan, batch.points2d, batch.points3d)
     start = torch.cat([roma.rotmat_to_rotvec(rotation), translation], -1)
@@ -232,7 +230,7 @@ def test_descriptors_are_matched_to_points_seen_from_several_views() -> None:
     photo = np.concatenate([points[:100] + 0.1 * rng.normal(size=(100, 64)), rng.normal(size=(500, 64))])
     theirs, own = ((rows / np.linalg.norm(rows, axis=1, keepdims=True)).astype(np.float32) for rows in (seen, photo))
     ids = np.tile(np.arange(300) + 7, 3)
-    keypoints, matched = descriptor_poses.descriptor_matches(own, theirs, ids)
+    keypoints, matched = bench_left_out.descriptor_matches(own, theirs, ids)
     true = keypoints < 100
     assert true.sum() == 100
     np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
