@@ -5,7 +5,8 @@
 
 LEDs: each camera sees 4 to 6 of them, without normals, and a light that is not the headset's; one camera: the first of
 a rig alone. photos: three that overlap as one rig, and each of them alone, against the points of one view with all
-keypoints and points that have no partner; --limit of each scene. Right is a rotation within 3 degrees.
+keypoints and points that have no partner; --limit of each scene. scale unknown: of 0.2 to 5, which is found. Right is a
+rotation within 3 degrees.
 """
 
 import argparse
@@ -30,7 +31,7 @@ def pose_matrix(rotation: Array, translation: Array) -> Array:
     return np.block([[rotation, np.reshape(translation, (3, 1))], [np.zeros((1, 3)), 1.0]])
 
 
-def problems(cameras: int, used: int, limit: int, seed: int) -> Iterator[Problem]:
+def problems(cameras: int, used: int, limit: int, seed: int, scale: bool) -> Iterator[Problem]:
     """A new device every fifth frame; so many cameras in random places that look at it, of which the first are used.
 
     The pose is rig_from_world, that of the first camera.
@@ -51,7 +52,8 @@ def problems(cameras: int, used: int, limit: int, seed: int) -> Iterator[Problem
             pixels.append(rng.permutation(np.concatenate([image, rng.uniform(0, PINHOLE.size, (1, 2))])))
         if min(map(len, pixels)) <= LEAST:
             continue
-        search = rig_search(pixels[:used], shown.points3d, [PINHOLE.model] * used, poses, seed=seed)
+        points3d = shown.points3d / (0.2 * 25 ** rng.random()) if scale else shown.points3d
+        search = rig_search(pixels[:used], points3d, [PINHOLE.model] * used, poses, seed=seed, scale=scale)
         yield Problem(f"{number}", search, [(poses[0][:3, :3], poses[0][:3, 3])], shown.points3d)
         number += 1
 
@@ -93,8 +95,14 @@ def main() -> None:
     options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
     chosen = options.parse_args()
     rows = [
-        Row(f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed), RIGHT_DEG)
-        for name, cameras, used in (("2 cameras", 2, 2), ("4 cameras", 4, 4), ("one camera", 2, 1))
+        Row(f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, scale), RIGHT_DEG)
+        for name, cameras, used, scale in (
+            ("2 cameras", 2, 2, False),
+            ("4 cameras", 4, 4, False),
+            ("one camera", 2, 1, False),
+            ("2 cameras, scale unknown", 2, 2, True),
+            ("4 cameras, scale unknown", 4, 4, True),
+        )
     ] + [
         Row(f"photos, {name}", partial(of_photos, slice(*used), chosen), RIGHT_DEG)
         for name, used in (("camera 1", (0, 1)), ("camera 2", (1, 2)), ("camera 3", (2, 3)), ("3 cameras", (0, 3)))

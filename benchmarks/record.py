@@ -129,7 +129,7 @@ def solved(problem: Problem) -> Outcome:
     found = problem.solve()
     seconds = time.process_time() - start
     turn, shift, moved, pose = nearest(problem, found.rotation, found.translation)
-    outside = all(beyond_bound(found, *one) for one in problem.poses)
+    outside = all(beyond_bound(found, one) for one in problem.poses)
     off = sigmas(found, pose, np.median(problem.points3d, 0)) if turn < FAR_DEG else []
     focal = float(found.focal_length / problem.focal)
     return Outcome(problem.name, turn, shift, found.verdict, seconds, outside, focal, moved, off)
@@ -146,41 +146,35 @@ def nearest(problem: Problem, rotation: Array, translation: Array) -> tuple[floa
     return min(errors, default=(NO_POSE_DEG, np.inf, np.inf, None), key=lambda error: error[0])
 
 
-def beyond_bound(found: Solution, rotation: Any, translation: Any) -> bool:
+def beyond_bound(found: Solution, pose: Pose) -> bool:
     """Whether the true rotation, or the true pose, lies outside the region that the solution claims to hold it with a
     probability of 99.9 %, as the bound in `reason` does: of errors e with e^T C^-1 e / d below the quantile of F with
     d and the degrees of freedom of the residuals, C the covariance less what widens it for few residuals.
 
     The promise of a confident pose is broken by one that is wrong (some degrees off) and beyond its bound.
     """
-    if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
-        return True
-    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), translation - found.translation]
-    size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
-    error, covariance = error[:size], found.covariance[:size, :size]
-    unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
-    free = max(2 * len(found.matches) - len(found.covariance), 1)
+    squared, free = np.square(sigmas(found, pose, np.zeros(3))), max(2 * len(found.matches) - len(found.covariance), 1)
     widened = stdtrit(free, ONE_SIGMA) ** 2
-    return any(
-        (error * unit)[:d] @ np.linalg.pinv((covariance * np.outer(unit, unit))[:d, :d]) @ (error * unit)[:d]
-        > d * fdtri(d, free, BOUND) / widened
-        for d in (3, size)
-    )
+    return not len(squared) or any(squared[:d].sum() > d * fdtri(d, free, BOUND) / widened for d in {3, len(squared)})
 
 
 def sigmas(found: Solution, pose: Pose, middle: Array) -> list[float]:
-    """The error of a pose along six independent directions, in the standard deviations that its covariance claims; that
-    of the shift at the middle of the scene (3,), since far from it a turn moves points by more than the first order."""
-    if found.covariance.shape != (6, 6) or not np.isfinite(found.covariance).all():
-        return []
+    """The error along three or six independent directions, first of the rotation alone, in the standard deviations that
+    its covariance claims; that of the shift at the middle of the scene (3,), since far from it a turn moves points by
+    more than the first order. Empty where nothing is claimed."""
     (rotation, translation), seen = pose, found.rotation @ middle
+    if not (np.isfinite(found.covariance).all() and np.isfinite(rotation).all()):
+        return []
+    size = 3 if len(found.covariance) < 6 else 6  # of directions the rotation alone; a focal length is the last one
     moved = np.eye(6)
     moved[3:, :3] = np.cross(np.eye(3), seen).T  # w x (R m)
-    covariance = moved @ found.covariance @ moved.T
+    moved = moved[:size, :size]
+    covariance = moved @ found.covariance[:size, :size] @ moved.T
     shift = rotation @ middle + translation - seen - found.translation
-    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift]
-    unit = 1 / np.sqrt(np.diag(covariance))
-    return np.linalg.solve(np.linalg.cholesky(covariance * np.outer(unit, unit)), error * unit).tolist()
+    error = np.r_[Rotation.from_matrix(rotation @ found.rotation.T).as_rotvec(), shift][:size]
+    unit = 1 / np.sqrt(np.maximum(np.diag(covariance), 1e-300))  # radians and units of the scene differ by decades
+    scaled = covariance * np.outer(unit, unit) + 1e-12 * np.eye(size)
+    return np.linalg.solve(np.linalg.cholesky(scaled), error * unit).tolist()
 
 
 def degrees(one: Any, other: Any) -> float:

@@ -121,12 +121,12 @@ def test_a_true_pose_is_beyond_its_bound_as_often_as_that_says(matches: int) -> 
     scales = np.sqrt(free / rng.chisquare(free, (4000, 1))) / one_sigma
     for error in scales * rng.standard_normal((4000, 6)) @ root.T:
         true = (Rotation.from_rotvec(error[:3]) * turn).as_matrix()
-        beyond.append(record.beyond_bound(found, true, shift + error[3:]))
+        beyond.append(record.beyond_bound(found, (true, shift + error[3:])))
     assert 1 <= sum(beyond) <= 16
     found.covariance = (root @ root.T)[:3, :3]  # of directions at infinity
-    assert not record.beyond_bound(found, found.rotation, shift)
+    assert not record.beyond_bound(found, (found.rotation, shift))
     found.covariance = np.full((6, 6), np.nan)  # nothing is claimed
-    assert record.beyond_bound(found, found.rotation, shift)
+    assert record.beyond_bound(found, (found.rotation, shift))
     outcomes = [record.Outcome("", 5.0, 0.0, "confident", 1.0, outside) for outside in (True, False)]
     row = record.Row("", list, 3.0)
     assert record.summary(outcomes, row)["confident_and_wrong"] == 1
