@@ -216,8 +216,8 @@ def problems(scene: SceneMap, photos: Sequence[CityPhoto], seed: int) -> Iterato
     with tempfile.TemporaryDirectory() as folder, multiprocessing.get_context("spawn").Pool(1, None, (), 1) as pool:
         written(scene, Path(folder))
         first, again = pool.map(opened, [Path(folder)] * 2, chunksize=1)
+    _ = scene.cones, scene.pictures  # before the first photo
     print(f"opened in {first}, again {again}, {ranked(scene, photos)}", end="; ", flush=True)
-    _ = scene.cones  # before the first photo
     for photo in photos:
         pixels, camera = photo.focal * photo.points2d, np.diag([photo.focal, photo.focal, 1.0])
         search = partial(scene.localize, pixels, camera, seed=seed, time_limit=TIME_LIMIT)
