@@ -104,6 +104,11 @@ class BpnpCLI(LightningCLI):
             if self.trainer.is_global_zero and not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
                 say(f"wrote {path}")
 
+    def after_test(self) -> None:
+        """Raise ValueError if there was nothing to test: Lightning is silent."""
+        if not sum(self.trainer.num_test_batches):
+            raise ValueError(f"expected problems to test on, got none from {type(self.datamodule).__name__}")
+
     def _check_checkpoint(self, subcommand: str) -> None:
         """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""
         path = self._get(self.config, "ckpt_path")

@@ -91,7 +91,7 @@ def pose_losses(pose: Pose, batch: Batch) -> Float[Tensor, " b"]:
 
 def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
     if batch.rotation is None or batch.translation is None:
-        raise ValueError("expected a batch with its true `rotation` and `translation`, got None")
+        raise ValueError("expected a batch with its true `rotation` and `translation`, got None; try Batch.from_arrays")
     return batch.rotation, batch.translation
 
 
@@ -114,7 +114,8 @@ def matching_likelihood_loss(prediction: Prediction, batch: Batch) -> Float[Tens
     """
     assignment, match3d = prediction.assignment, batch.match3d
     if assignment is None or match3d is None:
-        raise ValueError("expected an assignment and a batch with `match3d`, got None")
+        missing = "assignment" if assignment is None else "match3d"
+        raise ValueError(f"expected an assignment and a batch with `match3d`, got no {missing}; try Batch.from_arrays")
     partner = match3d.clamp_min(0)
     paired = (match3d >= 0).to(assignment.dtype)
     # Several 3D points may have been seen as one 2D point.

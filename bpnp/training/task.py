@@ -94,7 +94,10 @@ class BlindPnPTask(LightningModule):
         self.refine_validation = refine_validation
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
         self.tabled: set[str] = set()  # names of the figures that the tables of a test show
-        estimates: tuple[str, ...] = tuple(getattr(self.solver, "estimates", ()))
+        estimates: tuple[str, ...] | str = getattr(self.solver, "estimates", ())
+        if isinstance(estimates, str):
+            raise ValueError(f"expected `estimates` as a tuple of names, got {estimates!r}; try ({estimates!r},)")
+        estimates = tuple(estimates)
         validated = tuple(name for name in estimates if refine_validation or name != REFINED)
         self.estimates: dict[Stage, tuple[str, ...]] = {"val": validated, "test": estimates}
         self.metrics = nn.ModuleDict({stage: MeanOverProblems() for stage in self.estimates})
@@ -104,6 +107,9 @@ class BlindPnPTask(LightningModule):
 
     def forward(self, batch: Batch) -> Prediction:
         return self.solver(batch)
+
+    def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
+        check_batch(batch)
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         needs_pose = self.pose_weight > 0 or (self.loss is not None and getattr(self.loss, "needs_pose", True))
@@ -130,8 +136,9 @@ class BlindPnPTask(LightningModule):
     def on_validation_epoch_start(self) -> None:
         self.numbers.clear()
 
-    def on_validation_batch_start(self, batch: Batch, batch_idx: int, dataloader_idx: int = 0) -> None:
+    def on_validation_batch_start(self, batch: Any, batch_idx: int, dataloader_idx: int = 0) -> None:
         """A data module that collates with `Batch.from_arrays` numbers the problems of each batch from 0 on."""
+        check_batch(batch)
         number_globally(batch, self.numbers, processes=self.trainer.world_size)
 
     on_test_epoch_start = on_predict_epoch_start = on_validation_epoch_start
@@ -227,6 +234,7 @@ class BlindPnPTask(LightningModule):
             prediction = self.solver(batch)
             _wait(self.device)
         seconds = time.perf_counter() - start
+        check_prediction(prediction, batch, self.estimates[stage], type(self.solver).__name__)
         with exact_products(self.device):
             for name in self.estimates[stage]:
                 errors = pose_errors(prediction.poses[name], batch)
@@ -275,6 +283,37 @@ class BlindPnPTask(LightningModule):
             self.log(f"{stage}/correspondence_loss", loss.compute().float())
             self.tabled.add(f"{stage}/correspondence_loss")
             loss.reset()
+
+
+def check_batch(batch: object) -> None:
+    """Raise ValueError for what a data module gives in place of a Batch."""
+    if not isinstance(batch, Batch):
+        raise ValueError(
+            f"expected a Batch from the loaders of the data module, got {type(batch).__name__}; try a `collate_fn` "
+            "that returns Batch.from_arrays(...)"
+        )
+
+
+def check_prediction(prediction: object, batch: Batch, estimates: tuple[str, ...], solver: str) -> None:
+    """Raise ValueError for what a solver returns in place of a Prediction with its estimates, a pose a problem."""
+    if not isinstance(prediction, Prediction):
+        raise ValueError(
+            f"expected a Prediction from {solver}, got {type(prediction).__name__}; try "
+            "`return Prediction(poses={name: Pose(rotation, translation, stats)})`"
+        )
+    if absent := [name for name in estimates if name not in prediction.poses]:
+        raise ValueError(
+            f"expected all `estimates` of {solver} in Prediction.poses, got none named {', '.join(absent)} among "
+            f"{list(prediction.poses)}; try one name in both"
+        )
+    wanted = (len(batch), 3, 3), (len(batch), 3)
+    for name, pose in prediction.poses.items():
+        got = tuple(pose.rotation.shape), tuple(pose.translation.shape)
+        if got != wanted:
+            raise ValueError(
+                f"expected rotations {wanted[0]} and translations {wanted[1]} of {name!r} from {solver}, got {got[0]} "
+                f"and {got[1]}; try one pose a problem, NaN where none was found"
+            )
 
 
 def number_globally(batch: Batch, numbers: set[int], *, processes: int) -> None:

@@ -1,11 +1,12 @@
 import math
 import warnings
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 from lightning import Callback, LightningDataModule, Trainer
-from planted import padded, plant
+from planted import padded, plant, posed
 from small_data import SMALL_MESHES, quiet_trainer, small_net
 from torch import nn
 from torch.utils.data import DataLoader, Dataset
@@ -201,6 +202,43 @@ def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path:
         expected = correspondence_loss(task.solver.eval().match(one_batch).assignment, one_batch.match3d).mean()
     assert float(tested["test/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
     assert float(validated["val/correspondence_loss"]) == pytest.approx(float(expected), rel=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("answer", "estimates", "error"),
+    [
+        (lambda batch: batch.points2d, ("a",), "expected a Prediction from Answering, got Tensor"),
+        (
+            lambda batch: Prediction(poses={"b": posed(batch.rotation, batch.translation)}),
+            ("a",),
+            r"got none named a among \['b'\]",
+        ),
+        (
+            lambda batch: Prediction(poses={"a": posed(batch.rotation, batch.translation)}),
+            "a",
+            r"as a tuple of names, got 'a'; try \('a',\)",
+        ),
+        (
+            lambda batch: Prediction(poses={"a": posed(batch.rotation[:1], batch.translation[:1])}),
+            ("a",),
+            r"\(2, 3, 3\) and .* got \(1, 3, 3\)",
+        ),
+    ],
+)
+def test_what_a_solver_returns_is_checked(answer: Any, estimates: Any, error: str, tmp_path: Path) -> None:
+    class Answering(nn.Module):
+        forward = staticmethod(answer)
+
+    Answering.estimates = estimates
+    loader = DataLoader([Numbers()[0], Numbers()[1]], 2, collate_fn=collated)
+    with pytest.raises(ValueError, match=error):
+        quiet_trainer(tmp_path).test(BlindPnPTask(Answering()), loader)
+
+
+def test_a_loader_that_gives_no_batch_is_named(tmp_path: Path) -> None:
+    for run in (quiet_trainer(tmp_path).fit, quiet_trainer(tmp_path).test):
+        with pytest.raises(ValueError, match=r"expected a Batch from the loaders .* got list; try a `collate_fn`"):
+            run(BlindPnPTask(small_net()), DataLoader([(torch.rand(5, 2), torch.rand(5, 3))] * 2, 2))
 
 
 def test_several_processes_cannot_number_anew() -> None:
