@@ -2,6 +2,7 @@
 
 import json
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -55,12 +56,17 @@ class Method:
             described["checkpoint_state"] = [state.st_size, int(state.st_mtime)]
         return dict(plain(described))
 
+    @property
+    def settings(self) -> dict[str, Any]:
+        """The class and all arguments of its constructor."""
+        init_args = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
+        return {"class_path": self.class_path, "init_args": init_args}
+
     def build(self) -> nn.Module:
         """The solver in evaluation mode. Raises ValueError for settings that its class does not have."""
         if self.class_path in TRAINED and self.checkpoint is not None:
             return TrainedNet.from_checkpoint(self.checkpoint)
-        init_args = self.init_args | ({} if self.checkpoint is None else {"checkpoint": self.checkpoint})
-        solver: nn.Module = build(nn.Module, "solver", {"class_path": self.class_path, "init_args": init_args})
+        solver: nn.Module = build(nn.Module, "solver", self.settings)
         if self.time_limit is not None and "time_limit" in vars(solver):
             vars(solver)["time_limit"] = self.time_limit
         return solver.eval()
@@ -69,7 +75,8 @@ class Method:
 def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> list[Method]:
     """Methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path or a YAML file with a solver in it.
 
-    Raises ValueError for what names no method, a missing checkpoint, or two methods of one label.
+    Raises ValueError for what names no method, settings that it does not have, a missing checkpoint, or two methods of
+    one label.
     """
     methods: dict[str, Method] = {}
     for text in texts:
@@ -81,7 +88,9 @@ def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> l
         if label in methods:
             raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
         weights = str(checkpoint_path(checkpoint)) if at else None
-        methods[label] = Method(label, class_path, init_args, weights, time_limit)
+        methods[label] = method = Method(label, class_path, init_args, weights, time_limit)
+        if class_path not in TRAINED or weights is None:
+            _parsed(nn.Module, "solver", method.settings)  # before any test runs
     return list(methods.values())
 
 
@@ -105,7 +114,7 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
 
     Raises ValueError for a file without it, for a class that cannot be imported, or for what it does not accept.
     """
-    data = _recipe(recipe, "`data`; try --data psb").get("data")
+    data = _recipe(recipe, "`data`").get("data")
     if not data:
         raise ValueError(f"expected `data` in {recipe}, got none; try --data psb")
     settings = data if isinstance(data, dict) else {"class_path": data}
@@ -114,7 +123,9 @@ def read_data(recipe: Path, overrides: Sequence[str]) -> dict[str, Any]:
 
 def _recipe(path: Path, what: str) -> dict[str, Any]:
     if not path.is_file():
-        raise FileNotFoundError(f"expected a recipe with {what}, got no file {path}")
+        raise FileNotFoundError(
+            f"expected a recipe with {what}, got no file {path}; try the name of a packaged one, such as psb"
+        )
     return config_content(path)
 
 
@@ -207,5 +218,8 @@ def _parsed(
     try:
         return parser, parser.parse_args([f"--{name}={json.dumps(settings)}", *overrides])
     except Exception as error:
-        reason = str(error).strip().splitlines()[-1].strip()
-        raise ValueError(f"expected settings of {settings.get('class_path')}, got {reason}") from error
+        told = re.search(r"Errors:\n\s*- (.*?)\n\s*(?:- |Given value)", str(error), re.DOTALL)
+        reason = " ".join(told[1].split()) if told else str(error).strip().splitlines()[-1].strip()
+        raise ValueError(
+            f"expected {settings.get('class_path')} as a {base.__name__} and arguments of its own, got: {reason}"
+        ) from error

@@ -1,6 +1,7 @@
 """`bpnp table`: what it runs, keeps, resumes and prints."""
 
 import csv
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -117,9 +118,20 @@ class Poseless(nn.Module):
         return Prediction()
 
 
-def test_a_method_without_poses_is_named(recipes: list[str], fails: Callable[..., str]) -> None:
-    words = ["table", recipes[1], "--methods", "it=test_table_command.Poseless", recipes[-1], "--limit=1"]
-    assert "expected a pose from 'it', got predictions without one" in fails(*words)
+@pytest.mark.parametrize(
+    ("method", "error"),
+    [
+        ("Poseless", "expected a pose from 'it', got predictions without one"),
+        ("Nowhere", "got: Problem with given class_path 'test_table_command.Nowhere': module .* has no attribute"),
+        ("functools.partial", "as a Module and arguments of its own, got: Import path functools.partial does not"),
+    ],
+)
+def test_a_class_that_is_no_method_is_named(
+    recipes: list[str], fails: Callable[..., str], tmp_path: Path, method: str, error: str
+) -> None:
+    path = method if "." in method else f"test_table_command.{method}"
+    assert re.search(error, fails("table", recipes[1], "--methods", f"it={path}", recipes[-1], "--limit=1"))
+    assert (tmp_path / "out").exists() == (method == "Poseless")  # the others before any test
 
 
 def test_a_method_that_was_interrupted_starts_again(recipes: list[str], tmp_path: Path) -> None:
