@@ -60,6 +60,7 @@ def localize(
         time_limit: seconds a photo.
         seed: of the search.
     """
+    from bpnp.checks import check_positive
     from bpnp.datamodules.colmap.model_files import model_format
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
     from bpnp.maps.photos import photo_files
@@ -74,22 +75,27 @@ def localize(
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
+    if time_limit is not None:
+        check_positive(time_limit=time_limit)
+    known: dict[str, Any] = {
+        "attempts": _attempts(cluster),
+        "camera": None if camera is None else _camera(camera, map, scene),
+        "views": None if views is None else read_views(views),
+    }
     with claimed(output), progress() as shown:
         folder, bar = SolutionFolder(output, content_of_map(map)), shown.add_task("localizing", total=len(files))
         outcome = localize_photos(
             scene,
             files,
             folder,
-            attempts=_attempts(cluster),
             pictures=not no_pictures,
             done=lambda name: shown.update(bar, description=f"localized {name}", advance=1),
-            camera=None if camera is None else _camera(camera, map, scene),
-            views=None if views is None else read_views(views),
             keypoints=keypoints,
             leave_one_out=leave_one_out,
             solver=solver,
             seed=seed,
             time_limit=time_limit,
+            **known,
         )
     _report(files, folder, outcome, pictures=not no_pictures)
 
@@ -108,7 +114,7 @@ def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outco
         say(f"solved again, with {change}: {name}", to=out)
     if others := folder.of_other_maps():
         say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
-    for name, reason in errors.items():
+    for name, reason in list(errors.items())[1:]:  # the first is said by the error below
         say(f"{name}: {reason}", to=out)
     written = ", solutions/, pictures/" if pictures else ", solutions/"
     say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)

@@ -79,7 +79,7 @@ def read_camera(text: str, image: str | None = None) -> Any:
     if not numbers or None in numbers or not model.replace("_", "").isalnum() or model[0].isdigit():
         raise ValueError(
             f"expected --camera as a file with a 3x3 matrix or as MODEL,PARAMETERS such as SIMPLE_PINHOLE,800,320,240; "
-            f"got {text!r}"
+            f"got {text!r}, which is neither"
         )
     from bpnp.cameras import camera_models
 
@@ -105,7 +105,8 @@ def read_pose(path: Path) -> tuple[Array, Array]:
         content = json.loads(path.read_text(encoding="utf-8"))
         return np.array(content["rotation"], np.float64), np.array(content["translation"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {error}") from error
+        reason = f"no {error}" if isinstance(error, KeyError) else "no file" if not path.is_file() else error
+        raise ValueError(f"expected JSON with `rotation` and `translation` in {path}, got {reason}") from error
 
 
 def read_pairs(path: Path) -> Array:

@@ -112,6 +112,8 @@ def solve(
     if under is not None:
         size_in_camera(under, camera_from(lens))
     for path in (output, picture):  # raises before the search where its result could not be written
+        if path is not None and path.is_dir():
+            raise ValueError(f"expected a file to write to, got the folder {path}; try a name in it")
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
     with progress(items=False) as shown:

@@ -122,6 +122,7 @@ def test_options_and_columns_reach_the_search_as_they_are_written(tmp_path: Path
         (lambda files: [*files, "--time-limit", "0"], "positive `time_limit`"),
         (lambda files: [*files, "--surface", "100"], "a mesh to draw 100 points from"),
         (lambda files: [*files, "--picture", "a.jpeg"], "--picture that ends in .png, .svg, .pdf"),
+        (lambda files: [*files, "--output", str(Path(files[0]).parent)], "expected a file to write to, got the folder"),
         (lambda files: [*files, "--device", "tpu9"], "`device` of this machine"),
     ],
 )
