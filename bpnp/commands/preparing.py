@@ -98,8 +98,8 @@ def _show(store: "Store", counts: Mapping[str, int]) -> None:
 def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv"] = "poselib") -> None:
     """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
 
-    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. Raises ValueError or OSError as
-    `load_authors_weights` does, and leaves no file that is half written.
+    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. No file is
+    left half written.
 
     Args:
         file: the authors' file, *.pth.tar.

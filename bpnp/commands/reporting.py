@@ -22,7 +22,7 @@ def report(
 
     Args:
         runs: folders that `bpnp test` or `bpnp table` wrote, or their runs.
-        paper: the paper's rows beneath, for orientation.
+        paper: modelnet40 or megadepth, the paper's rows beneath, for orientation.
         html: write a page that needs no network.
         recall: write the recall curves as .png, .svg or .pdf.
     """

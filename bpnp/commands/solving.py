@@ -68,16 +68,17 @@ def solve(
         json: print JSON instead of a table.
         surface: points to draw from a mesh; its vertices by default.
         prior: rough pose, the JSON of a solution; or a network, packaged weights by name or a checkpoint.
-        prior_degrees: standard deviation of its rotation.
+        prior_degrees: standard deviation of its rotation, degrees.
         prior_distance: standard deviation of its translation, scene units; unknown by default.
         up_camera: direction up in the camera (x right, y down, z forward), such as 0 -1 0, if gravity is known.
         up_scene: the same direction in the scene, such as 0 0 1.
-        up_degrees: standard deviation of the direction up.
+        up_degrees: standard deviation of the direction up, degrees.
         clutter: share of the points without a partner, if known.
         at_infinity: points3d are unit directions, such as of stars; the rotation alone is found.
         solver: auto, which asks a packaged matcher when the search is in doubt; search; or a
             network, packaged weights by name or a checkpoint.
-        inlier_threshold: largest error of a match, pixels with a camera.
+        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
+            times the residuals' scale by default.
         time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search.
         device: such as cuda; cpu by default.
@@ -181,7 +182,8 @@ def verify(
         output: write the solution as JSON.
         json: print JSON instead of a table.
         surface: points to draw from a mesh; its vertices by default.
-        inlier_threshold: largest error of a match, pixels with a camera.
+        inlier_threshold: largest error of a match, pixels with a camera, else of x/z, y/z; three
+            times the residuals' scale by default.
         time_limit: seconds, 10 by default; inf for no limit.
         seed: of the search around the pose.
     """
