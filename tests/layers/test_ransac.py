@@ -80,15 +80,8 @@ def test_the_most_probable_matches_are_tried_first(backend: str) -> None:
     place = torch.arange(300).expand(8, 300)
     matched = torch.where(place < 15, planted.match3d, planted.match3d.roll(1, -1))
     assignment = torch.zeros(8, 300, 300).double().scatter_(1, matched.unsqueeze(1), 1 / (1 + place.double())[:, None])
-    r, _, stats = ransac_pnp(
-        assignment,
-        planted.points2d,
-        planted.points3d,
-        backend=backend,
-        matches_factor=1.0,
-        threshold=0.002,
-        max_iterations=64,
-    )
+    options = {"matches_factor": 1.0, "threshold": 0.002, "max_iterations": 64}
+    r, _, stats = ransac_pnp(assignment, planted.points2d, planted.points3d, backend=backend, **options)
     assert (stats.iterations <= 64).all()
     assert torch.rad2deg(rotation_angle(r, planted.rotation)).max() < 1
 

@@ -1,5 +1,7 @@
 """A place of the map that looks like another one: a box with two faces printed alike, seen from all around."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from planted import degrees_between, seen
@@ -7,6 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
+from bpnp.maps.localize import Photo
+from bpnp.maps.twins import best_rival
 from bpnp.maps.views import View
 
 FOCAL, ALIKE, DIFFERENT = 800.0, 150, 40  # pixels; points of a face
@@ -105,16 +109,11 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     points, normals = box(rng, ())
     size, turn, shift = 1.4, Rotation.random(rng=rng).as_matrix(), np.array([40.0, -10.0, 25.0])
     one = map_of(points, normals)
-    again = tuple(
-        View(
-            f"again {view.name}",
-            view.camera,
-            view.rotation @ turn.T,
-            size * view.translation - view.rotation @ turn.T @ shift,
-            view.points + np.int32(len(one.points3d)),
-        )
-        for view in one.views
-    )
+    again = []
+    for view in one.views:
+        turned, places = view.rotation @ turn.T, view.points + np.int32(len(one.points3d))
+        moved = size * view.translation - turned @ shift
+        again.append(View(f"again {view.name}", view.camera, turned, moved, places))
     both = np.concatenate([one.points3d, size * one.points3d @ turn.T + shift])
     twice = SceneMap(both, np.arange(len(both)), np.zeros(len(both), np.int32), (*one.views, *again)).seen_by(2)
     rotation, translation = pose_at(14.0, 4.2, -3.0)
@@ -125,3 +124,15 @@ def test_a_place_that_is_there_twice_is_ambiguous_whatever_its_size(seed: int) -
     other = [degrees_between(one.rotation, rotation @ turn.T) for one in solution.candidates[:2]]
     assert min(found) < 1
     assert min(other) < 1
+
+
+def test_a_pose_that_leads_to_the_best_one_is_no_twin() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = box(rng, ())
+    scene, pose = map_of(points, normals), pose_at(14.0, 4.2, -3.0)
+    keypoints = photo(rng, points, normals, *pose)
+    solution = scene.localize(keypoints, CAMERA)
+    turned = Rotation.from_rotvec([0, 0, np.radians(3)]).as_matrix()
+    beside = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
+    place = Photo(keypoints, CAMERA, scene._region(scene.views[0], np.arange(len(points))), lambda _: ())
+    assert best_rival(place, solution, [replace(solution, candidates=(beside,))]) is None

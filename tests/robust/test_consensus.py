@@ -26,16 +26,9 @@ def test_poses_and_scores_are_poselibs(inliers: float, lead: float) -> None:
     )
     # An assignment of each 2D point to the 3D point of the same index.
     weights = (torch.randn(3, MATCHES, generator=generator, dtype=torch.float64) + lead * true).exp()
+    options = {"matches_factor": 1.0, "threshold": THRESHOLD, "max_iterations": 2048}
     ours, theirs = (
-        ransac_pnp(
-            torch.diag_embed(weights),
-            points2d,
-            points3d,
-            matches_factor=1.0,
-            backend=backend,
-            threshold=THRESHOLD,
-            max_iterations=2048,
-        )
+        ransac_pnp(torch.diag_embed(weights), points2d, points3d, backend=backend, **options)
         for backend in ("torch", "poselib")
     )
     poses = torch.stack([torch.cat([r, t.unsqueeze(-1)], -1) for r, t, _ in (ours, theirs)], 1)

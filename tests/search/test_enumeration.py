@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from planted import degrees_between, directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.loops.parallel import Clock
 from bpnp.robust.minimal_solvers import p3p
 from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses
 from bpnp.search.point_sets import PointSets
@@ -74,3 +75,5 @@ def test_small_problems_are_exhausted(seed: int) -> None:
     matches = (poses.residual <= 1e-6).sum(-1)
     assert matches.max() == brute_force(rays, points, 1e-6) == 5
     assert degrees_between(poses.rotation[matches.argmax()], rotation) < 1e-3
+    late = enumerate_poses(PointSets(rays, points), radius=RADIUS, deadline=Clock.now())
+    assert (late.ended, late.solved) == ("interrupted", 0)

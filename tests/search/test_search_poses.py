@@ -89,11 +89,12 @@ def test_narrow_views_are_solved_like_wide_ones(spread: float) -> None:
     assert found.residual == pytest.approx(0.002 * spread, rel=0.3)
 
 
-def test_of_points_that_have_no_label_in_common_no_pose_is_found():
+def test_of_points_that_have_no_label_in_common_or_lie_on_a_line_no_pose_is_found():
     rng = np.random.default_rng(4)
     sets = PointSets(directions(rng.normal(size=(300, 3)) + [0, 0, 4]), rng.normal(size=(280, 3)))
-    sets = replace(sets, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
-    result = search_poses(sets)
-    assert result.verdict == "failed"
-    assert result.batches == 0
-    assert not len(result.candidates)
+    labelled = replace(sets, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
+    for lacking in (labelled, PointSets(sets.bearings, sets.points3d[:, :1] * [1.0, 2, 3])):
+        result = search_poses(lacking)
+        assert result.verdict == "failed"
+        assert result.batches == 0
+        assert not len(result.candidates)

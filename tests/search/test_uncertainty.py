@@ -50,6 +50,8 @@ def test_a_prior_bounds_what_the_points_leave_loose() -> None:
     points = np.column_stack([1e-4 * rng.standard_normal((5, 2)), rng.uniform(-1, 1, 5)])  # nearly on one line
     rays = noisy(directions(points + [0, 0, 6.0]), rng)
     free = sigma_of(PointSets(rays, points), np.eye(3), np.array([0, 0, 6.0]))
+    unseen = PointSets(rays, points, directions(points + [0, 0, 6.0]))  # with normals away from the camera
+    assert sigma_of(unseen, np.eye(3), np.array([0, 0, 6.0])) == math.inf
     known = PointSets(rays, points, prior=PosePrior(np.eye(3), None, 2.0))
     assert free > math.radians(60)
     assert sigma_of(known, np.eye(3), np.array([0, 0, 6.0])) < math.radians(2.001)
