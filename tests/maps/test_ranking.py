@@ -1,7 +1,6 @@
 """The rank of views: planted places of clumped points, photos beside one of them."""
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -62,13 +61,3 @@ def test_views_of_one_place_come_after_all_other_places() -> None:
     best_last = list(places_first(twice, scores[::-1].copy(), len(scene.points3d)))
     assert best_last[:10] == list(range(len(twice) - 1, len(twice) - 11, -1))
     assert sorted(best_last[-10:]) == list(range(10))
-
-
-def test_views_of_much_wider_points_come_last_where_the_focal_length_is_known() -> None:
-    scene = city(0)
-    narrow = 0.3 * photo(scene, 10, 1)  # three times the focal length
-    known, unknown = (scores_of_views(narrow, scene.pictures, known_focal=known) for known in (True, False))
-    assert known == pytest.approx(unknown - 2)  # all views are as wide as the photo was
-    alike = scores_of_views(photo(scene, 10, 1), scene.pictures)
-    assert (alike > 0).mean() > 0.5
-    assert int((alike > alike[10]).sum()) == int((unknown > unknown[10]).sum())

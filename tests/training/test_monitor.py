@@ -12,7 +12,7 @@ from torch import nn
 from torch.utils.data import DataLoader
 
 from bpnp import Batch, Prediction
-from bpnp.training.callbacks import TrainingMonitor, feature_spreads, watched_values
+from bpnp.training.callbacks import TrainingMonitor, watched_values
 
 
 class PlantedModule(LightningModule):
@@ -64,18 +64,6 @@ def fit(folder: Path, monitor: TrainingMonitor, logger: object, epochs: int = 3)
     loader = DataLoader([planted(6), planted(4)], batch_size=None)  # type: ignore[arg-type]
     trainer = quiet_trainer(folder, max_epochs=epochs, callbacks=[monitor], logger=logger, log_every_n_steps=1)
     trainer.fit(PlantedModule(), loader, loader)
-
-
-def test_the_spread_of_known_features() -> None:
-    """Corners are sqrt(1 - 1/4) from their mean; of opposite points what is padded does not count."""
-    corners, opposite = torch.eye(4).expand(1, 4, 4), torch.tensor([[[1.0, 0], [-3, 0], [0, 9], [0, 9]]])
-    batch, solver = planted(1), nn.Identity()
-    batch.mask2d, batch.mask3d = torch.ones(1, 4, dtype=torch.bool), torch.tensor([[True, True, False, False]])
-    assert feature_spreads(solver, batch) == {}
-    for features, spreads in (((corners, opposite), (0.75**0.5, 1)), ((torch.ones(1, 4, 3), opposite), (0, 1))):
-        solver.features = lambda _, given=features: given
-        found = feature_spreads(solver, batch)
-        assert (float(found["feature_spread_2d"]), float(found["feature_spread_3d"])) == pytest.approx(spreads)
 
 
 def test_a_planted_collapse_is_reported(tmp_path: Path) -> None:
