@@ -150,10 +150,8 @@ def test_rows_are_measured_printed_written_and_drawn(tmp_path: Path, monkeypatch
 
 def test_errors_are_those_to_the_nearest_true_pose() -> None:
     """Any of the poses is right; the middle of the scene is seen twice as far away, the centre moved by as much."""
-    turn, half = np.eye(3), np.diag([-1.0, -1, 1])
-    shift = np.array([0.0, 0, 4])
-    middle = np.full((5, 3), [0, 0, 1.0])
-    problem = record.Problem("", Mock(), [(half, shift), (turn, shift)], middle, distance=2.0)
+    turn, half, shift = np.eye(3), np.diag([-1.0, -1, 1]), np.array([0.0, 0, 4])
+    problem = record.Problem("", Mock(), [(half, shift), (turn, shift)], np.full((5, 3), [0, 0, 1.0]), distance=2.0)
     assert record.nearest(problem, turn, shift + [0, 0, 5])[:3] == (0, 2.5, 1)
     assert record.nearest(replace(problem, poses=[]), turn, shift)[0] == record.NO_POSE_DEG
 

@@ -95,6 +95,4 @@ def test_of_points_that_have_no_label_in_common_or_lie_on_a_line_no_pose_is_foun
     labelled = replace(sets, labels2d=np.ones(300, np.int64), labels3d=np.full(280, 2))
     for lacking in (labelled, PointSets(sets.bearings, sets.points3d[:, :1] * [1.0, 2, 3])):
         result = search_poses(lacking)
-        assert result.verdict == "failed"
-        assert result.batches == 0
-        assert not len(result.candidates)
+        assert (result.verdict, result.batches, len(result.candidates)) == ("failed", 0, 0)
