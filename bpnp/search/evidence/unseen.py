@@ -2,13 +2,13 @@
 
 It lies near the best pose or far from it, and what the matches say counts against both:
 
-    P = 10^(-3 e) (max(2^-h, q) F^l + q 2^-h)
+    P = 10^(-3 e) (max(2^-h, q) F G^(l - 1) + q 2^-h)
 
 - Starts. Let a better optimum attract a start as often as the best pose does, or more often. Of h independent starts
   that ended at one of the two, all ended at the best pose with a probability of at most 2^-h.
 - Near. Starts that share a wide optimum end at whichever narrow one lies in their way: however many they are, a better
-  one lies beside it with the probability q, and each of l looks, starts drawn on purpose around the best pose, fails to
-  meet it with the probability F.
+  one lies beside it with the probability q. A look, starts drawn on purpose around the best pose, fails to meet it with
+  the probability F, and each one after that with G, since looks miss the same optima; without a look F G^(l - 1) is 1.
 - Far. A pose that exceeds chance and is far from a better one is a rare repetition or symmetry: q.
 - Matches. A pose with a better one elsewhere explains a part of the points by coincidence: it aligns a part of the
   scene, or slides along a surface, and each of its matches is worth little. With e decades of evidence a match, a match
@@ -41,7 +41,8 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
 
 def near_missed(hits: int, looks: int, rule: Evidence) -> float:
     """Probability that a better optimum beside the best pose was not met."""
-    return max(0.5**hits, rule.another) * rule.look_fails**looks
+    overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
+    return max(0.5**hits, rule.another) * overlooked
 
 
 def far_missed(hits: int, rule: Evidence) -> float:
