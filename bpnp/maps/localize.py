@@ -26,7 +26,8 @@ MOST_KEYPOINTS = 2048  # the strongest; of the 2,000 largest SIFT keypoints half
 VIEW_DEGREES = 15.0  # about the largest angle per axis between photos of which one sees a third of the other's points
 VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to it
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
-BRIEF = DEFAULT.limited(1)  # one raster search
+# A search of a fourth of the time meets four fifths as many poses: near one view after the other that is more.
+BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
 LONGER = DEFAULT.limited(16)
 PROMISING = 3  # views that are tried longer if none is confident
 LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one

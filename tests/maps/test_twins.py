@@ -132,7 +132,7 @@ def test_a_pose_that_leads_to_the_best_one_is_no_twin() -> None:
     scene, pose = map_of(points, normals), pose_at(14.0, 4.2, -3.0)
     keypoints = photo(rng, points, normals, *pose)
     solution = scene.localize(keypoints, CAMERA)
-    turned = Rotation.from_rotvec([0, 0, np.radians(3)]).as_matrix()
+    turned = Rotation.from_rotvec([0, 0, np.radians(2.3)]).as_matrix()
     beside = replace(solution.candidates[0], rotation=turned @ pose[0], translation=turned @ pose[1])
     place = Photo(keypoints, CAMERA, scene._region(scene.views[0], np.arange(len(points))), lambda _: ())
     assert best_rival(place, solution, [replace(solution, candidates=(beside,))]) is None

@@ -33,7 +33,7 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
 
     >>> rule = Evidence()
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
-    [0.0, -2.0, -3.1, -3.3]
+    [0.0, -2.0, -3.24, -3.3]
     """
     unseen = near_missed(hits, looks, rule) + far_missed(hits, rule)
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
