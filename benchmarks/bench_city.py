@@ -4,25 +4,25 @@
     python -m benchmarks city --twice 0.1
 
 The models of the data, or those that are named, lie at random places, rotations and scales; changed copies of them make
-up the number of views: other places with the statistics of real ones, mirrored or not, the points moved along a smooth
-field by a tenth of the distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos
-are left out with all points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of
-the distance.
---twice: every place is there twice, this share of the points of the second one gone; a confident pose in it is wrong,
-and no pose there is right. A row begins with what it takes to open the map as a COLMAP model, and again, with the index
-of a large one: CPU seconds and peak memory of a new process before the first photo; then the rank of the views
-(`bpnp.maps.ranking`): of how many photos one of the first 1, 10 and 50 views is turned by less than 30 degrees and lies
-within half the distance.
+up the number of views: places like real ones, mirrored or not, the points moved along a smooth field by a tenth of the
+distance from which they are seen, and a third of them dropped. Photos of the scenes of --photos are left out with all
+points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
+--twice: every place is there twice, this share of the points of the second one gone; no pose there is right. A row
+begins with what it takes to open the map as a COLMAP model, and again, with the index of a large one: CPU seconds and
+peak memory of a new process before the first photo; then the rank of the views (`bpnp.maps.ranking`): of how many
+photos one of the first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
 """
 
 import argparse
 import multiprocessing
+import struct
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from record import TIME_LIMIT, Array, Pose, Problem, Row, Similarity, degrees, parser, run, spread
@@ -44,21 +44,19 @@ APART = 40.0  # side of the cube in which places lie, in distances of a view, fo
 CAMERA = camera_from(np.eye(3))  # views are looked near by pose alone
 
 
-@dataclass(frozen=True, eq=False)
-class CityPhoto:
-    """A photo that was left out: all its keypoints (m, 2), normalised; poses: the true one, and of a repeated place the
-    one there. distance: of the median point that it sees."""
+class CityPhoto(NamedTuple):
+    """A photo that was left out."""
 
     name: str
-    points2d: Array
+    points2d: Array  # all its keypoints (m, 2), normalised
     focal: float
-    poses: tuple[Pose, ...]
-    distance: float
+    poses: tuple[Pose, ...]  # the true one, and of a repeated place the one there
+    distance: float  # of the median point that it sees
 
 
 def moved(place: SceneMap, to: Similarity) -> SceneMap:
     """The place in another frame."""
-    poses = [to.pose(view.rotation, view.translation) for view in place.views]
+    poses = (to.pose(view.rotation, view.translation) for view in place.views)
     views = (replace(view, rotation=r, translation=t) for view, (r, t) in zip(place.views, poses, strict=True))
     return replace(place, points3d=to.points(place.points3d), views=tuple(views))
 
@@ -163,10 +161,8 @@ def written(scene: SceneMap, folder: Path) -> None:
         file.write(np.uint64(len(counts)).tobytes())
         for number, (view, rows) in enumerate(zip(scene.views, np.split(keypoints, counts.cumsum()[:-1]), strict=True)):
             turn = Rotation.from_matrix(view.rotation).as_quat(scalar_first=True)
-            file.write(np.uint32(number + 1).tobytes() + np.r_[turn, view.translation].tobytes())
-            file.write(
-                np.uint32(1).tobytes() + f"{number:06d}\0".encode() + np.uint64(len(rows)).tobytes() + rows.tobytes()
-            )
+            name, pose = f"{number:06d}".encode(), (*turn, *view.translation)
+            file.write(struct.pack("<I7dI7sQ", number + 1, *pose, 1, name, len(rows)) + rows.tobytes())
     fields = [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("length", "<u8")]
     points = np.zeros(len(scene.points3d), fields)
     points["id"], points["xyz"] = np.arange(1, len(points) + 1), scene.points3d
@@ -192,9 +188,8 @@ def opened(folder: Path) -> str:
 
 def ranked(scene: SceneMap, photos: Sequence[CityPhoto]) -> str:
     """Shares of the photos that have a view near by among the first of the rank, and its milliseconds a view."""
-    places, start = [], time.process_time()
-    for photo in photos:
-        places.append(scene.places(None, photo.points2d, CAMERA))
+    start = time.process_time()
+    places = [scene.places(None, photo.points2d, CAMERA) for photo in photos]
     seconds = (time.process_time() - start) / len(photos) / len(scene.views)
     first = [
         min((k for k, place in enumerate(order) if is_near(place.view, photo)), default=len(order))
@@ -241,5 +236,4 @@ def main() -> None:
     options.add_argument("--photos", nargs="+", default=REPORTED, metavar="SCENE", help="scenes of the photos")
     options.add_argument("--views", type=int, nargs="+", default=VIEWS, help="of the cities")
     options.add_argument("--twice", type=float, help="every place twice, this share of the points of one gone")
-    chosen = options.parse_args()
-    run(rows(chosen), chosen)
+    run(rows, options)

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from leds import Setting, picture, problem
+from leds import Setting, frames
 from record import TIME_LIMIT, Array, Problem, Row, parser, run
 from view_problems import REPORTED, ViewProblem, median_distance, scene_problems
 
@@ -25,9 +25,9 @@ LEDS = [Setting(f"{kind}, {n} lights, 10 seen", kind, n, least=10) for kind in (
 
 
 def of_photos(options: argparse.Namespace) -> Iterator[Problem]:
-    known: dict[str, Any] = {"limit": options.limit, "against": "map", "outliers": 1.0, "seed": options.seed}
-    for photo in (photo for name in options.scenes for photo in scene_problems(options.data, name, **known)):
-        (pixels, size), distance = image_of(photo), median_distance(photo.seen, photo.pose)
+    known: dict[str, Any] = {"against": "map", "outliers": 1.0, "seed": options.seed}
+    for photo in scene_problems(options.data, options.scenes, options.limit, **known):
+        (pixels, size), distance = image_of(photo), median_distance(photo.points3d[photo.matched], photo.pose)
         search = partial(photo.scene.localize, pixels, image_size=size, seed=options.seed, time_limit=TIME_LIMIT)
         yield Problem(photo.name, search, [photo.pose], distance=distance, focal=photo.focal)
 
@@ -41,26 +41,18 @@ def image_of(photo: ViewProblem) -> tuple[Array, tuple[int, int]]:
     return pixels + np.array([width / 2, height / 2]), (width, height)
 
 
-def of_leds(setting: Setting, k: int, limit: int, seed: int) -> Iterator[Problem]:
-    """Frames with the image's size alone; every fifth has a new device."""
-    rng = np.random.default_rng([seed, k])
-    for i in range(limit):
-        shown = picture(setting, 1000 * seed + i // 5, rng)
-        known = {"normals3d": shown.device.normals3d, "image_size": (shown.camera.size, shown.camera.size)}
-        yield problem(f"{i}", shown, **known, seed=seed)
-
-
 def rows(options: argparse.Namespace) -> Iterator[Row]:
-    if options.what == "leds":
-        for k, one in enumerate(LEDS):
-            yield Row(one.name, partial(of_leds, one, k, options.limit, options.seed), RIGHT_DEG["leds"])
+    if options.what == "maps":
+        yield Row("whole map", partial(of_photos, options), RIGHT_DEG["maps"])
         return
-    yield Row("whole map", partial(of_photos, options), RIGHT_DEG["maps"])
+    for k, setting in enumerate(LEDS):
+        known = {"image_size": (setting.camera.size, setting.camera.size), "seed": options.seed}
+        drawn = partial(frames, setting, k, options.limit, options.seed, **known)
+        yield Row(setting.name, drawn, RIGHT_DEG["leds"])
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("what", choices=RIGHT_DEG)
     options.add_argument("--scenes", nargs="+", default=SCENES, metavar="SCENE")
-    chosen = options.parse_args()
-    run(rows(chosen), chosen)
+    run(rows, options)

@@ -2,20 +2,20 @@
 
     python -m benchmarks layers [--points 200 --rounds 3]
 
-Ours and the paper's take turns; times are medians over the rounds, of processor time, which other programs hardly
-change; ratios are medians of the rounds' ratios. Inputs are told by the kind of the features and the share of the
-assignment on the true matches. A camera of the paper's protocol (noise 2 pixels at a focal length of 800, Euler angles
-up to 45 degrees, distance 4.5) sees points in the unit ball, whose features are
+Ours and the paper's take turns; processor times and ratios are medians over the rounds. A camera of the paper's
+protocol (noise 2 pixels at a focal length of 800, Euler angles up to 45 degrees, distance 4.5) sees points in the unit
+ball. Inputs are told by the kind of the points' features and the share of the assignment on the true matches:
 
-- smooth: random waves of a point's place in the image (noisy on the 2D side, exact on the 3D side). Points that lie
-  close together look alike, as they do to a trained network, and share their probability. `level` is the wave number.
-- independent: a random unit vector for each point and the same with noise of relative size `level` on the other side.
-  A wrong match is as unlikely as any other; the easy case for every iterative solver.
+- smooth: random waves of a point's place in the image (noisy on the 2D side, exact on the 3D side), `level` their wave
+  number. Points that lie close together look alike, as to a trained network, and share their probability.
+- independent: a random unit vector for each point, with noise of relative size `level` on the other side. A wrong match
+  is as unlikely as any other; the easy case for every iterative solver.
 """
 
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from timeit import Timer
 from typing import Any, Literal
 
 import numpy as np
@@ -61,8 +61,8 @@ def planted(batch: int, points: int, *, kind: Kind, level: float, seed: int = 0)
     )
     if kind == "smooth":
         directions = level * DISTANCE * torch.randn(2, CHANNELS // 2, generator=generator)
-        features2d, features3d = ((x @ directions) for x in (noisy, exact))
-        features2d, features3d = (torch.cat([x.cos(), x.sin()], -1) for x in (features2d, features3d))
+        waves = (x @ directions for x in (noisy, exact))
+        features2d, features3d = (torch.cat([x.cos(), x.sin()], -1) for x in waves)
     else:
         features3d = torch.randn(batch, points, CHANNELS, generator=generator)
         features2d = features3d + level * torch.randn(batch, points, CHANNELS, generator=generator)
@@ -78,21 +78,11 @@ Race = tuple[float, float, float]  # milliseconds of ours and of the paper's, an
 
 
 def race(ours: Callable[[], object], papers: Callable[[], object], *, rounds: int) -> Race:
-    """Time both in turns, after each was called once to warm up and once to see how long it takes."""
-    repeats = []
-    for candidate in (ours, papers):
-        candidate()
-        repeats.append(max(1, round(1000 * SHORTEST / milliseconds(candidate, 1))))
-    turns = [[milliseconds(c, n) for c, n in zip((ours, papers), repeats, strict=True)] for _ in range(rounds)]
+    """Processor time of both in turns, after each was called once to warm up and once to see how long it takes."""
+    timers = [Timer(candidate, timer=time.process_time) for candidate in (ours, papers)]
+    repeats = [max(1, round(SHORTEST / max(timer.repeat(2, 1)[1], 1e-6))) for timer in timers]
+    turns = [[1000 * t.timeit(n) / n for t, n in zip(timers, repeats, strict=True)] for _ in range(rounds)]
     return *(float(x) for x in np.median(turns, 0)), float(np.median([b / a for a, b in turns]))  # type: ignore[return-value]
-
-
-def milliseconds(candidate: Callable[[], object], repeats: int) -> float:
-    """Of processor time, a call."""
-    start = time.process_time()
-    for _ in range(repeats):
-        candidate()
-    return max(1000 * (time.process_time() - start) / repeats, 1e-3)
 
 
 def rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:

@@ -131,5 +131,4 @@ def main() -> None:
     options = parser(__doc__)
     options.add_argument("scenes", nargs="+", metavar="SCENE")
     options.add_argument("--maps", type=Path, default=Path("runs/left-out"), help="folder of the maps that are built")
-    chosen = options.parse_args()
-    run(rows(chosen), chosen)
+    run(rows, options)

@@ -65,7 +65,7 @@ def of_photos(used: slice, options: argparse.Namespace) -> Iterator[Problem]:
         for query in images_of(scene, options.limit):
             shown = view_problem(scene, query, against="view", outliers=1.0, seed=options.seed)
             beside = [view for _, view in overlapping(scene, query) if f"{name}/{view.name}" != shown.view][:2]
-            if len(beside) < 2 or shown.matches < LEAST_MATCHES:
+            if len(beside) < 2 or shown.matched.sum() < LEAST_MATCHES:
                 continue
             rng, pixels = np.random.default_rng([options.seed, query.image_id]), [shown.pixels[0]]
             for view in beside:
@@ -90,21 +90,17 @@ def rig_search(
     return partial(bpnp.solve, list(pixels), points3d, list(cameras), rig=rig, **known)
 
 
+def rows(options: argparse.Namespace) -> Iterator[Row]:
+    for name, cameras, used, scale in (
+        ("2 cameras", 2, 2, False), ("4 cameras", 4, 4, False), ("one camera", 2, 1, False),
+        ("2 cameras, scale unknown", 2, 2, True), ("4 cameras, scale unknown", 4, 4, True),
+    ):  # fmt: skip
+        yield Row(f"LEDs, {name}", partial(problems, cameras, used, options.limit, options.seed, scale), RIGHT_DEG)
+    for name, photos in (("camera 1", (0, 1)), ("camera 2", (1, 2)), ("camera 3", (2, 3)), ("3 cameras", (0, 3))):
+        yield Row(f"photos, {name}", partial(of_photos, slice(*photos), options), RIGHT_DEG)
+
+
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--scenes", nargs="*", default=REPORTED, help="COLMAP models of the photos")
-    chosen = options.parse_args()
-    rows = [
-        Row(f"LEDs, {name}", partial(problems, cameras, used, chosen.limit, chosen.seed, scale), RIGHT_DEG)
-        for name, cameras, used, scale in (
-            ("2 cameras", 2, 2, False),
-            ("4 cameras", 4, 4, False),
-            ("one camera", 2, 1, False),
-            ("2 cameras, scale unknown", 2, 2, True),
-            ("4 cameras, scale unknown", 4, 4, True),
-        )
-    ] + [
-        Row(f"photos, {name}", partial(of_photos, slice(*used), chosen), RIGHT_DEG)
-        for name, used in (("camera 1", (0, 1)), ("camera 2", (1, 2)), ("camera 3", (2, 3)), ("3 cameras", (0, 3)))
-    ]
-    run(rows, chosen)
+    run(rows, options)

@@ -6,6 +6,7 @@ Right is a rotation within 0.2 degrees. Every tenth frame has a new catalogue, s
 --peers: tetra3rs too, where it is installed.
 """
 
+import argparse
 import importlib
 import struct
 import tempfile
@@ -32,12 +33,10 @@ NARROW, IN_VIEW = 5.0, 15.0  # up to these degrees a catalogue is a belt of the 
 
 
 class Frame(NamedTuple):
-    """Pixels (m, 2) of stars and others, directions (n, 3), rotation, and which direction each pixel is (-1: none)."""
-
-    pixels: Array
-    directions: Array
+    pixels: Array  # (m, 2) of stars and others
+    directions: Array  # (n, 3)
     rotation: Array
-    star: NDArray[np.int64]
+    star: NDArray[np.int64]  # (m,) which direction each pixel is, -1: none
 
 
 def lens(field: float, factor: float = 1.0) -> Camera:
@@ -86,10 +85,8 @@ def frame(count: int, field: float, seed: int, i: int, false: float = FALSE) -> 
 def problems(count: int, field: float, limit: int, seed: int) -> Iterator[Problem]:
     for i in range(limit):
         shown = frame(count, field, seed, i)
-        search = partial(
-            bpnp.solve, shown.pixels, shown.directions, lens(field).model, at_infinity=True, seed=i,
-            time_limit=TIME_LIMIT,
-        )  # fmt: skip
+        known: dict[str, Any] = {"at_infinity": True, "seed": i, "time_limit": TIME_LIMIT}
+        search = partial(bpnp.solve, shown.pixels, shown.directions, lens(field).model, **known)
         yield Problem(f"{i}", search, [(shown.rotation, np.zeros(3))])
 
 
@@ -123,16 +120,15 @@ def by_tetra(count: int, field: float, limit: int, seed: int) -> Iterator[Outcom
         yield Outcome("", degrees(turned, shown.rotation), 0.0, "confident" if found else "failed", seconds)
 
 
-def rows(limit: int, seed: int, *, peers: bool) -> Iterator[Row]:
+def rows(options: argparse.Namespace) -> Iterator[Row]:
     for count, field in product(CATALOGUES, FIELDS):
-        yield Row(f"{count}, {field:.0f} deg", partial(problems, count, field, limit, seed), RIGHT_DEG)
-        if peers and field < WIDE:
-            drawn = partial(by_tetra, count, field, limit, seed)
-            yield Row(f"tetra3rs: {count}, {field:.0f} deg", drawn, RIGHT_DEG)
+        name, shown = f"{count}, {field:.0f} deg", (count, field, options.limit, options.seed)
+        yield Row(name, partial(problems, *shown), RIGHT_DEG)
+        if options.peers and field < WIDE:
+            yield Row(f"tetra3rs: {name}", partial(by_tetra, *shown), RIGHT_DEG)
 
 
 def main() -> None:
     options = parser(__doc__)
     options.add_argument("--peers", action="store_true", help="tetra3rs too")
-    chosen = options.parse_args()
-    run(rows(chosen.limit, chosen.seed, peers=chosen.peers), chosen)
+    run(rows, options)

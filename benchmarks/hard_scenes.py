@@ -20,7 +20,7 @@ WINDOW = np.array([[0, 0, 0], [0.5, 0, 0], [0.5, 0.8, 0], [0, 0.8, 0], [0.25, 0.
 
 def board(rng: np.random.Generator) -> Drawn:
     """Part of a lattice of 14 x 10 points."""
-    points = _grid(14, 10) * 0.3
+    points = 0.3 * np.array([[i, j, 0.0] for i in range(14) for j in range(10)])
     return _in_frame(points, points, _facing(rng, 40, (1.5, 2.5), aside=0.8), rng)
 
 
@@ -132,10 +132,6 @@ SCENES: tuple[Callable[[np.random.Generator], Drawn], ...] = (
     ending_facade, colonnade, gappy_facade, row_of_windows, facade_with_door, stretched, hinged, wrong_focal_cloud,
     wrong_focal_plane, helix, lines, clumps, stairs, board, wallpaper,
 )  # fmt: skip
-
-
-def _grid(columns: int, rows: int) -> Array:
-    return np.array([[i, j, 0.0] for i in range(columns) for j in range(rows)])
 
 
 def _line(rng: np.random.Generator, axes: int) -> Array:

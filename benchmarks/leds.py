@@ -54,10 +54,8 @@ class Camera:
     @property
     def model(self) -> tuple[str, list[float]]:
         """As `bpnp.solve` takes it."""
-        middle = self.size / 2
-        if self.fisheye:
-            return "OPENCV_FISHEYE", [self.focal, self.focal, middle, middle, 0.0, 0.0, 0.0, 0.0]
-        return "PINHOLE", [self.focal, self.focal, middle, middle]
+        pinhole = [self.focal, self.focal, self.size / 2, self.size / 2]
+        return ("OPENCV_FISHEYE", [*pinhole, 0.0, 0.0, 0.0, 0.0]) if self.fisheye else ("PINHOLE", pinhole)
 
 
 class Setting(NamedTuple):
@@ -188,14 +186,19 @@ SETTINGS = {
 
 
 def problems(name: str, limit: int, seed: int) -> Iterator[Problem]:
-    """Frames of a setting; every fifth has a new device."""
+    """Frames of one of SETTINGS, whose camera is told."""
     setting = SETTINGS[name]
-    rng = np.random.default_rng([seed, list(SETTINGS).index(name)])
+    return frames(setting, list(SETTINGS).index(name), limit, seed, camera=setting.camera.model)
+
+
+def frames(setting: Setting, number: int, limit: int, seed: int, /, **known: Any) -> Iterator[Problem]:
+    """Frames of a setting, whose number goes into the seed; every fifth has a new device."""
+    rng = np.random.default_rng([seed, number])
     for i in range(limit):
         shown = picture(setting, 1000 * seed + i // 5, rng)
         normals = shown.device.normals3d if setting.normals else None
         prior = vertical(shown, rng) if setting.gravity else None
-        yield problem(f"{name}/{i}", shown, camera=shown.camera.model, normals3d=normals, prior=prior)
+        yield problem(f"{setting.name}/{i}", shown, normals3d=normals, prior=prior, **known)
 
 
 def problem(name: str, shown: Frame, **known: Any) -> Problem:

@@ -70,54 +70,41 @@ def spread(items: Sequence[T], limit: int, first: float = 0.0) -> list[T]:
 
 @dataclass(frozen=True)
 class Problem:
-    """Something to solve, and the poses of which any is right: none where points have no pose in common.
-
-    points3d: of the scene, whose middle tells how far a pose is off. distance: unit of the error of the camera's
-    centre. focal: the true focal length in pixels, where it is to be found too.
-    """
+    """Something to solve, and the poses of which any is right: none where points have no pose in common."""
 
     name: str
     solve: Callable[[], Solution]
     poses: Sequence[Pose]
-    points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))
-    distance: float = 1.0
-    focal: float = np.nan
+    points3d: Array = field(default_factory=lambda: np.zeros((1, 3)))  # whose middle tells how far a pose is off
+    distance: float = 1.0  # unit of the error of the camera's centre
+    focal: float = np.nan  # the true focal length in pixels, where it is to be found too
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Of one problem: the errors of the pose to the true one that is nearest.
-
-    shift: of the camera's centre, in units of the problem's distance. moved: of the middle of the scene as the camera
-    sees it, in its distances. verdict: "" of a method that has none. outside: whether the true poses lie beyond the
-    bound that the solution claims (`beyond_bound`). focal: the focal length that was found, of the true one; NaN where
-    it was known. sigmas: errors in their own standard deviations (`sigmas`), of a pose that is near.
-    """
+    """Of one problem: the errors of the pose to the true one that is nearest."""
 
     problem: str
     rotation_deg: float
-    shift: float
-    verdict: str
+    shift: float  # of the camera's centre, in units of the problem's distance
+    verdict: str  # "" of a method that has none
     cpu_seconds: float
-    outside: bool = True
-    focal: float = np.nan
-    moved: float = 0.0
-    sigmas: Sequence[float] = ()
+    outside: bool = True  # whether the true poses lie beyond the bound that the solution claims (`beyond_bound`)
+    focal: float = np.nan  # the focal length that was found, of the true one; NaN where it was known
+    moved: float = 0.0  # of the middle of the scene as the camera sees it, in its distances
+    sigmas: Sequence[float] = ()  # errors in their own standard deviations (`sigmas`), of a pose that is near
 
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a benchmark: what draws its problems, and up to where a pose is right.
-
-    excused: a confident pose that is not right and within its own bound is no broken promise.
-    """
+    """A line of a benchmark: what draws its problems, and up to where a pose is right."""
 
     name: str
     draw: Callable[[], Iterable[Problem | Outcome]]
     right_deg: float
     right_shift: float = np.inf
     right_moved: float = np.inf
-    excused: bool = True
+    excused: bool = True  # a confident pose that is not right and within its own bound is no broken promise
 
     def is_right(self, one: Outcome) -> bool:
         limits = (one.rotation_deg, self.right_deg), (one.shift, self.right_shift), (one.moved, self.right_moved)
@@ -228,13 +215,13 @@ def measured(rows: Iterable[Row], only: Sequence[str] = ("",)) -> Iterator[tuple
         yield row, result, found
 
 
-def run(rows: Iterable[Row], options: argparse.Namespace) -> None:
+def run(rows: Callable[[argparse.Namespace], Iterable[Row]], options: argparse.ArgumentParser) -> None:
     """Measure the rows of a benchmark, and write them and their outcomes to `--output` as they come."""
-    results: dict[str, dict[str, Any]] = {}
-    for row, result, found in measured(rows, options.only):
+    chosen, results = options.parse_args(), {}
+    for row, result, found in measured(rows(chosen), chosen.only):
         results[row.name] = result | {"outcomes": [asdict(outcome) for outcome in found]}
-        if options.output:
-            write(options.output, {"rows": results})
+        if chosen.output:
+            write(chosen.output, {"rows": results})
 
 
 def write(path: Path, record: dict[str, Any]) -> None:

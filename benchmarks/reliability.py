@@ -1,7 +1,6 @@
-"""How often confident poses are wrong; and a diagram of what the search claims against what is observed.
+"""How often confident poses are wrong: LEDs, shapes, photos, scenes that repeat, wrong focal lengths and labels.
 
     python -m benchmarks reliability --only leds shapes photos maps hard --seed 9 --limit 100
-    python -m benchmarks reliability --only leds shapes photos maps --draw docs/images/reliability.png
 
 Rows: leds (the settings of `leds.py`), shapes (0, 0.25 and 0.5 outliers a match), photos (against the points of one
 view, 0 to 100 % outliers a side), maps (photos left out of their map, which view is not told), hard (`hard_scenes.py`),
@@ -15,28 +14,20 @@ the camera's centre by less than a twentieth. Wrong: not right, and beyond the b
 
 import argparse
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from functools import cache, partial
 from itertools import cycle
-from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import leds
 import numpy as np
 import shapes
 from hard_scenes import CAMERA, SCENES, Drawn, wrong_focal_plane
-from matplotlib.figure import Figure
-from record import TIME_LIMIT, Array, Pose, Problem, Row, nearest, parser, run
+from record import TIME_LIMIT, Array, Pose, Problem, Row, parser, run
 from scipy.special import softmax
-from scipy.stats import binomtest
 from view_problems import LEAST_MATCHES, REPORTED, Against, ViewProblem, scene_problems
 
 from bpnp import Solution, solve
 from bpnp.cameras import camera_from
-from bpnp.report.figures import save_figure
-from bpnp.search import pool, verdict
-from bpnp.search.verdict import missed
 from bpnp.solving.problem import problem_from
 from bpnp.solving.sources import Options, solutions_of
 
@@ -52,7 +43,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
     for name in leds.SETTINGS:
         yield right(f"leds, {name}", partial(leds.problems, name, *count))
     for ratio in (0.0, 0.25, 0.5):
-        drawn = partial(shapes.problems, f"shapes-{ratio:.2f}", *count, options.data, options.time_limit)
+        drawn = partial(shapes.problems, "shapes", ratio, *count, options.data, options.time_limit)
         yield right(f"shapes, {ratio:g} outliers a match", drawn)
     for outliers in (0.0, 0.25, 0.5, 0.75, 1.0):
         yield right(f"photos, {outliers:.0%} outliers", partial(photos, outliers, "view", [[1.0]]))
@@ -74,42 +65,44 @@ def of_photos(
 ) -> Iterator[Problem]:  # fmt: skip
     """Photos with cameras of these factors of the focal length, NaN for none: those for the first photo, for the second
     and so on, in turns."""
-    solve_one = in_map if against == "map" else with_cones
+    solve_one, known = in_map if against == "map" else with_cones, limits(options)
     for photo, chosen in zip(drawn(outliers, against), cycle(factors)):
         for factor in chosen:
             if np.isfinite(factor):
-                seen = photo.points3d if against == "view" and factor == 1 else photo.seen  # the depth of what is seen
-                run = partial(solve_one, photo, factor, options)
+                seen = photo.points3d if against == "view" and factor == 1 else photo.points3d[photo.matched]
+                run = partial(solve_one, photo, factor, **known)
                 yield problem(f"{photo.name} x {factor}", run, [photo.pose], seen)
 
 
 def in_turns(options: argparse.Namespace, outliers: float, against: Against) -> list[ViewProblem]:
     """Photos of each scene in turns, so that a part of them is of all scenes; those with enough true matches."""
     known = {"against": against, "outliers": outliers, "seed": options.seed}
-    turns = [scene_problems(options.data, scene, limit=options.limit, **known) for scene in options.scenes]
-    return [photo for turn in zip(*turns, strict=False) for photo in turn if photo.matches >= LEAST_MATCHES]
+    turns = [scene_problems(options.data, [scene], options.limit, **known) for scene in options.scenes]
+    return [photo for turn in zip(*turns, strict=False) for photo in turn if photo.matched.sum() >= LEAST_MATCHES]
 
 
-def in_map(photo: ViewProblem, factor: float, options: argparse.Namespace) -> Solution:
+def in_map(photo: ViewProblem, factor: float, **known: Any) -> Solution:
     pixels, camera = photo.pixels
-    known = {"seed": options.seed, "time_limit": options.time_limit}
     return photo.scene.localize(pixels, camera * [[factor], [factor], [1]], **known)
 
 
-def with_cones(photo: ViewProblem, factor: float, options: argparse.Namespace) -> Solution:
+def with_cones(photo: ViewProblem, factor: float, **known: Any) -> Solution:
     """Against one view, with the cones of the points."""
     camera = camera_from(np.diag([factor * photo.focal, factor * photo.focal, 1.0]))
     cones: dict[str, Any] = {"normals3d": photo.scene.cones.axes, "cosines3d": photo.scene.cones.cosines}
     points = problem_from(photo.focal * photo.points2d, photo.points3d, camera, **cones)
-    return solutions_of({0: points}, Options(asks=False, seed=options.seed, time_limit=options.time_limit))[0]
+    return solutions_of({0: points}, Options(asks=False, **known))[0]
+
+
+def limits(options: argparse.Namespace) -> dict[str, Any]:
+    return {"seed": options.seed, "time_limit": options.time_limit}
 
 
 def with_lens(draw: Callable[[Any], Drawn], seed: Any, options: argparse.Namespace) -> Iterator[Problem]:
     rng = np.random.default_rng(seed)
     for k in range(options.limit):
         pixels, points3d, poses = draw(rng)
-        run = partial(solve, pixels, points3d, CAMERA, seed=options.seed, time_limit=options.time_limit)
-        yield problem(f"{k}", run, poses, points3d)
+        yield problem(f"{k}", partial(solve, pixels, points3d, CAMERA, **limits(options)), poses, points3d)
 
 
 def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
@@ -125,8 +118,7 @@ def of_classes(kind: str, options: argparse.Namespace) -> Iterator[Problem]:
         known: dict[str, Any] = {"likeliest": {"labels2d": score.argmax(1), "labels3d": scene}}.get(kind, {})
         if kind == "probabilities":
             known = {"labels2d": softmax(score, 1), "labels3d": np.eye(COLOURS)[scene]}
-        known |= {"seed": options.seed, "time_limit": options.time_limit}
-        yield leds.problem(f"{k}", shown, camera=shown.camera.model, **known)
+        yield leds.problem(f"{k}", shown, camera=shown.camera.model, **known, **limits(options))
 
 
 def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], points3d: Array) -> Problem:
@@ -136,60 +128,9 @@ def problem(name: str, run: Callable[[], Solution], poses: Sequence[Pose], point
     return Problem(name, run, poses, points3d, distance)
 
 
-Claims = list[tuple[float, bool]]  # log10 of the probability that a better pose was missed, whether the best is wrong
-
-
-def watched(row: Row, claims: Claims) -> Row:
-    """The row, whose problems tell what they claim whenever a pose exceeds chance: once a decade of each problem."""
-
-    def claiming(one: Problem) -> Solution:
-        made: dict[float, tuple[float, bool]] = {}
-
-        def claim(poses: Any, sets: Any, *rest: Any, independent: bool = True) -> float:
-            value = missed(poses, sets, *rest, independent=independent)
-            same_scene = len(sets.points3d) == len(one.points3d)  # not a part of a map; its origin may be another one
-            if independent and same_scene and len(poses) and poses.log10_false_alarms[0] < 0:
-                rotation, middle = poses.rotation[0], np.median(one.points3d, 0)
-                translation = rotation @ (sets.middle - middle) + poses.translation[0]
-                degrees, _, moved, _ = nearest(one, rotation, translation)
-                made[value // 1] = value, not (degrees <= RIGHT_DEG and moved <= RIGHT_MOVED)
-            return value
-
-        with patch.object(pool, "missed", claim), patch.object(verdict, "missed", claim):
-            found = one.solve()
-        claims.extend(made.values())
-        return found
-
-    def draw() -> Iterator[Problem]:
-        for one in row.draw():
-            assert isinstance(one, Problem)
-            yield replace(one, solve=partial(claiming, one))
-
-    return replace(row, draw=draw)
-
-
-def diagram(claims: Claims, path: Path) -> None:
-    """Claims against shares of wrong poses, in each decade a problem once, with Wilson's intervals."""
-    axes = (figure := Figure(figsize=(6, 4), layout="constrained")).subplots()
-    claimed, far = np.maximum([claim for claim, _ in claims], -6.0), np.array([wrong for _, wrong in claims])
-    for decade in np.unique(claimed // 1):
-        part = claimed // 1 == decade
-        x, test = (10 ** claimed[part]).mean(), binomtest(int(far[part].sum()), int(part.sum()))
-        low, high = test.proportion_ci(method="wilson")
-        axes.plot([x] * 3, np.maximum([low, test.statistic, high], 1e-9), "o-", color="tab:blue", markevery=[1])
-        axes.annotate(f"{test.k} of {test.n}", (x, high), ha="center", va="bottom", fontsize=7)
-    axes.plot([1e-6, 1], [1e-6, 1], "k--", lw=1)
-    axes.set(xscale="log", yscale="log", ylim=(1e-4, 2), xlabel="claimed: a better pose was missed", ylabel="wrong")
-    save_figure(figure, path)
-
-
 def main() -> None:
     options = parser(__doc__)
-    options.add_argument("--draw", type=Path, help="picture to write of what is claimed")
     options.add_argument("--scenes", nargs="*", default=REPORTED)
     options.add_argument("--factors", type=float, nargs="+", default=FACTORS, help="of wrong focal lengths")
     options.add_argument("--time-limit", type=float, default=TIME_LIMIT, help="seconds (default: %(default)s)")
-    chosen, claims = options.parse_args(), Claims()
-    run((watched(row, claims) if chosen.draw else row for row in rows(chosen)), chosen)
-    if chosen.draw:
-        diagram(claims, chosen.draw)
+    run(rows, options)

@@ -43,19 +43,15 @@ TABLE = r"<!-- results: {} -->\n(.*?)<!-- end of results -->"
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table.
-
-    measure: a number of problems or their outcomes, from a seed and the folder of the data. problems: in full, and
-    quickly. right_deg, right_shift: up to which a pose is right. data: the folder in that of the data that it needs.
-    """
+    """A line of a table."""
 
     table: str
     name: str
-    measure: Callable[[int, int, Path], Iterable[Problem | Outcome]]
-    problems: tuple[int, int]
+    measure: Callable[[int, int, Path], Iterable[Problem | Outcome]]  # of a number of problems, a seed and the data
+    problems: tuple[int, int]  # in full, and quickly
     right_deg: float
     right_shift: float = float("inf")
-    data: str = ""
+    data: str = ""  # folder in that of the data that it needs
     in_readme: bool = False
 
 
@@ -84,15 +80,16 @@ IN_README = ("ring, 3 lights", "headset, 3 lights", "drone, 3 lights")
 ROWS = (
     *(
         Row("search", f"shapes, any rotation, {ratio:g} outliers a match",
-            partial(shapes.problems, f"shapes-{ratio:.2f}"), (48, 4), 2.0, in_readme=ratio == 0.25)
+            partial(shapes.problems, "shapes", ratio), (48, 4), 2.0, in_readme=ratio == 0.25)
         for ratio in (0, 0.25, 0.5)
     ),
-    Row("search", "PSB meshes, the paper's protocol", partial(shapes.problems, "psb"), (100, 3), *PAPER, "psb", True),
-    Row("search", "PSB meshes, any rotation", partial(shapes.problems, "psb-so3"), (100, 3), *PAPER, "psb"),
-    Row("search", "PSB meshes, 0.5 outliers a match", partial(shapes.problems, "psb-0.50"), (100, 3), *PAPER, "psb"),
+    Row("search", "PSB meshes, the paper's protocol", partial(shapes.problems, "psb", 0), (100, 3), *PAPER, "psb",
+        in_readme=True),
+    Row("search", "PSB meshes, any rotation", partial(shapes.problems, "psb-so3", 0), (100, 3), *PAPER, "psb"),
+    Row("search", "PSB meshes, 0.5 outliers a match", partial(shapes.problems, "psb", 0.5), (100, 3), *PAPER, "psb"),
     *(
-        Row("search", f"photos, {name}", partial(shapes.problems, chosen), (100, 5), 1.0, data="colmap")
-        for name, chosen in (("the points that they see", "photos"), ("0.5 outliers a match", "photos-0.50"))
+        Row("search", f"photos, {name}", partial(shapes.problems, "photos", ratio), (100, 5), 1.0, data="colmap")
+        for name, ratio in (("the points that they see", 0), ("0.5 outliers a match", 0.5))
     ),
     Row("maps", "left out of its map, which view is told", partial(photos, "best view", 1.0), (48, 5), 1.0,
         data="colmap"),

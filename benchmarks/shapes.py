@@ -1,8 +1,8 @@
 """Shapes, meshes and the points that photos see, for `solve` without a prior.
 
 A set is shapes (procedural, any rotation), psb (Euler angles up to 45 degrees, the paper's protocol), psb-so3 or photos
-(as many of each of the models `REPORTED`); a number after it is the ratio of outliers to matches on either side: random
-points, of photos keypoints without a point and points that the photo does not see.
+(as many of each of the models `REPORTED`). Outliers are random points, of photos keypoints without a point and points
+that the photo does not see; their ratio is to the matches on either side.
 """
 
 from collections.abc import Iterator
@@ -58,17 +58,16 @@ def of_data(name: str, ratio: float, limit: int, seed: int, data: Path) -> Itera
         yield f"{name}/{batch.ids[0]}", *(x[0].double().numpy() for x in values if x is not None)  # type: ignore[misc]
 
 
-def problems(chosen: str, limit: int, seed: int, data: Path, time_limit: float = TIME_LIMIT) -> Iterator[Problem]:
+def problems(
+    chosen: str, ratio: float, limit: int, seed: int, data: Path, time_limit: float = TIME_LIMIT
+) -> Iterator[Problem]:
     """At most `limit` of a set."""
-    kind, _, number = chosen.rpartition("-") if "." in chosen else (chosen, "", "0")
-    ratio = float(number)
-    if kind == "shapes":
+    if chosen == "shapes":
         drawn = shapes(ratio, limit, seed)
-    elif kind == "photos":
-        each = -(-limit // len(REPORTED))
-        drawn = chain.from_iterable(of_data(scene, ratio, each, seed, data) for scene in REPORTED)
     else:
-        drawn = of_data(kind, ratio, limit, seed, data)
+        scenes = REPORTED if chosen == "photos" else [chosen]
+        each = -(-limit // len(scenes))
+        drawn = chain.from_iterable(of_data(name, ratio, each, seed, data) for name in scenes)
     for name, points2d, points3d, rotation, translation in islice(drawn, limit):
         search = partial(solve, points2d, points3d, seed=seed, time_limit=time_limit)
         yield Problem(name, search, [(rotation, translation)], points3d)

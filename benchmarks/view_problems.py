@@ -3,9 +3,10 @@
 Zhou, Agostinho, Osep, Leal-Taixe, "Is geometry enough for matching in visual localization?", ECCV 2022, section 5.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,24 +27,16 @@ LEAST_MATCHES = 10  # fewer matches count as a failure
 
 @dataclass(frozen=True, eq=False)
 class ViewProblem:
-    """A photo's keypoints (m, 2), normalised, and points (n, 3) of its map; matched: (n,), which of them it sees.
-
-    pose: of the photo. view: the one whose points they are, None for those of the whole map. focal: pixels. scene: the
-    map without the photo, of these points alone, in this order.
-    """
+    """A photo's keypoints and points of its map."""
 
     name: str
-    points2d: Array
-    points3d: Array
-    matched: NDArray[np.bool_]
-    pose: Pose
-    view: str | None
-    focal: float
-    scene: SceneMap
-
-    @property
-    def matches(self) -> int:
-        return int(self.matched.sum())
+    points2d: Array  # (m, 2), normalised
+    points3d: Array  # (n, 3)
+    matched: NDArray[np.bool_]  # (n,) which of them the photo sees
+    pose: Pose  # of the photo
+    view: str | None  # whose points they are, None for those of the whole map
+    focal: float  # pixels
+    scene: SceneMap  # without the photo, of these points alone, in this order
 
     @property
     def pixels(self) -> tuple[Array, Array]:
@@ -54,11 +47,6 @@ class ViewProblem:
     def distance(self) -> float:
         """Of the median point from the photo."""
         return median_distance(self.points3d, self.pose)
-
-    @property
-    def seen(self) -> Array:
-        """Points that have a partner."""
-        return self.points3d[self.matched]
 
 
 def median_distance(points3d: Array, pose: Pose) -> float:
@@ -145,35 +133,27 @@ def part_of(place: SceneMap, points: NDArray[np.integer], name: str = "") -> Sce
     return SceneMap(place.points3d[points], place.point_ids[points], np.empty(0, np.int32), views)
 
 
-def scene_problems(data: Path, name: str, *, limit: int, **chosen: Any) -> Iterator[ViewProblem]:
-    """Problems of at most `limit` photos of a scene. chosen: options of `view_problem`."""
-    scene = model_of(data, name)
-    for query in images_of(scene, limit):
-        yield view_problem(scene, query, **chosen)
+def scene_problems(data: Path, names: Iterable[str], limit: int, **chosen: Any) -> Iterator[ViewProblem]:
+    """Problems of at most `limit` photos of each of these scenes. chosen: options of `view_problem`."""
+    for scene in (model_of(data, name) for name in names):
+        yield from (view_problem(scene, query, **chosen) for query in images_of(scene, limit))
 
 
 def model_of(data: Path, name: str) -> Reconstruction:
     return read_reconstruction(data / "colmap" / name / "sparse/0", name=name)
 
 
-def elsewhere(photos: Sequence[ViewProblem]) -> list[ViewProblem]:
-    """The map of each problem with the photo of the problem that comes half of them later."""
-    others = [*photos[len(photos) // 2 :], *photos[: len(photos) // 2]]
-    return [
-        replace(photo, points2d=other.points2d, focal=other.focal) for photo, other in zip(photos, others, strict=True)
-    ]
-
-
 def photos(
     against: Against, outliers: float, limit: int, seed: int, data: Path, *, in_map: bool = True, apart: bool = False
 ) -> Iterator[Problem]:
     """At most `limit` photos of the reported scenes in their maps, told the view if it is one, or by the points alone,
-    without a prior; apart: in maps of other places. The error of a centre is in distances of the median point."""
+    without a prior; apart: in the map of the problem that comes half of them before. The error of a centre is in
+    distances of the median point."""
     each = -(-limit // len(REPORTED))
-    known: dict[str, Any] = {"limit": each, "against": against, "outliers": outliers, "seed": seed}
-    drawn = [photo for name in REPORTED for photo in scene_problems(data, name, **known)]
-    for photo in (elsewhere(drawn) if apart else drawn)[:limit]:
-        pixels, camera = photo.pixels
+    drawn = list(scene_problems(data, REPORTED, each, against=against, outliers=outliers, seed=seed))
+    half = len(drawn) // 2 if apart else 0
+    for photo, shown in islice(zip(drawn, drawn[half:] + drawn[:half], strict=True), limit):
+        pixels, camera = shown.pixels
         search = partial(solve, pixels, photo.points3d, camera)
         if in_map:
             search = partial(photo.scene.localize, pixels, camera, views=photo.view and [photo.view])
