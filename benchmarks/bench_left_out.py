@@ -3,8 +3,9 @@
     python -m benchmarks left_out castle-P30 fountain-P11 --limit 6
 
 Rows of a scene: views (the three views that share most points are named), map (none is); views-sift and map-sift, the
-same with SIFT descriptors, a ratio test and PoseLib. pycolmap builds a map for each photo on the first run and keeps it
-in --maps. Truth: the pose in the model of all photos, aligned by the views that both models have.
+same with SIFT descriptors, a ratio test and PoseLib; words-sift, with the ten views that a bag of visual words finds
+(Sivic and Zisserman, ICCV 2003). pycolmap builds a map for each photo on the first run and keeps it in --maps. Truth:
+the pose in the model of all photos, aligned by the views that both models have.
 """
 
 import argparse
@@ -20,6 +21,7 @@ import pycolmap
 from numpy.typing import NDArray
 from rebuilt_maps import PhotoScene, aligned
 from record import TIME_LIMIT, Array, Problem, Row, parser, run, spread
+from scipy.cluster.vq import kmeans2, vq
 from view_problems import median_distance
 
 from bpnp import SceneMap, Solution
@@ -34,44 +36,60 @@ RATIO = 0.8  # largest ratio of the distances to the nearest descriptor and to t
 THRESHOLD_PX = 8.0  # of an inlier
 LEAST_INLIERS = 12  # of a pose that counts as confident, the limit of hloc
 AT_ONCE = 256  # descriptors of the photo in one product
+WORDS, ROUNDS, EVERY = 512, 5, 4  # of the vocabulary; rounds of k-means; one descriptor of so many makes it
+RETRIEVED = 10  # views
 
 
 class DescribedMap:
-    """The descriptors of a model's observations, from the database that the model was built from."""
+    """The descriptors of a model's observations, from the database that the model was built from, and the visual words
+    of its views: their centres, the rarity of each, and of each view its words by rarity, a unit vector."""
 
     def __init__(self, model: Path, database: Path) -> None:
-        records = read_records(model)
-        self._points3d = dict(zip(records.point_ids.tolist(), records.points3d, strict=True))
-        self._database = database
-        self._views = {}
+        records, self.features, self.views = read_records(model), features_of(database), {}
+        self.points3d = np.full((records.point_ids.max() + 1, 3), np.nan)
+        self.points3d[records.point_ids] = records.points3d
         for image in records.images:
-            _, descriptors = self._features(image.name)
             seen = image.point_ids >= 0
-            self._views[image.name] = descriptors[seen], image.point_ids[seen]
+            self.views[image.name] = self.features[image.name][1][seen], image.point_ids[seen]
+        described = [descriptors for descriptors, _ in self.views.values()]
+        some = np.concatenate(described)[::EVERY].astype(np.float64)
+        self.centres, _ = kmeans2(some, WORDS, iter=ROUNDS, minit="points", seed=0)
+        counts = np.array([self.word_counts(descriptors) for descriptors in described])
+        self.rarity = np.log(len(counts) / np.maximum((counts > 0).sum(0), 1))
+        self.bags = counts * self.rarity / np.linalg.norm(counts * self.rarity, axis=1, keepdims=True)
+
+    def word_counts(self, descriptors: NDArray[np.float32]) -> NDArray[np.int64]:
+        return np.bincount(vq(descriptors, self.centres)[0], minlength=WORDS)
+
+    def retrieved(self, photo: str) -> list[str]:
+        """The views whose words are most like those of the photo."""
+        likeness = self.bags @ (self.rarity * self.word_counts(self.features[photo][1]))
+        return [list(self.views)[i] for i in np.argsort(-likeness, kind="stable")[:RETRIEVED]]
 
     def localize(self, photo: str, camera: tuple[float, ...], views: Iterable[str] | None) -> Any:
         """Rotation, translation and verdict of a photo of the database, against the points of these views or of all."""
-        pixels, own = self._features(photo)
-        theirs, ids = zip(*(self._views[name] for name in views or self._views), strict=True)
+        pixels, own = self.features[photo]
+        theirs, ids = zip(*(self.views[name] for name in views or self.views), strict=True)
         keypoints, points = descriptor_matches(own, np.concatenate(theirs), np.concatenate(ids))
         lens = {"model": "PINHOLE", "width": 0, "height": 0, "params": list(camera)}
-        pose, stats = poselib.estimate_absolute_pose(
-            pixels[keypoints], np.array([self._points3d[point] for point in points.tolist()]), lens,
-            {"max_reproj_error": THRESHOLD_PX, "seed": 0}, {},
-        )  # fmt: skip
+        accepted = {"max_reproj_error": THRESHOLD_PX, "seed": 0}
+        pose, stats = poselib.estimate_absolute_pose(pixels[keypoints], self.points3d[points], lens, accepted, {})
         verdict = "confident" if stats["num_inliers"] >= LEAST_INLIERS else "ambiguous"
         return SimpleNamespace(
-            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict,
-            covariance=np.full((6, 6), np.nan), focal_length=np.nan,
+            rotation=np.asarray(pose.R), translation=np.asarray(pose.t), verdict=verdict, focal_length=np.nan,
+            covariance=np.full((6, 6), np.nan), matches=np.column_stack([keypoints, points]),
         )  # fmt: skip
 
-    def _features(self, photo: str) -> tuple[Array, NDArray[np.float32]]:
-        """Keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""
-        with pycolmap.Database.open(self._database) as content:
-            (number,) = (image.image_id for image in content.read_all_images() if image.name == photo)
-            descriptors = content.read_descriptors(number).data.astype(np.float32)
-            pixels = content.read_keypoints(number)[:, :2].astype(np.float64)
-        return pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+
+def features_of(database: Path) -> dict[str, tuple[Array, NDArray[np.float32]]]:
+    """Of each photo the keypoints (m, 2), pixels, and descriptors (m, 128) of unit length."""
+    found = {}
+    with pycolmap.Database.open(database) as content:
+        for image in content.read_all_images():
+            descriptors = content.read_descriptors(image.image_id).data.astype(np.float32)
+            pixels = content.read_keypoints(image.image_id)[:, :2].astype(np.float64)
+            found[image.name] = pixels, descriptors / np.linalg.norm(descriptors, axis=1, keepdims=True)
+    return found
 
 
 def descriptor_matches(
@@ -97,19 +115,21 @@ def descriptor_matches(
 
 def problems_of(scene: PhotoScene, photo: str, full: SceneMap, seed: int) -> dict[str, Problem]:
     """By method, of one photo that is left out of its map; reading and detecting is done before."""
-    place, found = SceneMap.from_colmap(scene.without(photo)), detected_keypoints(scene.photos / photo)
+    model = scene.model(left_out=photo)
+    place, found = SceneMap.from_colmap(model), detected_keypoints(scene.photos / photo)
     (true,) = full.named([photo])
     shared = np.array([np.isin(view.points, true.points).sum() for view in full.views])
     likely = [full.views[i].name for i in np.argsort(-shared, kind="stable")]
     views = [name for name in likely if name != photo and name in place.view_numbers][:VIEWS]
     far = median_distance(full.points3d[true.points], (true.rotation, true.translation))
     alignment = aligned(full, place)
-    described = DescribedMap(scene.without(photo), scene.database)
+    described = DescribedMap(model, scene.database)
     known: dict[str, Any] = {"scores": found.scores, "seed": seed, "time_limit": TIME_LIMIT}
     searches: dict[str, Callable[[], Solution]] = {}
     for method, named in (("views", views), ("map", None)):
         searches[method] = partial(place.localize, found.pixels, ("PINHOLE", CAMERA), views=named, **known)
         searches[f"{method}-sift"] = partial(described.localize, photo, CAMERA, named)
+    searches["words-sift"] = lambda: described.localize(photo, CAMERA, described.retrieved(photo))
     name, pose = f"{scene.photos.name}/{photo}", alignment.pose(true.rotation, true.translation)
     return {
         method: Problem(name, search, [pose], distance=far * alignment.scale) for method, search in searches.items()
@@ -120,7 +140,7 @@ def rows(options: argparse.Namespace) -> Iterator[Row]:
     for name in options.scenes:
         kept = options.maps / f"{name}-{FEATURES}"
         scene = PhotoScene(options.data / "photos" / name, kept, CAMERA, FEATURES)
-        full = SceneMap.from_colmap(scene.full())
+        full = SceneMap.from_colmap(scene.model())
         chosen = spread([photo for photo in scene.names() if photo in full.view_numbers], options.limit)
         drawn = [problems_of(scene, photo, full, options.seed) for photo in chosen]
         for method in drawn[0]:

@@ -5,7 +5,6 @@ run: features.db, full/sparse and without-<photo>/sparse.
 """
 
 import shutil
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -54,19 +53,13 @@ class PhotoScene:
         """The photos."""
         return sorted(path.name for path in self.photos.iterdir() if path.suffix.lower() in {".jpg", ".png"})
 
-    def full(self) -> Path:
-        """The model of all photos."""
-        return self._model("full", self.names())
-
-    def without(self, photo: str) -> Path:
-        """The model of all photos but one."""
-        return self._model(f"without-{photo}", [name for name in self.names() if name != photo])
-
-    def _model(self, what: str, names: Sequence[str]) -> Path:
-        folder = self.kept / what / "sparse"
+    def model(self, left_out: str | None = None) -> Path:
+        """The model of all photos, or of all but one."""
+        names = [name for name in self.names() if name != left_out]
+        folder = self.kept / (f"without-{left_out}" if left_out else "full") / "sparse"
         if not folder.is_dir():
             options = pycolmap.IncrementalPipelineOptions()
-            options.num_threads, options.random_seed, options.image_names = 1, 0, list(names)
+            options.num_threads, options.random_seed, options.image_names = 1, 0, names
             options.ba_refine_focal_length = options.ba_refine_extra_params = False
             temporary = folder.with_name("part")
             shutil.rmtree(temporary, ignore_errors=True)

@@ -4,6 +4,7 @@ import json
 import runpy
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -232,6 +233,29 @@ def test_descriptors_are_matched_to_points_seen_from_several_views() -> None:
     assert true.sum() == 100
     np.testing.assert_array_equal(matched[true], keypoints[true] + 7)
     assert (~true).sum() < 25
+
+
+def test_a_photo_is_localised_by_descriptors_in_the_views_that_its_words_retrieve(monkeypatch) -> None:
+    """Twelve views of 100 points each; the photo sees those of the first one."""
+    rng, turn = np.random.default_rng(0), Rotation.from_rotvec([0.1, 0.2, 0.3]).as_matrix()
+    points, rows = rng.uniform(-1, 1, (1200, 3)), rng.normal(size=(1200, 64)).astype(np.float32)
+    rows /= np.linalg.norm(rows, axis=1, keepdims=True)
+    camera, pose = points[:100] @ turn.T + [0, 0, 5], (turn, np.array([0.0, 0, 5]))
+    pixels, ids = 1000 * camera[:, :2] / camera[:, 2:] + 500, np.arange(1200)
+    views = {f"view {k}": (pixels, rows[100 * k : 100 * k + 100]) for k in range(12)}
+    images = [SimpleNamespace(name=f"view {k}", point_ids=ids[100 * k : 100 * k + 100]) for k in range(12)]
+    model = SimpleNamespace(images=images, point_ids=ids, points3d=points)
+    monkeypatch.setattr(bench_left_out, "read_records", lambda _: model)
+    monkeypatch.setattr(bench_left_out, "features_of", lambda _: views | {"photo": views["view 0"]})
+    monkeypatch.setattr(bench_left_out, "WORDS", 100)
+    place = bench_left_out.DescribedMap(Path(), Path())
+    assert place.retrieved("photo")[0] == "view 0"
+    assert len(place.retrieved("photo")) == 10
+    for named in (None, place.retrieved("photo")):
+        search = partial(place.localize, "photo", (1000.0, 1000.0, 500.0, 500.0), named)
+        outcome = record.solved(record.Problem("", search, [pose], points))
+        assert outcome.rotation_deg < 0.01
+        assert outcome.verdict == "confident"
 
 
 def test_photos_of_a_city_are_seen_where_their_poses_put_them(tmp_path: Path) -> None:
