@@ -28,7 +28,7 @@ VIEW_SHARE = 0.2  # the same of the shift of what they look at, in distances to 
 # The view's pose is the one to look near, not the best pose of a view that was tried in vain.
 # A search of a fourth of the time meets four fifths as many poses: near one view after the other that is more.
 BRIEF = replace(DEFAULT, near=(DEFAULT.everywhere,)).limited(1)
-LONGER = DEFAULT.limited(16)
+ONCE, LONGER = DEFAULT.limited(1), DEFAULT.limited(16)
 PROMISING = 3  # views that are tried longer if none is confident
 LIKELY = -20.0  # log10 of the false alarms below which a view is tried longer before the next one
 RANKS = {"failed": 0, "ambiguous": 1, "confident": 2}

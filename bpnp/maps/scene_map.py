@@ -24,6 +24,7 @@ from bpnp.maps.localize import (
     BRIEF,
     LIKELY,
     LONGER,
+    ONCE,
     PROMISING,
     Photo,
     Region,
@@ -233,10 +234,10 @@ class SceneMap:
         time_limit: seconds for all views together, after which no search begins; None for no limit.
 
         Poses near each view are tried briefly until one is confident, longer at once where hardly any unrelated points
-        would fit as well, and at the end near the most promising views longer; else the pose with the fewest false
-        alarms is returned. A confident pose is compared with those that explain the same image points elsewhere in the
-        map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are the first `candidates`; not if a
-        prior is given. `solution.view` is the view near which it was found.
+        would fit as well; then near each view once more, and near the most promising ones longer; else the pose with
+        the fewest false alarms is returned. A confident pose is compared with those that explain the same image points
+        elsewhere in the map (`bpnp.maps.twins`): "ambiguous" if one does so about as well, and both are the first
+        `candidates`; not if a prior is given. `solution.view` is the view near which it was found.
         `solution.matches` (k, 2): place of a keypoint, and id of a point in the map's COLMAP model; `solution.points3d`
         with the ids `solution.point_ids` are the points that were tried.
         Raises ValueError for unknown views and for input that `bpnp.solve` refuses.
@@ -258,7 +259,7 @@ class SceneMap:
         def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
             return counted(near_view(region, used, camera, expected, options), tries)
 
-        waiting, longer = deque((place, BRIEF) for place in places), set[str]()
+        waiting, longer = deque((place, rule) for rule in (BRIEF, ONCE) for place in places), set[str]()
         while waiting:
             place, settings = waiting.popleft()
             remaining = None if time_limit is None else time_limit - (Clock.now() - start)

@@ -18,6 +18,7 @@ from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.scene import Scene
+from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import SearchResult, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]
@@ -35,7 +36,8 @@ def against_rivals(
     """A confident result once more, beside the poses that a repeated structure would confuse with it, and beside those
     at other focal lengths; if one of the former is better, so is that one.
 
-    The camera is believed as it was given unless another focal length has fewer false alarms by `rule.lead` decades."""
+    The camera is believed as it was given unless another focal length, which is paid for as an unknown, has fewer false
+    alarms."""
     result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
     if result.verdict != "confident" or sets.focal is not None:
         return result
@@ -45,7 +47,7 @@ def against_rivals(
     rotation, translation = result.best
     middle = rotation @ sets.middle + translation
     for other in _at_other_focal_lengths(result, sets, middle, entered, rule):
-        if other is not None and _alarms(sets, other, rule) < result.log10_false_alarms - rule.lead:
+        if other is not None and _alarms(sets, other, rule) < result.log10_false_alarms:
             better = of_misfit(misfit_of(rotation, middle, other), rule)
             if better is not None:
                 chance = result.reason.split(", and no alternative")[0]
@@ -59,15 +61,19 @@ def _at_other_focal_lengths(
     """Poses with the focal lengths that fit them best: of Gauss-Newton steps from the best pose itself, and from the
     likeliest of those that annealing reaches from it at other focal lengths.
 
-    The latter only where three matches may be coincidences: else the steps meet what there is. middle: (3,) of the
-    scene, seen from the camera.
+    The latter only where three matches may be coincidences: else the steps meet what there is. Where they rather are
+    than not, poses are looked for around it there. middle: (3,) of the scene, seen from the camera.
     """
     rotation, scale = result.best[0], max(result.residual, sets.image.scales[0])
     yield with_focal_length(sets, rotation, middle, scale)
     decades = -result.log10_false_alarms / match_count(result.candidates, sets)
     if -rule.independent * decades > rule.missed:
         scene = entered()
-        zooms = [(zoom, *near_focal_length(sets, rotation, middle, zoom, scale, scene)) for zoom in rule.zoomed.zooms]
+        vague = 10 ** (-rule.independent * decades) > 0.5
+        zooms = [
+            (zoom, *near_focal_length(sets, rotation, middle, zoom, scale, scene, looks=vague))
+            for zoom in rule.zoomed.zooms
+        ]
         zoom, there, poses = max(zooms, key=lambda one: _likelihood(*one[1:]))
         if not len(poses):  # after the deadline
             return
@@ -77,10 +83,11 @@ def _at_other_focal_lengths(
 
 
 def near_focal_length(
-    sets: PointSets, rotation: Array, middle: Array, zoom: float, scale: float, scene: Scene
+    sets: PointSets, rotation: Array, middle: Array, zoom: float, scale: float, scene: Scene, *, looks: bool = False
 ) -> tuple[PointSets, Candidates]:
     """The points at `zoom` times the focal length, and the pose that annealing reaches there from the one that sees the
-    scene as large, by some of the bearings; none after the deadline.
+    scene as large, by some of the bearings, or the likeliest of those that a look around that one meets; none after the
+    deadline.
 
     middle: (3,) of the scene, seen from the camera. scale: of the residuals, radians. scene: whose settings and
     deadline hold.
@@ -88,10 +95,11 @@ def near_focal_length(
     zoomed, settings = at_focal_length(sets, zoom), scene.settings
     rule = settings.evidence.zoomed
     few = replace(settings, fine=replace(settings.fine, bearings=rule.bearings))
-    there = Scene(zoomed, 0, few, scene.deadline)
+    there = Scene(zoomed, 0, settings if looks else few, scene.deadline)
     wide = max(scale, rule.width * abs(math.log(zoom)) * sets.image.spread)
     poses = rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None]
-    ends = anneal_on_points(there, Candidates.unscored(*there.enter(*poses)), 2 * wide)
+    start = Candidates.unscored(*there.enter(*poses))
+    ends = search_beside(there, start, settings.beside) if looks else anneal_on_points(there, start, 2 * wide)
     return zoomed, in_user_frame(ends[:1], there)
 
 
