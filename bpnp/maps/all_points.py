@@ -20,8 +20,8 @@ from bpnp.solving.solution import Solution
 
 @one_blas_thread
 def on_all_points(solution: Solution, photo: Photo) -> Solution | None:
-    """A confident solution fitted to all points of a photo's place that its camera sees, and judged by them; None where
-    they explain the keypoints no better."""
+    """A confident solution fitted to all points of a photo's place that its camera sees, and judged by them; as it was
+    but for a doubt where they explain the keypoints no better, None without one."""
     place, seen = photo.place, in_picture(photo.problem, solution)
     cones = Cones(place.cones.axes[seen], place.cones.cosines[seen])
     region = replace(place, points3d=place.points3d[seen], point_ids=place.point_ids[seen], cones=cones)
@@ -37,14 +37,17 @@ def on_all_points(solution: Solution, photo: Photo) -> Solution | None:
         beside = finish(scene, search_beside(scene, start, DEFAULT.beside), DEFAULT.finished)
         ends = Candidates.concatenated([ends, in_user_frame(beside, scene)])
     # That no better pose was missed is known of the one that is refined.
-    result = judged(ends, problem.sets, batches=1, exhaustive=True)
-    result = against_rivals(result, problem.sets, lambda: scene, DEFAULT.evidence, exhaustive=True)
+    alone = judged(ends, problem.sets, batches=1, exhaustive=True)
+    result = against_rivals(alone, problem.sets, lambda: scene, DEFAULT.evidence, exhaustive=True)
     better = result.log10_false_alarms < solution.log10_false_alarms
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
     rule = DEFAULT.evidence
     same = problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]
-    if photo.deadline.passed() or not (better and same):
+    if photo.deadline.passed() or not same:
         return None
+    if not better:
+        doubted = alone.verdict == "confident" and result.verdict != "confident"
+        return replace(solution, verdict=result.verdict, reason=result.reason) if doubted else None
     fitted = finished(problem, result, solution.seconds, None)
     stats = replace(fitted.stats, iterations=solution.stats.iterations)
     candidates = (*fitted.candidates, *solution.candidates[1:])

@@ -79,6 +79,19 @@ def test_the_pose_is_fitted_to_all_points_that_its_camera_sees(planted: tuple[Sc
     assert solution.log10_false_alarms < of_view.log10_false_alarms
 
 
+def test_a_doubt_that_all_points_raise_is_kept_though_they_explain_no_more(
+    planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, truth = planted
+    keypoints, _ = photo_of(truth, 1)
+    known = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
+    doubt = {"verdict": "ambiguous", "reason": "another focal length"}
+    monkeypatch.setattr("bpnp.maps.all_points.against_rivals", lambda result, *_, **__: replace(result, **doubt))
+    solution = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
+    assert (known.verdict, solution.verdict, solution.reason) == ("confident", "ambiguous", doubt["reason"])
+    assert solution.log10_false_alarms == known.log10_false_alarms  # of the view's points alone
+
+
 def test_only_strong_keypoints_are_tried_and_matches_are_among_all_of_them(
     planted: tuple[SceneMap, Planted], monkeypatch: pytest.MonkeyPatch
 ) -> None:

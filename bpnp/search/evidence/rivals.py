@@ -37,7 +37,7 @@ def against_rivals(
     at other focal lengths; if one of the former is better, so is that one.
 
     The camera is believed as it was given unless another focal length, which is paid for as an unknown, has fewer false
-    alarms."""
+    alarms by the factor `rule.focal_chance`."""
     result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
     if result.verdict != "confident" or sets.focal is not None:
         return result
@@ -46,8 +46,9 @@ def against_rivals(
         return result
     rotation, translation = result.best
     middle = rotation @ sets.middle + translation
+    most = result.log10_false_alarms + math.log10(rule.focal_chance)
     for other in _at_other_focal_lengths(result, sets, middle, entered, rule):
-        if other is not None and _alarms(sets, other, rule) < result.log10_false_alarms:
+        if other is not None and _alarms(sets, other, rule) < most:
             better = of_misfit(misfit_of(rotation, middle, other), rule)
             if better is not None:
                 chance = result.reason.split(", and no alternative")[0]
