@@ -18,8 +18,7 @@ from view_problems import REPORTED
 
 from bpnp import solve
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
-from bpnp.datamodules.shapes import procedural_shape
-from bpnp.datamodules.surfaces import normalise, sample_surface
+from bpnp.datamodules.shapes import normalise, procedural_shape, sample_surface
 
 Points = tuple[str, Array, Array, Array, Array]  # name, points2d, points3d, rotation, translation
 POINTS, NOISE = 400, 2 / 800

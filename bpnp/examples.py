@@ -12,8 +12,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageEnhance
 from scipy.spatial.transform import Rotation
 
-from bpnp.datamodules.shapes import procedural_shape
-from bpnp.datamodules.surfaces import sample_surface
+from bpnp.datamodules.shapes import procedural_shape, sample_surface
 from bpnp.datamodules.synthetic_maps.maps import LONG_SIDE, MapOptions, draw_map_problem
 
 Kind = Literal["mesh", "photo", "leds", "stars"]

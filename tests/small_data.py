@@ -10,8 +10,7 @@ from lightning import LightningModule, Trainer
 from torch import Tensor, nn, optim
 
 from bpnp import BPnPNet
-from bpnp.datamodules.shapes import procedural_shape
-from bpnp.datamodules.surfaces import Mesh
+from bpnp.datamodules.shapes import Mesh, procedural_shape
 from bpnp.geometry import project, transform
 from bpnp.layers import RansacPnP
 from bpnp.models import Refinement

@@ -48,7 +48,7 @@ def test_the_wheel_holds_what_is_used_and_no_more(built: dict[str, Path]) -> Non
         "__init__.pyi",
         "report/__init__.pyi",
         "weights/procedural-so3.ckpt",
-        "report/page/assets/page.html",
+        "report/assets/page.html",
     ):
         assert f"bpnp/{name}" in names
     assert any(name.endswith("LICENSE") for name in names)

@@ -4,9 +4,8 @@ from collections.abc import Callable, Mapping
 
 from bpnp.commands.localizing import localize
 from bpnp.commands.preparing import convert_weights, prepare_authors, prepare_megadepth, prepare_modelnet40
-from bpnp.commands.reporting import report, view, wandb_results
+from bpnp.commands.reporting import report, table, view, wandb_results
 from bpnp.commands.solving import solve, verify, warm_up
-from bpnp.commands.tables import table
 
 Command = Callable[..., None]
 

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from rich.text import Text
 
-from bpnp.commands.output import progress, say
 from bpnp.files import claimed
-from bpnp.report.terminal import console
+from bpnp.report.terminal import console, progress, say
 
 if TYPE_CHECKING:
     from bpnp.maps.many_photos import Outcome, SolutionFolder
@@ -156,8 +155,7 @@ def _attempts(cluster: str | None) -> Callable[..., Any]:
 
 def _table(records: Mapping[str, Mapping[str, Any]]) -> Any:
     """A row for each photo."""
-    from bpnp.report.palette import VERDICTS
-    from bpnp.report.terminal import SplitTable, number
+    from bpnp.report.terminal import VERDICTS, SplitTable, number
 
     rows = []
     for name, record in records.items():

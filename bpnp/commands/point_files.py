@@ -47,7 +47,7 @@ def read_points3d(
 
         return read_records(path if path.is_dir() else path.parent).points3d, None, None
     if path.suffix.lower() not in ARRAYS:
-        from bpnp.datamodules.surfaces import SUFFIXES, read_mesh, read_vertices, sample_surface
+        from bpnp.datamodules.shapes import SUFFIXES, read_mesh, read_vertices, sample_surface
 
         _check_suffix(path, (*ARRAYS, *SUFFIXES))
         if surface is None:

@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
-from bpnp.commands.output import say
 from bpnp.commands.parser import at_least
 from bpnp.files import written_whole
+from bpnp.report.terminal import say
 
 if TYPE_CHECKING:
     from bpnp.datamodules.store import Store

@@ -9,9 +9,8 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from bpnp.commands.output import progress, say
 from bpnp.files import write_text
-from bpnp.report.terminal import console
+from bpnp.report.terminal import console, progress, say
 
 if TYPE_CHECKING:
     from bpnp.solving.solution import Solution
@@ -97,8 +96,12 @@ def solve(
     if photo is not None and (picture is None or camera is None):
         raise ValueError("expected --photo with --picture and --camera, got it without")
     if picture is not None:
-        from bpnp.report.figures import SUFFIXES, save_figure  # matplotlib, where something is drawn
-        from bpnp.report.photos import read_photo, size_in_camera
+        from bpnp.report.figures import (  # matplotlib, where something is drawn
+            SUFFIXES,
+            read_photo,
+            save_figure,
+            size_in_camera,
+        )
         from bpnp.solving.pictures import solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
@@ -240,7 +243,7 @@ def _tell(solution: "Solution", *, json: bool, output: Path | None) -> Console:
 
 def solution_table(solution: "Solution") -> Table:
     """Verdict, pose and matches; the next candidates, and how long it took."""
-    from bpnp.report.palette import VERDICTS
+    from bpnp.report.terminal import VERDICTS
 
     table = Table(box=box.SIMPLE, show_header=False, padding=(0, 1))
     table.add_column(no_wrap=True, style="dim")

@@ -15,11 +15,10 @@ from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 import bpnp.datamodules
-from bpnp.commands.output import say
 from bpnp.commands.parser import OneLineParser, plain
 from bpnp.files import claimed, config_content
-from bpnp.training.callbacks import InterruptedCheckpoint, SafeCheckpointIO, interruptible
-from bpnp.training.results_writer import ResultsWriter
+from bpnp.report.terminal import say
+from bpnp.training.callbacks import InterruptedCheckpoint, ResultsWriter, SafeCheckpointIO, interruptible
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
 
 

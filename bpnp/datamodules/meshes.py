@@ -19,9 +19,8 @@ from bpnp.datamodules.augment import picked
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
-from bpnp.datamodules.shapes import Sampler, Shapes, open_shapes, procedural_shapes
+from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, open_shapes, procedural_shapes
 from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store
-from bpnp.datamodules.surfaces import MeshError, Normalisation, normalise
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
 

@@ -1,28 +1,198 @@
-"""Collections of shapes to sample: procedural ones, and meshes in a folder."""
+"""Triangle meshes, read from files or drawn; uniform samples of their surface; and collections of shapes to sample."""
 
+import io
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
 from bpnp.checks import check_within
-from bpnp.datamodules.surfaces import SUFFIXES, Mesh, read_mesh, sample_surface
 from bpnp.files import files_as_they_are, fingerprint
 from bpnp.geometry import random_rotations
 
+SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
+Normalisation = Literal["unit_sphere", "unit_cube", "none"]
 VERSION = 1  # of procedural shapes, raised whenever the same seed makes another one
 PARTS = ("train", "val", "test")
 SPLITS = ("train", "test")
 LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
 ENTRY = re.compile(rf"(?:.*/)?([^/]+)/(train|test)/([^/.][^/]*)(?:{'|'.join(map(re.escape, SUFFIXES))})", re.I)
 Sampler = Callable[[int], NDArray[np.float64]]
+
+
+class MeshError(ValueError):
+    """A file that is no usable mesh. The message names the file."""
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles: vertices (v, 3) and the vertex indices (f, 3) of the faces. MeshError if they are no surface."""
+
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        if len(self.faces) == 0:
+            raise MeshError("expected a mesh with faces, got none")
+        if not np.isfinite(self.vertices).all():
+            raise MeshError("expected finite vertices, got NaN or infinity")
+        if self.faces.min() < 0 or self.faces.max() >= len(self.vertices):
+            used = f"{self.faces.min()} to {self.faces.max()}"
+            raise MeshError(f"expected faces of the vertices 0 to {len(self.vertices) - 1}, got {used}")
+        area = self.areas.sum()
+        if not 0 < area < np.inf:
+            raise MeshError(f"expected a surface of positive area, got {area}")
+
+    @property
+    def areas(self) -> NDArray[np.float64]:
+        """Area of each face (f,)."""
+        a, b, c = (self.vertices[self.faces[:, i]] for i in range(3))
+        return np.linalg.norm(np.cross(b - a, c - a), axis=-1) / 2
+
+
+def read_mesh(path: Path) -> Mesh:
+    """Read an .off, .ply, .obj, .stl or .glb file; the parts of a scene become one mesh. Polygons become fans.
+
+    Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
+    vertices.
+    """
+    return _of_file(path, _mesh)
+
+
+def _of_file(path: Path, parse: Callable[[bytes, str], Any]) -> Any:
+    """What `parse` makes of the bytes and the suffix of a file; its errors name the file."""
+    try:
+        return parse(path.read_bytes(), path.suffix.lower())
+    except MeshError as error:
+        raise MeshError(f"{path}: {error}") from error
+
+
+def _mesh(content: bytes, suffix: str) -> Mesh:
+    """The mesh in the bytes of a file with this suffix; the MeshError names no file."""
+    if suffix == ".off":
+        return _parse_off(content)
+    mesh = _load(content, suffix)
+    if not isinstance(mesh, trimesh.Trimesh):
+        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
+
+
+def read_vertices(path: Path) -> NDArray[np.float64]:
+    """The points (v, 3) of a cloud in the order of the file, or the different vertices of a mesh.
+
+    Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
+    """
+    return _of_file(path, _vertices)
+
+
+def _parse_off(content: bytes) -> Mesh:
+    """The counts may stand on the header line (``OFF490 518 0``), as in many files of ModelNet40.
+
+    trimesh reads OFF too, but five times slower, and takes a file that ends early for one with fewer faces.
+    """
+    text = content.decode("utf-8-sig", errors="replace")
+    lines = [stripped for line in text.splitlines() if (stripped := line.partition("#")[0].strip())]
+    header = re.match(r"(?:ST)?C?N?OFF\b|OFF(?=\d)", lines[0]) if lines else None
+    if header is None:
+        raise MeshError(f"expected `OFF` in the first line, got {text[:20]!r}")
+    rest = lines[0][header.end() :].split()
+    counts, body = (rest, lines[1:]) if rest else (lines[1].split() if len(lines) > 1 else [], lines[2:])
+    if len(counts) < 2 or not all(count.isdecimal() for count in counts[:2]):
+        raise MeshError(f"expected the numbers of vertices and faces after `OFF`, got {' '.join(counts)[:40]!r}")
+    num_vertices, num_faces = int(counts[0]), int(counts[1])
+    if len(body) < num_vertices + num_faces:
+        raise MeshError(
+            f"expected {num_vertices} vertices and {num_faces} faces, got {len(body)} lines: the file is truncated"
+        )
+    try:
+        vertices = np.loadtxt(body[:num_vertices], usecols=(0, 1, 2), ndmin=2) if num_vertices else np.empty((0, 3))
+        faces = _triangles(body[num_vertices : num_vertices + num_faces])
+    except (ValueError, IndexError) as error:
+        raise MeshError(f"expected vertices and faces as numbers, got something else ({error})") from error
+    return Mesh(vertices, faces)
+
+
+def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
+    """Fans of the polygons in rows ``k i_1 ... i_k [colour]``; points and edges (k < 3) have no surface."""
+    corners = np.array([int(row.split(None, 1)[0]) for row in rows])
+    fans = [np.empty((0, 3), np.int64)]
+    for count in np.unique(corners[corners >= 3]):
+        same = [row for row, k in zip(rows, corners, strict=True) if k == count]
+        polygons = np.loadtxt(same, usecols=range(1, count + 1), dtype=np.int64, ndmin=2)
+        middle, last = polygons[:, 1:-1], polygons[:, 2:]
+        fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
+    return np.concatenate(fans)
+
+
+def _vertices(content: bytes, suffix: str) -> NDArray[np.float64]:
+    if suffix == ".off":
+        return _different(_parse_off(content).vertices)
+    vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
+    if not len(vertices):  # as a mesh, a cloud of points is empty
+        vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64).reshape(-1, 3)
+        declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
+        expected = 1 if declared is None else int(declared[1])
+        if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
+            raise MeshError(f"expected {expected} points, got {len(vertices)}")
+    return vertices
+
+
+def _different(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+    _, first = np.unique(vertices, axis=0, return_index=True)
+    return vertices[np.sort(first)]
+
+
+def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh") -> Any:
+    """trimesh's mesh, or what it makes of the file."""
+    if not content:
+        raise MeshError("expected a mesh, got an empty file")
+    try:
+        # force: one mesh of all parts, each where the scene puts it; process: no search for equal vertices
+        file = io.BytesIO(content)
+        return trimesh.load(file, file_type=suffix[1:], force=force, process=False, skip_materials=True)
+    except Exception as error:
+        raise MeshError(f"expected a {suffix} mesh, got a file that trimesh cannot read ({error})") from error
+
+
+def sample_surface(mesh: Mesh, count: int, rng: np.random.Generator) -> NDArray[np.float64]:
+    """`count` points (count, 3) drawn uniformly by area from the triangles of a mesh.
+
+    A triangle is drawn with probability proportional to its area, a point in it as a + u (b - a) + v (c - a) with
+    (u, v) uniform in the unit square, folded over its diagonal.
+    """
+    cumulative = mesh.areas.cumsum()
+    # side="right": a triangle without area is never drawn
+    face = np.searchsorted(cumulative, rng.random(count) * cumulative[-1], side="right")
+    a, b, c = (mesh.vertices[mesh.faces[face, i]] for i in range(3))
+    u, v = rng.random((2, count, 1))
+    over = u + v > 1
+    u, v = np.where(over, 1 - u, u), np.where(over, 1 - v, v)
+    return a + u * (b - a) + v * (c - a)
+
+
+def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.float64]:
+    """Put the surface samples (k, 3) of a mesh into a frame that does not depend on its units.
+
+    unit_sphere: their mean at the origin, the farthest at distance 1. unit_cube: their bounding box centred, its
+    longest side 1. none: as in the file.
+    """
+    if mode == "none":
+        return points
+    if mode == "unit_sphere":
+        centred = points - points.mean(0)
+        return centred / np.linalg.norm(centred, axis=-1).max()
+    if mode == "unit_cube":
+        low, high = points.min(0), points.max(0)
+        return (points - (low + high) / 2) / (high - low).max()
+    raise ValueError(f"expected `normalisation` unit_sphere, unit_cube or none, got {mode!r}")
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ from torch import Tensor, nn
 from bpnp.checks import check_positive, checked_shapes
 from bpnp.geometry import MIN_POINTS
 from bpnp.precision import full_precision
-from bpnp.robust.backends import BACKENDS
 from bpnp.robust.matches import Matches, in_scene, normalised, residuals
 from bpnp.robust.minimal_solvers import take
+from bpnp.robust.ransac import BACKENDS
 from bpnp.types import SolveStats
 
 Backend = Literal["auto", "poselib", "opencv", "torch"]

@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bpnp.cameras import camera_from
-from bpnp.report.palette import LIGHT, QUIET, VERDICTS
-from bpnp.report.photos import size_in_camera
+from bpnp.report.figures import size_in_camera
+from bpnp.report.terminal import LIGHT, QUIET, VERDICTS
 from bpnp.search.evidence.uncertainty import centre_covariance
 from bpnp.solving.pictures import solution_points
 from bpnp.solving.solution import Solution

@@ -20,8 +20,7 @@ from bpnp.files import fingerprint, interruptions_later, write_text
 from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
-from bpnp.report.figures import save_figure
-from bpnp.report.photos import read_photo
+from bpnp.report.figures import read_photo, save_figure
 from bpnp.solving.pictures import pose_text
 from bpnp.solving.solution import Solution
 

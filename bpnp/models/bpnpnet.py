@@ -11,7 +11,7 @@ from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement, match_again, pnp_pose, ransac_pose, round_widths
-from bpnp.models.nets.features import ImageFeatures, SceneFeatures
+from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
 from bpnp.types import Batch, Prediction

@@ -14,8 +14,7 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
 from bpnp.models.evaluation import Refinement, pnp_pose, ransac_pose
-from bpnp.models.nets.attention import ExchangeBlock, Neighbourhood
-from bpnp.models.nets.normalisation import centred
+from bpnp.models.nets import ExchangeBlock, Neighbourhood, centred
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.types import Batch, Prediction, SolveStats
 

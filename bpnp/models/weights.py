@@ -19,7 +19,7 @@ from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement
-from bpnp.models.nets.features import ImageFeatures, PointFeatures, SceneFeatures
+from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"

@@ -3,7 +3,7 @@ from .figures import plot_problem as plot_problem
 from .figures import plot_residuals as plot_residuals
 from .figures import plot_scene as plot_scene
 from .figures import recall_curve as recall_curve
-from .page.write import write_page as write_page
+from .page import write_page as write_page
 from .points import read_points as read_points
 from .results import ProblemRow as ProblemRow
 from .results import Results as Results

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from bpnp.report.charts import RECALLS, recall_chart
 from bpnp.report.figures import plot_problem, recall_curve
-from bpnp.report.page.charts import RECALLS, recall_chart
 from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_shares, read_results
 

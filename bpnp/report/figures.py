@@ -12,14 +12,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from bpnp.cameras import in_front
+from bpnp.cameras import Camera, image_size, in_front, same_shape
 from bpnp.files import interruptions_later, written_whole
-from bpnp.report.page.charts import RECALLS, Error, recall_of
-from bpnp.report.palette import DASHES, LIGHT, QUIET
-from bpnp.report.photos import size_in_camera
+from bpnp.report.charts import RECALLS, Error, recall_of
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
 from bpnp.report.runs import lines_of, read_runs
+from bpnp.report.terminal import DASHES, LIGHT, QUIET
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -257,3 +256,31 @@ def _upright(points: Array, frame: tuple[Array, Array]) -> Array:
     rotation, translation = frame
     x, y, z = (points @ rotation.T + translation).T
     return np.stack([x, z, -y], -1)
+
+
+def read_photo(path: Path | str) -> Array:
+    """The picture in a file (h, w, 3), uint8. Raises ValueError that names a file that is none."""
+    from PIL import Image
+
+    try:
+        with Image.open(path) as photo:
+            return np.asarray(photo.convert("RGB"))
+    except OSError as error:
+        raise ValueError(f"expected a picture, got {path}: {error}") from error
+
+
+def size_in_camera(photo: Array, camera: Camera | None) -> tuple[int, int]:
+    """Width and height of a whole photo in pixels of its camera, where the photo may have been made smaller since.
+
+    Raises ValueError for a photo of another shape than the camera's images.
+    """
+    height, width = photo.shape[:2]
+    known = None if camera is None else image_size(camera)
+    if known is None:
+        return width, height
+    if not same_shape((width, height), known):
+        raise ValueError(
+            f"expected a photo of {known[0]} x {known[1]} pixels as its camera has, or of that shape, got {width} x "
+            f"{height}; try the photo of this camera"
+        )
+    return known

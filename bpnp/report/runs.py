@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
-from bpnp.report.palette import DASHES, LIGHT
 from bpnp.report.results import SUMMARY, Results, read_results
+from bpnp.report.terminal import DASHES, LIGHT
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -1,4 +1,6 @@
-"""Tables for the terminal: every name and number stays whole in 80 columns."""
+"""How results look: colours; on the terminal lines as they are, progress on stderr, and tables that keep every name and
+number whole in 80 columns.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -7,11 +9,50 @@ from typing import Literal
 
 from rich import box
 from rich.console import Console, ConsoleOptions
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+# Colours of runs and estimates, for the page and for figures: eight of each scheme that stay apart for readers with
+# normal vision, protanopia and deuteranopia (at least 30 in CIE Lab) and tritanopia (23), at a contrast of 3 or more
+# against the background. Estimates also differ by their dashes.
+LIGHT = ("#002ed0", "#c68500", "#08a76d", "#91290f", "#977dea", "#916393", "#58006e", "#201816")
+DARK = ("#12cdff", "#ffb006", "#009b6b", "#986e9f", "#f3d783", "#cd5e1c", "#e7eee7", "#887bff")
+# The page itself, light and dark: quiet text, lines between rows, panels, what has the focus, wrong matches.
+INKS = {
+    "background": ("#ffffff", "#14171c"),
+    "text": ("#1b1f24", "#e6e8eb"),
+    "quiet": ("#59626d", "#a0a8b3"),
+    "line": ("#d5dae0", "#363c45"),
+    "panel": ("#f5f6f8", "#1d2128"),
+    "focus": ("#0b57d0", "#8ab4f8"),
+    "wrong": ("#b3261e", "#ff8a80"),
+} | {f"c{i}": inks for i, inks in enumerate(zip(LIGHT, DARK, strict=True))}
+QUIET = INKS["quiet"][0]
+VERDICTS = {"confident": LIGHT[2], "ambiguous": LIGHT[1], "failed": LIGHT[3]}
+DASHES = ((), (6.0, 3.0), (2.0, 2.0), (9.0, 3.0, 2.0, 3.0))
 Paper = Literal["modelnet40", "megadepth"]  # data sets of the paper, whose printed rows can be shown
 WIDTH = 80  # columns of the narrowest terminal; narrower ones wrap
+
+
+def say(line: object, *, to: Console | None = None) -> None:
+    """A line as it is: not wrapped, not coloured."""
+    (to or Console()).print(str(line), markup=False, highlight=False, soft_wrap=True)
+
+
+def progress(*, items: bool = True) -> Progress:
+    """What is going on and since when, and of several items how many are done; gone when the block ends."""
+    columns = (BarColumn(), MofNCompleteColumn()) if items else ()
+    console = Console(stderr=True)
+    return Progress(
+        SpinnerColumn(),
+        TextColumn("{task.description}", markup=False),
+        *columns,
+        TimeElapsedColumn(),
+        console=console,
+        transient=True,
+        disable=not console.is_interactive,
+    )
 
 
 def console() -> Console:

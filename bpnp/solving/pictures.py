@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from bpnp.cameras import Camera, Lens, camera_from
 from bpnp.files import written_whole
 from bpnp.report.figures import plot_image, plot_residuals
-from bpnp.report.palette import VERDICTS
 from bpnp.report.points import ProblemPoints
+from bpnp.report.terminal import VERDICTS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

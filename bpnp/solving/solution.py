@@ -184,7 +184,7 @@ class Solution:
         coordinates without a camera. photo: a file or (h, w, 3) uint8 under the points, as it was taken; it needs a
         camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
         """
-        from bpnp.report.photos import read_photo
+        from bpnp.report.figures import read_photo
         from bpnp.solving.pictures import solution_picture
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo

@@ -19,8 +19,7 @@ from bpnp.files import config_content, packaged_config
 from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
-from bpnp.training.callbacks import interruptible
-from bpnp.training.results_writer import ResultsWriter
+from bpnp.training.callbacks import ResultsWriter, interruptible
 from bpnp.training.task import BlindPnPTask
 
 SHORT_NAMES = {

@@ -7,9 +7,8 @@ from lightning.pytorch.trainer.states import TrainerFn
 from planted_model import plant_model
 from small_data import check_pairs
 
-from bpnp.datamodules.colmap.model_files import ColmapError
+from bpnp.datamodules.colmap.model_files import ColmapError, find_scenes
 from bpnp.datamodules.colmap.module import ColmapDataModule
-from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.datamodules.stored import split_scenes
 
 

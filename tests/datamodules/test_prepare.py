@@ -20,9 +20,8 @@ from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
 from bpnp.datamodules.colmap.module import colmap_recipe
 from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
-from bpnp.datamodules.shapes import open_shapes
+from bpnp.datamodules.shapes import normalise, open_shapes, read_mesh, sample_surface
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
-from bpnp.datamodules.surfaces import normalise, read_mesh, sample_surface
 
 BAD = {
     "train/cut": "OFF\n3 1 0\n0 0 0\n1 0 0\n",

@@ -4,8 +4,7 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import pdist, squareform
 
-from bpnp.datamodules.shapes import procedural_shape, procedural_shapes
-from bpnp.datamodules.surfaces import normalise, sample_surface
+from bpnp.datamodules.shapes import normalise, procedural_shape, procedural_shapes, sample_surface
 
 
 def samples(split: str, count: int, *, seed: int = 0) -> np.ndarray:

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from scipy import stats
 
-from bpnp.datamodules.surfaces import Mesh, MeshError, read_mesh, sample_surface
+from bpnp.datamodules.shapes import Mesh, MeshError, read_mesh, sample_surface
 
 VERTICES = "0 0 0\n2 0 0\n2 1 0\n0 1 0\n0 0 3\n"
 FACES = "4 0 1 2 3\n3 0 1 4\n"  # a rectangle of area 2 and a triangle of area 3

@@ -8,8 +8,13 @@ from planted import plant
 from torch import Tensor
 
 from bpnp.geometry import angle_between, camera_centre
-from bpnp.models.baselines.branch_and_bound import Boxes, rotation_uncertainty, translation_uncertainty
-from bpnp.models.baselines.gopac import maximise_inliers, within
+from bpnp.models.baselines.branch_and_bound import (
+    Boxes,
+    maximise_inliers,
+    rotation_uncertainty,
+    translation_uncertainty,
+    within,
+)
 from bpnp.models.baselines.gosma import RayMixture, SceneMixture, align_mixtures, distance, squared_norm
 
 

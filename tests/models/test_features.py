@@ -7,8 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from bpnp.models.nets.features import InputTransform, PointFeatures, normalise_points3d
-from bpnp.models.nets.normalisation import MaskedBatchNorm, linear_context_norm
+from bpnp.models.nets import InputTransform, MaskedBatchNorm, PointFeatures, linear_context_norm, normalise_points3d
 
 SIZES = (9, 1, 14)
 

@@ -8,7 +8,7 @@ from planted import padded, plant
 from bpnp import Batch
 from bpnp.models import Matcher
 from bpnp.models.matcher import image_of
-from bpnp.models.nets.attention import Attention, Neighbourhood
+from bpnp.models.nets import Attention, Neighbourhood
 from bpnp.training.losses import matching_likelihood_loss
 
 

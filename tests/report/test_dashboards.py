@@ -6,8 +6,8 @@ import wandb
 from report_data import write_run
 from small_data import is_written
 
+from bpnp.report.charts import recall_chart
 from bpnp.report.dashboards import log_results, scalars
-from bpnp.report.page.charts import recall_chart
 
 
 @pytest.fixture(autouse=True)

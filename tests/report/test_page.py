@@ -9,8 +9,8 @@ from plotly.offline import get_plotlyjs
 from report_data import HOSTILE, inflated, write_run
 
 from bpnp.report import write_page
-from bpnp.report.page.charts import chart_text, recall_chart
-from bpnp.report.page.write import page_html
+from bpnp.report.charts import chart_text, recall_chart
+from bpnp.report.page import page_html
 from bpnp.report.results import CAUSES
 from bpnp.report.terminal import number
 

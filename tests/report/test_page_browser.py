@@ -13,7 +13,7 @@ import pytest
 from report_data import HOSTILE, drawn_problem, write_run
 
 from bpnp.report import Results, write_page
-from bpnp.report.palette import DARK, LIGHT
+from bpnp.report.terminal import DARK, LIGHT
 
 REQUIRED = bool(os.environ.get("BPNP_REQUIRE_BROWSER"))
 if not REQUIRED:

@@ -9,7 +9,7 @@ from planted import seen
 from report_data import drawn_problem, inflated, row
 from scipy.spatial.transform import Rotation
 
-from bpnp.report.page.problems import PROBLEMS, page_points
+from bpnp.report.page import PROBLEMS, page_points
 from bpnp.report.points import ProblemPoints
 from bpnp.report.results import Results
 

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bpnp.report import Results, write_results
-from bpnp.report.page.write import quartile_rows
+from bpnp.report.page import quartile_rows
 from bpnp.report.tables import results_table
 from bpnp.report.terminal import SplitTable
 

@@ -15,9 +15,8 @@ import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
-from bpnp.training.callbacks import PoseLossWarmup
+from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
 from bpnp.training.losses import correspondence_loss, pose_loss
-from bpnp.training.results_writer import ResultsWriter
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError, number_globally
 
 

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from bpnp.datamodules.augment import check_clutter
-from bpnp.datamodules.colmap.model_files import FILES, ColmapError
+from bpnp.datamodules.colmap.model_files import FILES, ColmapError, find_scenes
 from bpnp.datamodules.colmap.reconstruction import ImagePoints, Reconstruction, read_reconstruction
-from bpnp.datamodules.colmap.scenes import find_scenes
 from bpnp.datamodules.problem import Counts, Problem, ProblemSource, stacked
 from bpnp.datamodules.store import Made, Recipe, StoreError, is_store
 from bpnp.datamodules.stored import PROBLEMS, WIDTHS, StoredDataModule, large_enough, problem_row

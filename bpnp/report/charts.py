@@ -12,9 +12,9 @@ import numpy.typing as npt
 import torch
 
 from bpnp.metrics import joint_error, recall_curve
-from bpnp.report.palette import DASHES, INKS, LIGHT
 from bpnp.report.results import Results
 from bpnp.report.runs import lines_of
+from bpnp.report.terminal import DASHES, INKS, LIGHT
 
 if TYPE_CHECKING:
     from plotly.graph_objects import Figure

@@ -4,8 +4,11 @@ plotly's script is inside, compressed: 2.0 MB of text. The numbers and points tr
 ten thousand problems stay under 20 MB. The template and what is drawn by the browser are in `assets`.
 """
 
+import base64
+import gzip
 import json
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from itertools import zip_longest
@@ -15,16 +18,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment
 from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
 from bpnp.files import write_text
-from bpnp.report.page.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
-from bpnp.report.page.problems import PROBLEMS, compressed, page_numbers, page_points
-from bpnp.report.palette import DASHES, INKS
-from bpnp.report.points import read_points, utf8
-from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, Results, cause_shares, read_results
+from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
+from bpnp.report.points import Array, ProblemPoints, read_points, utf8
+from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, ProblemRow, Results, cause_shares, read_results
 from bpnp.report.runs import Line, lines_of, named_runs
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
-from bpnp.report.terminal import Paper
+from bpnp.report.terminal import DASHES, INKS, Paper
 
 SCRIPTS = ("page.js", "problem.js")
 SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
@@ -40,6 +42,10 @@ COLUMNS = {  # of the table of problems: head and hover text
     "iterations": ("iterations", "iterations of the solver"),
     "seconds": ("sec", "seconds, the problem's share of its batch"),
 }
+PROBLEMS = 500  # whose points are on the page
+DIGITS = 5  # significant ones of errors; of points and poses, of their extent
+ERRORS = ("rotation_error_deg", "translation_error", "centre_error", "reprojection_error_deg", "seconds")
+COUNTS = ("inliers", "m", "n", "matches", "iterations")
 
 
 class TableRow(NamedTuple):
@@ -159,8 +165,112 @@ def plotly_script() -> str:
 
 
 def _asset(name: str) -> str:
-    return (files("bpnp.report.page") / "assets" / name).read_text(encoding="utf-8")
+    return (files("bpnp.report") / "assets" / name).read_text(encoding="utf-8")
 
 
 def _utf8(value: Any) -> Any:
     return utf8(value) if isinstance(value, str) and not isinstance(value, Markup) else value
+
+
+def compressed(text: str) -> str:
+    """gzip in base64, which the page's `inflated` reads."""
+    return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
+
+
+def shown_id(id: str) -> str:
+    """A problem's name as the page has it."""
+    return utf8(id) or "(no name)"
+
+
+def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
+    """The numbers of all problems: a series for each run and estimate. Columns of several series are there once."""
+    columns: dict[tuple[Any, ...], int] = {}
+
+    def place(values: Iterable[Any]) -> int:
+        return columns.setdefault(tuple(values), len(columns))
+
+    series = []
+    for line in lines_of(runs):
+        rows = runs[line.run].of(line.estimate)
+        names = {"run": line.run, "estimate": line.estimate, "name": line.label, "colour": f"c{line.colour}"}
+        ids, numbers = place(shown_id(row.id) for row in rows), _columns(rows)
+        series.append(names | {"ids": ids, "numbers": {key: place(values) for key, values in numbers.items()}})
+    return {"series": series, "columns": list(columns)}
+
+
+def page_points(runs: Mapping[str, Results], points: Mapping[str, Sequence[ProblemPoints]]) -> str:
+    """The points of the `PROBLEMS` worst problems of all runs: compressed lines of JSON.
+
+    The first line has, by run, the number of the line after it for each of the run's problems, -1 for none. Runs on the
+    same points share lines.
+    """
+    keys = {name: {problem.index: _key(problem) for problem in points[name]} for name in runs}
+    shared: dict[Hashable, dict[str, ProblemPoints]] = {}
+    for name in runs:
+        for problem in points[name]:
+            shared.setdefault(keys[name][problem.index], {})[name] = problem
+    error = {key: max(problem.error for problem in by_run.values()) for key, by_run in shared.items()}
+    worst = sorted(error, key=lambda key: -error[key])[:PROBLEMS]
+    place = {key: number for number, key in enumerate(worst)}
+    places = {
+        name: [place.get(keys[name].get(row.index), -1) for row in results.of(next(iter(results.estimates)))]
+        for name, results in runs.items()
+    }
+    lines = [json.dumps(_line(shared[key]), separators=(",", ":")) for key in worst]
+    return compressed("\n".join([json.dumps(places), *lines]))
+
+
+def _key(problem: ProblemPoints) -> Hashable:
+    """The same for problems of the same points: the name, the points that are there and the true pose."""
+    pose = None if problem.pose is None else np.c_[problem.pose].tobytes()
+    return problem.id, problem.points2d.tobytes(), problem.points3d.tobytes(), pose
+
+
+def _columns(rows: Sequence[ProblemRow]) -> dict[str, list[Any]]:
+    return {
+        **{key: [_shortened(getattr(row, key)) for row in rows] for key in ERRORS},
+        **{key: [getattr(row, key) for row in rows] for key in COUNTS},
+        "cause": [CAUSES.index(row.cause) for row in rows],
+    }
+
+
+def _shortened(value: float) -> float | str:
+    """`DIGITS` significant digits; of what JSON has no number for, the name that JavaScript's `Number` reads."""
+    if math.isfinite(value):
+        return float(f"{value:.{DIGITS}g}")
+    return "NaN" if math.isnan(value) else "Infinity"
+
+
+def _line(runs: Mapping[str, ProblemPoints]) -> dict[str, Any]:
+    """Points, true matches and pose; of each run the poses and the assigned matches."""
+    shown = next(iter(runs.values()))
+    ids2d, ids3d = (ids.tolist() for ids in shown.numbers())
+    decimals = _decimals(shown.points3d)
+    assigned = {name: problem.assigned3d.tolist() for name, problem in runs.items() if (problem.assigned3d >= 0).any()}
+    return {
+        "points2d": np.round(shown.points2d.astype(float), _decimals(shown.points2d)).tolist(),
+        "points3d": np.round(shown.points3d.astype(float), decimals).tolist(),
+        "ids2d": ids2d,
+        "ids3d": ids3d,
+        "match3d": shown.match3d.tolist(),
+        "assigned": assigned,
+        "truth": _pose(shown.pose, decimals),
+        "poses": {
+            name: {estimate: _pose(pose, decimals) for estimate, pose in problem.estimates.items()}
+            for name, problem in runs.items()
+        },
+    }
+
+
+def _decimals(points: Array) -> int:
+    """Decimal places of `DIGITS` digits of the points' extent."""
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    return DIGITS - math.floor(math.log10(extent)) if extent > 0 else DIGITS
+
+
+def _pose(pose: tuple[Array, Array] | None, decimals: int) -> list[float] | None:
+    """Quaternion (x, y, z, w) and translation; none without a pose."""
+    if pose is None or not np.isfinite(np.c_[pose]).all():
+        return None
+    quaternion = Rotation.from_matrix(pose[0]).as_quat()
+    return [*np.round(quaternion, DIGITS).tolist(), *np.round(np.asarray(pose[1], float), decimals).tolist()]

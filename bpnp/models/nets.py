@@ -1,0 +1,330 @@
+"""The neural networks that give points their features; no result depends on a padded point.
+
+Norms of padded sets, the context norm (Yi et al. 2018) and batch norm; point features with PointNet's input transform
+(paper section 3.3); attention within and between two sets.
+"""
+
+from itertools import pairwise
+from typing import Any
+
+import torch
+import torch.distributed as dist
+import torch.distributed.nn.functional as collectives
+from jaxtyping import Bool, Float
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional
+
+from bpnp.types import unpadded
+
+CONTEXT_EPS = 1e-3  # as in the authors' code
+
+
+def centred(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+    """x - mean over the real points of each set, per channel."""
+    weight = mask.unsqueeze(-1).to(x.dtype)
+    return x - (x * weight).sum(1, keepdim=True) / weight.sum(1, keepdim=True)
+
+
+def linear_context_norm(
+    x: Float[Tensor, "b k c"],
+    weight: Float[Tensor, "d c"],
+    bias: Float[Tensor, " d"],
+    mask: Bool[Tensor, "b k"] | None,
+    skip: Float[Tensor, "b k d"] | None = None,
+) -> Float[Tensor, "b k d"]:
+    """y = CN(x W^T + b) with CN(z) = (z - mean) / sqrt(var + 1e-3) over the points of each set, per channel.
+
+    With `skip` the result is skip + relu(y). The context norm is the only exchange between the points of a set; its
+    variance is unbiased, and zero for a set of one point. Padded points have y = 0; mask None: there are none. The
+    statistics of half-precision values are made in float32. The bias has no effect and its gradient is zero.
+    """
+    device = x.device.type
+    if torch.is_autocast_enabled(device):
+        dtype = torch.get_autocast_dtype(device)
+        x, weight, bias = x.to(dtype), weight.to(dtype), bias.to(dtype)
+    with torch.autocast(device, enabled=False):
+        return _LinearContextNorm.apply(x, weight, bias, mask, skip)
+
+
+class _LinearContextNorm(torch.autograd.Function):
+    """Keeps x and y for the gradient, and works in place: results in new memory cost more than their arithmetic.
+
+    dL/dz = (g - mean(g) - y sum(g y) / (count - 1)) / std for the gradient g of y.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, weight: Tensor, bias: Tensor, mask: Tensor | None, skip: Tensor | None) -> Tensor:
+        z = functional.linear(x, weight, bias)
+        y = _hidden(z if z.dtype == torch.float64 else z.float(), mask)
+        count = y.new_full((1, 1, 1), y.shape[1]) if mask is None else mask.sum(1)[:, None, None].to(y.dtype)
+        y = _hidden(y.sub_(y.sum(1, keepdim=True) / count), mask)
+        scale = torch.rsqrt(y.square().sum(1, keepdim=True) / (count - 1).clamp_min(1) + CONTEXT_EPS)
+        y = y.mul_(scale).to(x.dtype)
+        ctx.rectified = skip is not None
+        ctx.save_for_backward(x, weight, y, scale, count, mask)
+        return y if skip is None else torch.relu(y).add_(skip)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        x, weight, y, scale, count, mask = ctx.saved_tensors
+        g = gradient.to(y.dtype)
+        g = _hidden(torch.ops.aten.threshold_backward(g, y, 0) if ctx.rectified else g, mask)
+        wide = y.to(scale.dtype)
+        dz = g * wide
+        along = dz.sum(1, keepdim=True) / (count - 1).clamp_min(1)
+        mean = g.sum(1, keepdim=True, dtype=scale.dtype) / count
+        torch.mul(wide, along, out=dz).add_(mean).sub_(g).mul_(-scale)
+        dz = _hidden(dz, mask).to(x.dtype)
+        to_x, to_weight = ctx.needs_input_grad[:2]
+        dx = dz @ weight if to_x else None
+        dw = dz.flatten(0, 1).mT @ x.flatten(0, 1) if to_weight else None
+        return dx, dw, torch.zeros_like(dz[0, 0]), None, gradient if ctx.rectified else None
+
+
+def _hidden(x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
+    """Zero at padded points."""
+    return x if mask is None else x.masked_fill(~mask.unsqueeze(-1), 0)
+
+
+class MaskedBatchNorm(nn.BatchNorm1d):
+    """Batch norm over the real points of (b, k, c), or over the samples of (b, c).
+
+    In training the statistics cover the batches of all processes, so that splitting a batch over processes changes
+    nothing; a batch with a single value per channel has no variance and uses the running statistics.
+    """
+
+    running_mean: Tensor
+    running_var: Tensor
+    num_batches_tracked: Tensor
+    momentum: float
+
+    def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
+        mean, variance = self.running_mean, self.running_var
+        if self.training:
+            mean, variance = self._statistics(x, mask)
+        scale = torch.rsqrt(variance + self.eps) * self.weight
+        return torch.addcmul(self.bias - mean * scale, x, scale)
+
+    def _statistics(self, x: Tensor, mask: Bool[Tensor, "b k"] | None) -> tuple[Tensor, Tensor]:
+        """Mean and variance of the values of all processes, which the running statistics follow."""
+        real = torch.ones_like(x[..., :1]) if mask is None else mask.unsqueeze(-1)
+        weight, axes = real.to(self.running_mean), tuple(range(x.ndim - 1))  # half precision has too few digits here
+        count, total = weight.sum().reshape(1), (x * weight).sum(axes)
+        if dist.is_initialized():
+            count, total = collectives.all_reduce(count), collectives.all_reduce(total)
+        mean = total / count
+        scatter = (((x - mean) * weight) ** 2).sum(axes)
+        if dist.is_initialized():
+            scatter = collectives.all_reduce(scatter)
+        enough = count > 1
+        with torch.no_grad():
+            rate = self.momentum * enough.to(self.running_mean.dtype)
+            self.running_mean.lerp_(mean.to(self.running_mean.dtype), rate)
+            self.running_var.lerp_((scatter / (count - 1).clamp_min(1)).to(self.running_var.dtype), rate)
+            self.num_batches_tracked += 1
+        return torch.where(enough, mean, self.running_mean), torch.where(enough, scatter / count, self.running_var)
+
+
+class ResidualBlock(nn.Module):
+    """x + relu(CN(linear_c(CN(linear_b(linear_a(x)))))), CN the context norm.
+
+    Nothing stands between linear_a and linear_b: they are applied as one map, made of their product.
+    """
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.linear_a = nn.Linear(channels, channels)
+        self.linear_b = nn.Linear(channels, channels)
+        self.linear_c = nn.Linear(channels, channels)
+
+    def forward(self, x: Float[Tensor, "b k c"], mask: Bool[Tensor, "b k"] | None) -> Float[Tensor, "b k c"]:
+        """mask: None where nothing is padded."""
+        a, b, c = self.linear_a, self.linear_b, self.linear_c
+        with torch.autocast(x.device.type, enabled=False):  # the product keeps its digits
+            weight, bias = b.weight @ a.weight, torch.addmv(b.bias, b.weight, a.bias)
+        return linear_context_norm(linear_context_norm(x, weight, bias, mask), c.weight, c.bias, mask, skip=x)
+
+
+class PointFeatures(nn.Module):
+    """A vector of unit length for each point, from its coordinates and the statistics of its set.
+
+    Args:
+        coordinates: 2 or 3.
+        channels: width of the residual net.
+        depth: its residual blocks.
+        centre: subtract the mean feature of the set before the normalisation to unit length, which sharpens the
+            assignment (ours; off in the paper).
+    """
+
+    def __init__(self, coordinates: int, *, channels: int = 128, depth: int = 12, centre: bool = False) -> None:
+        super().__init__()
+        self.coordinates, self.channels, self.depth, self.centre = coordinates, channels, depth, centre
+        self.enter = nn.Linear(coordinates, channels)
+        self.blocks = nn.ModuleList(ResidualBlock(channels) for _ in range(depth))
+
+    def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        z, seen = self.enter(points), None if unpadded(mask) else mask
+        for block in self.blocks:
+            z = block(z, seen)
+        return functional.normalize(centred(z, mask) if self.centre else z, dim=-1)
+
+
+class ImageFeatures(PointFeatures):
+    """Features of normalised image points.
+
+    Args:
+        channels, depth, centre: as in `PointFeatures`.
+        scale: factor on the coordinates; 4 brings the image of a 50 degree camera to the size of a unit scene.
+    """
+
+    def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, scale: float = 1.0) -> None:
+        super().__init__(2, channels=channels, depth=depth, centre=centre)
+        self.scale = scale
+
+    def forward(self, points: Float[Tensor, "b m 2"], mask: Bool[Tensor, "b m"]) -> Float[Tensor, "b m c"]:
+        return super().forward(self.scale * points, mask)
+
+
+class SceneFeatures(PointFeatures):
+    """Features of scene points after PointNet's learned transform of the set.
+
+    Args:
+        channels, depth, centre: as in `PointFeatures`.
+        normalise: centre the points and scale them to unit size first, so that the features depend neither on the
+            scene's unit nor on its origin.
+    """
+
+    def __init__(self, *, channels: int = 128, depth: int = 12, centre: bool = False, normalise: bool = False) -> None:
+        super().__init__(3, channels=channels, depth=depth, centre=centre)
+        self.normalise = normalise
+        self.align = InputTransform()
+
+    def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n c"]:
+        points = normalise_points3d(points, mask) if self.normalise else points
+        return super().forward(self.align(points, mask), mask)
+
+
+class InputTransform(nn.Module):
+    """PointNet's learned 3 x 3 transform T of a 3D set: points @ T, T = I + output of a small set network."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        widths = (3, 64, 128, 1024, 512, 256)
+        self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(widths))
+        self.norms = nn.ModuleList(MaskedBatchNorm(width) for width in widths[1:])
+        self.out = nn.Linear(256, 9)
+
+    def forward(self, points: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
+        z, seen = points, None if unpadded(mask) else mask
+        for linear, norm in zip(self.linears[:3], self.norms[:3], strict=True):
+            z = torch.relu(norm(linear(z), seen))
+        z = (z if seen is None else z.masked_fill(~seen.unsqueeze(-1), 0)).amax(1)
+        for linear, norm in zip(self.linears[3:], self.norms[3:], strict=True):
+            z = torch.relu(norm(linear(z)))
+        transform = torch.eye(3, dtype=z.dtype, device=z.device) + self.out(z).unflatten(-1, (3, 3))
+        return points @ transform
+
+
+def normalise_points3d(points3d: Float[Tensor, "b n 3"], mask: Bool[Tensor, "b n"]) -> Float[Tensor, "b n 3"]:
+    """Centred at the mean, root mean square distance one: features that do not depend on the scene's units."""
+    weight = mask.unsqueeze(-1).to(points3d.dtype)
+    around = centred(points3d, mask) * weight
+    radius = ((around**2).sum((1, 2), keepdim=True) / weight.sum(1, keepdim=True)).sqrt()
+    return around / torch.where(radius > 0, radius, 1)
+
+
+class Attention(nn.Module):
+    """x + out(softmax(q k^T / sqrt(d)) v), with q of the points x and k, v of the points it looks at, both normalised.
+
+    channels: width, a multiple of heads.
+    """
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        if channels % heads:
+            raise ValueError(f"expected `channels` a multiple of `heads`, got {channels} and {heads}")
+        self.heads = heads
+        self.norm = nn.LayerNorm(channels)
+        self.query = nn.Linear(channels, channels)
+        self.key_value = nn.Linear(channels, 2 * channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(
+        self, x: Float[Tensor, "b k c"], seen: Float[Tensor, "b l c"], mask: Bool[Tensor, "b l"]
+    ) -> Float[Tensor, "b k c"]:
+        """mask: True at the real points of `seen`."""
+        q = self._split(self.query(self.norm(x)))
+        k, v = (self._split(part) for part in self.key_value(self.norm(seen)).chunk(2, -1))
+        z = functional.scaled_dot_product_attention(q, k, v, attn_mask=mask[:, None, None, :])
+        return x + self.out(z.transpose(1, 2).flatten(2))
+
+    def _split(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b h k d"]:
+        return x.unflatten(-1, (self.heads, -1)).transpose(1, 2)
+
+
+class FeedForward(nn.Module):
+    """x + linear(gelu(linear(norm(x)))), each point for itself."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.norm = nn.LayerNorm(channels)
+        self.enter = nn.Linear(channels, 2 * channels)
+        self.out = nn.Linear(2 * channels, channels)
+
+    def forward(self, x: Float[Tensor, "b k c"]) -> Float[Tensor, "b k c"]:
+        return x + self.out(functional.gelu(self.enter(self.norm(x))))
+
+
+class ExchangeBlock(nn.Module):
+    """Each set looks at itself, then at the other; the weights of the two directions are the same."""
+
+    def __init__(self, channels: int, heads: int) -> None:
+        super().__init__()
+        self.within = Attention(channels, heads)
+        self.between = Attention(channels, heads)
+        self.feed = FeedForward(channels)
+
+    def forward(
+        self,
+        x2d: Float[Tensor, "b m c"],
+        x3d: Float[Tensor, "b n c"],
+        mask2d: Bool[Tensor, "b m"],
+        mask3d: Bool[Tensor, "b n"],
+    ) -> tuple[Float[Tensor, "b m c"], Float[Tensor, "b n c"]]:
+        x2d, x3d = self.within(x2d, x2d, mask2d), self.within(x3d, x3d, mask3d)
+        x2d, x3d = self.between(x2d, x3d, mask3d), self.between(x3d, x2d, mask2d)
+        return self.feed(x2d), self.feed(x3d)
+
+
+class Neighbourhood(nn.Module):
+    """What lies around each point: the largest response, by channel, to the offsets of its nearest neighbours.
+
+    The offsets are in units of the set's mean distance to the neighbours, so that a denser sample of the same shape
+    looks alike. A point without a neighbour gets zeros.
+    """
+
+    def __init__(self, coordinates: int, channels: int, *, neighbours: int) -> None:
+        super().__init__()
+        self.neighbours = neighbours
+        self.enter = nn.Linear(coordinates + 1, channels)
+        self.out = nn.Linear(channels, channels)
+
+    def forward(self, points: Float[Tensor, "b k d"], mask: Bool[Tensor, "b k"]) -> Float[Tensor, "b k c"]:
+        k = min(self.neighbours, points.shape[1] - 1)
+        if k < 1:
+            return points.new_zeros(*points.shape[:2], self.out.out_features)
+        far = torch.cdist(points, points, compute_mode="donot_use_mm_for_euclid_dist")
+        far = far.masked_fill(~mask.unsqueeze(1), torch.inf)
+        far.diagonal(dim1=1, dim2=2).fill_(torch.inf)
+        distance, index = far.topk(k, largest=False)
+        real = distance.isfinite() & mask.unsqueeze(-1)
+        distance = torch.where(real, distance, 0)
+        unit = distance.sum((1, 2), keepdim=True) / real.sum((1, 2), keepdim=True).clamp_min(1)
+        unit = torch.where(unit > 0, unit, 1)
+        around = points.gather(1, index.flatten(1).unsqueeze(-1).expand(-1, -1, points.shape[-1]))
+        offset = around.unflatten(1, index.shape[1:]) - points.unsqueeze(2)
+        edges = torch.cat([offset, distance.unsqueeze(-1)], -1) / unit.unsqueeze(-1)
+        response = torch.relu(self.enter(edges)).masked_fill(~real.unsqueeze(-1), 0).amax(2)
+        return self.out(response)
