@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,33 +77,37 @@ def localize(
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
     if time_limit is not None:
         check_positive(time_limit=time_limit)
-    known: dict[str, Any] = {
-        "attempts": _attempts(cluster),
-        "camera": None if camera is None else _camera(camera, map, scene),
-        "views": None if views is None else read_views(views),
-    }
+    attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
+    tried = None if views is None else read_views(views)
     with claimed(output), progress() as shown:
         folder, bar = SolutionFolder(output, content_of_map(map)), shown.add_task("localizing", total=len(files))
         outcome = localize_photos(
             scene,
             files,
             folder,
+            attempts=attempts,
             pictures=not no_pictures,
             done=lambda name: shown.update(bar, description=f"localized {name}", advance=1),
+            camera=lens,
+            views=tried,
             keypoints=keypoints,
             leave_one_out=leave_one_out,
             solver=solver,
             seed=seed,
             time_limit=time_limit,
-            **known,
         )
     _report(files, folder, outcome, pictures=not no_pictures)
+    if outcome.errors:
+        (name, reason), *others = outcome.errors.items()
+        for other, why in others:
+            say(f"{other}: {why}")
+        raise ValueError(f"{len(others) + 1} of {len(files)} photos could not be tried, such as {name}: {reason}")
 
 
 def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outcome", *, pictures: bool) -> None:
-    """Say what was found, kept and written. Raises ValueError if some photos could not be tried."""
-    out, errors = console(), outcome.errors
-    records = {name: folder.records[name] for name in files if name in folder.records and name not in errors}
+    """Say what was found, kept and written."""
+    out = console()
+    records = {name: folder.records[name] for name in files if name in folder.records and name not in outcome.errors}
     if records:
         out.print(_table(records))
         cameras = Counter(record["made_with"]["camera_from"] for record in records.values())
@@ -113,13 +118,8 @@ def _report(files: Mapping[str, Path], folder: "SolutionFolder", outcome: "Outco
         say(f"solved again, with {change}: {name}", to=out)
     if others := folder.of_other_maps():
         say(f"not in poses.txt: {len(others)} solutions in another map, such as {others[0]}", to=out)
-    for name, reason in list(errors.items())[1:]:  # the first is said by the error below
-        say(f"{name}: {reason}", to=out)
     written = ", solutions/, pictures/" if pictures else ", solutions/"
     say(f"wrote poses.txt, results.json{written if records else ''} in {folder.path}", to=out)
-    if errors:
-        name, reason = next(iter(errors.items()))
-        raise ValueError(f"{len(errors)} of {len(files)} photos could not be tried, such as {name}: {reason}")
 
 
 def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
@@ -140,8 +140,6 @@ def _camera(text: str, map: Path, scene: "SceneMap") -> Any:
 
 def _attempts(cluster: str | None) -> Callable[..., Any]:
     """What localises the photos: here, or on the workers of a cluster."""
-    from functools import partial
-
     if cluster is None:
         from bpnp.maps.many_photos import attempts
 

@@ -98,8 +98,7 @@ def _show(store: "Store", counts: Mapping[str, int]) -> None:
 def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv"] = "poselib") -> None:
     """Convert the weights of the authors of BPnPNet into a checkpoint of bpnp.
 
-    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. No file is
-    left half written.
+    The checkpoint is for `BPnPNet.from_checkpoint` and `bpnp test --ckpt_path`. No file is left half written.
 
     Args:
         file: the authors' file, *.pth.tar.
@@ -109,7 +108,7 @@ def convert_weights(file: Path, out: Path, *, ransac: Literal["poselib", "opencv
     import lightning
     import torch
 
-    from bpnp.models.authors import load_authors_weights
+    from bpnp.models.bpnpnet import load_authors_weights
     from bpnp.training.task import BlindPnPTask
 
     task = BlindPnPTask(load_authors_weights(file, backend=ransac))

@@ -37,15 +37,14 @@ def report(
     """
     from bpnp.report.figures import recall_curve, save_figure
     from bpnp.report.page import write_page
-    from bpnp.report.runs import named_runs
-    from bpnp.report.tables import report as print_tables
+    from bpnp.report.tables import named_runs, read_runs, results_table
 
     paths = list(named_runs(runs).values())
     if html is not None:
         say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths), recall)}")
-    print_tables(paths, paper=paper)
+    console().print(results_table(read_runs(paths), paper=paper))
 
 
 def view(
@@ -66,7 +65,7 @@ def view(
         lines: which matches to draw.
     """
     from bpnp.report.figures import plot_problem, save_figure
-    from bpnp.report.runs import named_runs
+    from bpnp.report.tables import named_runs
 
     names = problems or []
     if output is not None and len(names) > 1:
@@ -129,7 +128,7 @@ def wandb_results(runs: list[Path], *, project: str = "bpnp", directory: Path = 
         directory: where the folders of offline runs go.
     """
     from bpnp.report.dashboards import log_results
-    from bpnp.report.runs import named_runs
+    from bpnp.report.tables import named_runs
 
     for name, folder in named_runs(runs).items():
         written = log_results(folder, project=project, name=name, directory=directory)

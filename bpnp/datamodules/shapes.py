@@ -4,7 +4,8 @@ import io
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -64,25 +65,23 @@ def read_mesh(path: Path) -> Mesh:
     Raises MeshError that names the file: truncated, foreign or empty file, no faces, no area, NaN, a face of missing
     vertices.
     """
-    return _of_file(path, _mesh)
+    with _opened(path) as (content, suffix):
+        if suffix == ".off":
+            return _parse_off(content)
+        mesh = _load(content, suffix)
+        if not isinstance(mesh, trimesh.Trimesh):
+            raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
+        corners, faces = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+        return Mesh(corners.reshape(-1, 3), faces.reshape(-1, 3))
 
 
-def _of_file(path: Path, parse: Callable[[bytes, str], Any]) -> Any:
-    """What `parse` makes of the bytes and the suffix of a file; its errors name the file."""
+@contextmanager
+def _opened(path: Path) -> Iterator[tuple[bytes, str]]:
+    """The bytes and the suffix of a file, which a MeshError of the block names."""
     try:
-        return parse(path.read_bytes(), path.suffix.lower())
+        yield path.read_bytes(), path.suffix.lower()
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from error
-
-
-def _mesh(content: bytes, suffix: str) -> Mesh:
-    """The mesh in the bytes of a file with this suffix; the MeshError names no file."""
-    if suffix == ".off":
-        return _parse_off(content)
-    mesh = _load(content, suffix)
-    if not isinstance(mesh, trimesh.Trimesh):
-        raise MeshError(f"expected a mesh, got a {type(mesh).__name__}")
-    return Mesh(np.asarray(mesh.vertices, np.float64).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3))
 
 
 def read_vertices(path: Path) -> NDArray[np.float64]:
@@ -90,7 +89,17 @@ def read_vertices(path: Path) -> NDArray[np.float64]:
 
     Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
     """
-    return _of_file(path, _vertices)
+    with _opened(path) as (content, suffix):
+        if suffix == ".off":
+            return _different(_parse_off(content).vertices)
+        vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
+        if not len(vertices):  # as a mesh, a cloud of points is empty
+            vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64)
+            vertices, declared = vertices.reshape(-1, 3), re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
+            expected = 1 if declared is None else int(declared[1])
+            if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
+                raise MeshError(f"expected {expected} points, got {len(vertices)}")
+        return vertices
 
 
 def _parse_off(content: bytes) -> Mesh:
@@ -130,19 +139,6 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
         middle, last = polygons[:, 1:-1], polygons[:, 2:]
         fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
     return np.concatenate(fans)
-
-
-def _vertices(content: bytes, suffix: str) -> NDArray[np.float64]:
-    if suffix == ".off":
-        return _different(_parse_off(content).vertices)
-    vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
-    if not len(vertices):  # as a mesh, a cloud of points is empty
-        vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64).reshape(-1, 3)
-        declared = re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
-        expected = 1 if declared is None else int(declared[1])
-        if len(vertices) < expected:  # trimesh takes a text file that ends early for one with fewer points
-            raise MeshError(f"expected {expected} points, got {len(vertices)}")
-    return vertices
 
 
 def _different(vertices: NDArray[np.float64]) -> NDArray[np.float64]:

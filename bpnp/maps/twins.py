@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import same_pose, turned_by
+from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import one_blas_thread
 from bpnp.maps.localize import Photo, Region, in_picture, problem_near
 from bpnp.maps.views import Array

@@ -9,4 +9,4 @@ from .results import ProblemRow as ProblemRow
 from .results import Results as Results
 from .results import read_results as read_results
 from .results import write_results as write_results
-from .runs import table as table
+from .tables import table as table

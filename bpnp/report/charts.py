@@ -13,7 +13,7 @@ import torch
 
 from bpnp.metrics import joint_error, recall_curve
 from bpnp.report.results import Results
-from bpnp.report.runs import lines_of
+from bpnp.report.tables import lines_of
 from bpnp.report.terminal import DASHES, INKS, LIGHT
 
 if TYPE_CHECKING:

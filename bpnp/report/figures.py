@@ -17,7 +17,7 @@ from bpnp.files import interruptions_later, written_whole
 from bpnp.report.charts import RECALLS, Error, recall_of
 from bpnp.report.points import Array, ProblemPoints, utf8
 from bpnp.report.results import Results
-from bpnp.report.runs import lines_of, read_runs
+from bpnp.report.tables import lines_of, read_runs
 from bpnp.report.terminal import DASHES, LIGHT, QUIET
 
 if TYPE_CHECKING:

@@ -24,10 +24,10 @@ from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, ProblemRow, Results, cause_shares, read_results
-from bpnp.report.runs import Line, lines_of, named_runs
-from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, best_texts, cell, run_rows
+from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
 from bpnp.report.terminal import DASHES, INKS, Paper
 
+FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # of a run
 SCRIPTS = ("page.js", "problem.js")
 SIZES = {"m": "2D points", "n": "3D points", "matches": "true matches"}
 COLUMNS = {  # of the table of problems: head and hover text
@@ -88,7 +88,10 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         data=compressed(json.dumps(numbers)),
         points=page_points(runs, points),
         plotly=plotly_script(),
-        runs={name: (described(results), _facts(results)) for name, results in runs.items()},
+        runs={
+            name: (described(results), json.dumps({key: getattr(results, key) for key in FACTS}, indent=2))
+            for name, results in runs.items()
+        },
         folders=", ".join(folders),
         inks=INKS,
         dashes=DASHES,
@@ -145,11 +148,6 @@ def _settings(settings: Mapping[str, Any]) -> Iterable[str]:
         yield f"checkpoint {settings['checkpoint']}"
 
 
-def _facts(results: Results) -> str:
-    names = ("written", "bpnp_version", "correspondence_loss", "settings")
-    return json.dumps({name: getattr(results, name) for name in names}, indent=2)
-
-
 def _shares(results: Results, estimate: str) -> tuple[list[float], float]:
     """Percent of the problems with each cause, and that the solver calls converged."""
     shares = np.array(list(cause_shares(results.of(estimate)).values()))
@@ -177,11 +175,6 @@ def compressed(text: str) -> str:
     return base64.b64encode(gzip.compress(text.encode(), 6, mtime=0)).decode()
 
 
-def shown_id(id: str) -> str:
-    """A problem's name as the page has it."""
-    return utf8(id) or "(no name)"
-
-
 def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     """The numbers of all problems: a series for each run and estimate. Columns of several series are there once."""
     columns: dict[tuple[Any, ...], int] = {}
@@ -193,7 +186,7 @@ def page_numbers(runs: Mapping[str, Results]) -> dict[str, Any]:
     for line in lines_of(runs):
         rows = runs[line.run].of(line.estimate)
         names = {"run": line.run, "estimate": line.estimate, "name": line.label, "colour": f"c{line.colour}"}
-        ids, numbers = place(shown_id(row.id) for row in rows), _columns(rows)
+        ids, numbers = place(utf8(row.id) or "(no name)" for row in rows), _columns(rows)
         series.append(names | {"ids": ids, "numbers": {key: place(values) for key, values in numbers.items()}})
     return {"series": series, "columns": list(columns)}
 

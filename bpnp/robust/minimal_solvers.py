@@ -185,9 +185,7 @@ def p3p_depths(chords: Any, a: float, b: float, poses: Any) -> int:
     """The depths d_i > 0 of three rays with |d_i f_i - d_j f_j| = |p_i - p_j|; how many solutions there are (0 to 4).
 
     chords: of `chords_between` the rays. a, b: |p_0 - p_1|^2 and |p_2 - p_0|^2 over |p_1 - p_2|^2.
-    poses: the depths are written to poses[:, 3], in units of |p_1 - p_2|. With x = d_0/d_2 and y = d_1/d_2 the law of
-    cosines gives two conics; a root of det(C1 + s C2) = 0 makes their pencil a pair of lines, and each line meets the
-    conics in at most two points (Ding, Yang, Larsson, Olsson, Astrom: Revisiting the P3P Problem, CVPR 2023).
+    poses: the depths are written to poses[:, 3], in units of |p_1 - p_2|. The conics and lines are those of `p3p`.
     """
     m01, m12, m20 = 1 - 0.5 * chords[0], 1 - 0.5 * chords[1], 1 - 0.5 * chords[2]
     # Symmetric matrices by their components xx, xy, xw, yy, yw, ww.

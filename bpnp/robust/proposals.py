@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from bpnp.distinct_poses import distinct
-from bpnp.geometry import bearings
+from bpnp.geometry import bearings, distinct
 from bpnp.precision import full_precision
 from bpnp.robust.matches import Matches, in_scene, normalised, truncated_scores, weighted_draws
 from bpnp.robust.minimal_solvers import poses_of_triples, take
@@ -56,7 +55,10 @@ def pose_hypotheses(
     matches, centre, scale = normalised(chosen)
     poses = _poses_of_widest(*(points[:, SCORED:].unflatten(1, (-1, 3)) for points in matches[:2]))
     sample = Matches(*(values[:, :SCORED] for values in matches))
-    threshold2 = THRESHOLD**2 * _variance(points2d, mask2d)
+    size = mask2d.sum(-1, keepdim=True).clamp(min=1)
+    mean = torch.where(mask2d.unsqueeze(-1), points2d, 0).sum(1) / size
+    spread = torch.where(mask2d, (points2d - mean.unsqueeze(1)).square().sum(-1), 0).sum(-1) / size.squeeze(-1)
+    threshold2 = THRESHOLD**2 * spread
     score = truncated_scores(poses, sample, threshold2.float()[:, None, None])
 
     best = poses.new_full((len(poses), count, 3, 4), torch.nan)
@@ -110,10 +112,3 @@ def _poses_of_widest(
     else:
         chosen = wide.topk(image.shape[1] // DRAWN_EACH).indices
     return poses_of_triples(bearings(take(image, chosen)), take(scene, chosen))
-
-
-def _variance(points: Float[Tensor, "b m 2"], real: Bool[Tensor, "b m"]) -> Float[Tensor, " b"]:
-    """Mean squared distance of a sample's points from their mean."""
-    count = real.sum(-1, keepdim=True).clamp(min=1)
-    mean = torch.where(real.unsqueeze(-1), points, 0).sum(1) / count
-    return torch.where(real, (points - mean.unsqueeze(1)).square().sum(-1), 0).sum(-1) / count.squeeze(-1)

@@ -34,14 +34,6 @@ SingleEstimator = Callable[[Array, Array, float, int, int], tuple[Array, int] | 
 Estimator = Callable[[Matches, float, int, int], tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]]
 
 
-def growing_pool(count: Int[Tensor, " b"], draws: int) -> Float[Tensor, "b d"]:
-    """Size of the pool of each draw: it grows geometrically from SMALLEST_POOL to `count`."""
-    progress = (torch.arange(draws, device=count.device, dtype=torch.float64) + 0.5) / draws
-    last = count.clamp(min=3).unsqueeze(-1).double()
-    first = last.clamp(max=SMALLEST_POOL)
-    return (first * (last / first) ** progress).ceil()
-
-
 def consensus(
     matches: Matches, threshold: float, hypotheses: int, seed: int
 ) -> tuple[Float[Tensor, "b 3 4"], Int[Tensor, " b"]]:
@@ -56,7 +48,10 @@ def consensus(
     """
     threshold2 = threshold**2
     subset = Matches(*(values[:, :SUBSET] for values in matches))
-    triples = distinct_triples(growing_pool(matches.real.sum(-1), hypotheses), seed)
+    progress = (torch.arange(hypotheses, device=matches.real.device, dtype=torch.float64) + 0.5) / hypotheses
+    last = matches.real.sum(-1, keepdim=True).clamp(min=3).double()
+    first = last.clamp(max=SMALLEST_POOL)
+    triples = distinct_triples((first * (last / first) ** progress).ceil(), seed)
     # Fewer than three matches: repeated ones, no pose.
     triples = triples.clamp(max=matches.real.shape[1] - 1).flatten(1)
     rays, scene = (

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import same_pose, turned_by
+from bpnp.geometry import same_pose, turned_by
 from bpnp.search.evidence.image_statistics import ImageStatistics
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 

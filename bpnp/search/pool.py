@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import same_pose
+from bpnp.geometry import same_pose
 from bpnp.search.annealing import finish
 from bpnp.search.candidates import Candidates, best_distinct, in_scene_frame, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests

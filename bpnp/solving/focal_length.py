@@ -17,7 +17,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, camera_from, plain_camera, zoomed_camera
-from bpnp.distinct_poses import same_pose, turned_by
+from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.search.annealing import polished
 from bpnp.search.enumeration.search import is_enumerable

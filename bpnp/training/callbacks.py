@@ -26,7 +26,8 @@ from bpnp.models.nets import centred
 from bpnp.models.weights import read_checkpoint
 from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
-from bpnp.report.tables import report
+from bpnp.report.tables import read_runs, results_table
+from bpnp.report.terminal import console
 from bpnp.training.task import number_globally
 from bpnp.types import Batch, Prediction
 
@@ -231,7 +232,7 @@ class ResultsWriter(Callback):
             write_results(folder, rows, correspondence_loss=mean, settings={**settings, "complete": complete})
             write_points(folder, (problem for *_, part in gathered for problem in part))
             if self.settings is None:
-                report([folder])
+                console().print(results_table(read_runs([folder])))
             count = len({row.index for row in rows})
             rank_zero_info(f"{'' if complete else 'interrupted: '}results of {count} problems in {folder}")
 

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from bpnp import Batch, BPnPNet
 from bpnp.cli import main
 from bpnp.datamodules import MeshDataModule
-from bpnp.models.authors import load_authors_weights, tensor_maps
+from bpnp.models.bpnpnet import load_authors_weights, tensor_maps
 from bpnp.training.task import BlindPnPTask
 
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,8 +41,7 @@ class ColmapError(ValueError):
     """A COLMAP folder or file that cannot be used; the message names it."""
 
 
-@dataclass(frozen=True)
-class CameraRecord:
+class CameraRecord(NamedTuple):
     model: str
     params: NDArray[np.float64]
     size: tuple[int, int]  # width and height of the image, pixels

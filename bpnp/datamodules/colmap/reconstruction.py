@@ -3,7 +3,7 @@
 import logging
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -102,7 +102,7 @@ def _camera_of(record: CameraRecord | None, where: str) -> Camera:
     if record is None:
         raise ColmapError(f"expected {where}, got no such camera; try another model")
     try:
-        return colmap_camera(record.model, record.params, record.size)
+        return colmap_camera(*record)
     except ValueError as error:
         raise ColmapError(f"{where}: {error}; try another model") from error
 
@@ -116,33 +116,21 @@ def _image_points(
     *,
     keypoints: bool,
 ) -> ImagePoints:
-    has_point = record.point_ids >= 0
-    observed = np.unique(record.point_ids[has_point])
+    rotation = Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix()
+    observed = np.unique(record.point_ids[record.point_ids >= 0])
     place = np.minimum(np.searchsorted(ids, observed), len(ids) - 1)
-    none = np.empty((0, 2), np.float32)
-    image = ImagePoints(
-        name=record.name,
-        image_id=record.image_id,
-        camera=camera,
-        rotation=Rotation.from_quat(np.roll(record.quaternion, -1)).as_matrix(),
-        translation=record.translation,
-        observed=place[ids[place] == observed],
-        points2d=none,
-        seen=place[:0],
-        clutter2d=none,
-    )
-    if not keypoints:
-        return image
-    undistorted = camera.normalise(record.keypoints)
+    observed = place[ids[place] == observed]
+    count = None if keypoints else 0
+    point_ids, undistorted = record.point_ids[:count], camera.normalise(record.keypoints[:count])
     usable = np.isfinite(undistorted).all(-1)
     lost["keypoints that could not be undistorted"] += int((~usable).sum())
 
-    place = np.minimum(np.searchsorted(ids, record.point_ids), len(ids) - 1)
-    known = has_point & (ids[place] == record.point_ids)
+    has_point, place = point_ids >= 0, np.minimum(np.searchsorted(ids, point_ids), len(ids) - 1)
+    known = has_point & (ids[place] == point_ids)
     lost["keypoints of a point that is missing"] += int((has_point & ~known).sum())
 
     matched = np.flatnonzero(known & usable)
-    camera_points = points3d[place[matched]] @ image.rotation.T + image.translation
+    camera_points = points3d[place[matched]] @ rotation.T + record.translation
     depth = camera_points[:, 2]
     in_front = depth > (NEAR * np.median(depth[depth > 0]) if (depth > 0).any() else 0)
     lost["matches with the point behind or in the camera"] += int((~in_front).sum())
@@ -152,9 +140,6 @@ def _image_points(
     by_error = np.argsort(error, kind="stable")
     seen, first = np.unique(place[matched[by_error]], return_index=True)
     lost["repeated keypoints"] += len(matched) - len(seen)
-    return replace(
-        image,
-        points2d=undistorted[matched[by_error[first]]].astype(np.float32),
-        seen=seen,
-        clutter2d=undistorted[~has_point & usable].astype(np.float32),
-    )
+    points2d, clutter2d = undistorted[matched[by_error[first]]], undistorted[~has_point & usable]
+    pose, sides = (rotation, record.translation), (points2d.astype(np.float32), seen, clutter2d.astype(np.float32))
+    return ImagePoints(record.name, record.image_id, camera, *pose, observed, *sides)

@@ -279,17 +279,9 @@ class SyntheticMapDataModule(ProblemDataModule):
         **loading: Any,
     ) -> None:
         super().__init__(**loading)
+        weights, axes = WEIGHTS if kinds is None else kinds, "upright" if frame == "any" else frame
         self.options = MapOptions(
-            num_points=num_points,
-            min_points=min_points,
-            outliers=outliers,
-            views=views,
-            kinds=WEIGHTS if kinds is None else kinds,
-            frame="upright" if frame == "any" else frame,
-            tilt_deg=tilt_deg,
-            scale_range=scale_range,
-            field_of_view=field_of_view,
-            noise_px=noise_px,
+            num_points, min_points, outliers, views, weights, axes, tilt_deg, scale_range, field_of_view, noise_px
         )
         self.problems = {"train": train_problems, "val": val_problems, "test": test_problems}
         self.fresh = fresh_views

@@ -117,11 +117,6 @@ def right_of(along: Array) -> Array:
     return along[:, ::-1] * [1.0, -1.0]
 
 
-def hidden(scene: Scene, centre: Array, points: Array) -> NDArray[np.bool_]:
-    """Whether a wall or a blob is between the camera's centre (3,) and each of the points (n, 3)."""
-    return hidden_by_walls(scene.walls, centre, points) | hidden_by_blobs(scene.blobs, centre, points)
-
-
 def hidden_by_walls(walls: Walls, centre: Array, points: Array) -> NDArray[np.bool_]:
     """Whether the segment from the centre to each point crosses a wall."""
     offset = np.einsum("ij,ij->i", walls.start, walls.normal)
@@ -207,7 +202,8 @@ def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *
     chance = np.where(chance > 0, chance, ONE_PHOTO if alone else 0.0)
     detected = GRAZING * rng.random(len(near)) < chance * np.minimum(facing, GRAZING)
     near = near[detected]
-    near = near[~hidden(scene, camera.centre, scene.points[near])]
+    way = camera.centre, scene.points[near]
+    near = near[~(hidden_by_walls(scene.walls, *way) | hidden_by_blobs(scene.blobs, *way))]
     return Sight(near, np.stack([x[near], y[near]], -1) / depth[near, None], depth[near])
 
 

@@ -2,8 +2,6 @@
 
 import math
 
-from torch import Tensor
-
 from bpnp.geometry import MIN_POINTS, bearings
 from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, agreement
@@ -13,12 +11,6 @@ from bpnp.robust.minimal_solvers import p3p
 TRIPLES = 256  # random ones, solved at a time
 PREVIEW = 32  # 2D points on which every hypothesis of random triples is scored
 HYPOTHESES = 8  # of these triples that are then scored on all points
-
-
-def solutions(problem: SingleProblem, triples2d: Tensor, triples3d: Tensor) -> tuple[Tensor, Tensor]:
-    """Rotations (s, 3, 3) and translations (s, 3) under which triples (h, 3) match, up to four each."""
-    solution = p3p(bearings(problem.points2d)[triples2d], problem.points3d[triples3d])
-    return solution.rotation[solution.valid], solution.translation[solution.valid]
 
 
 class RandomRansac(SingleSolver):
@@ -57,14 +49,15 @@ class RandomRansac(SingleSolver):
         self.max_hypotheses = math.inf if max_hypotheses is None else max_hypotheses
 
     def solve(self, problem: SingleProblem, deadline: Deadline) -> Answer:
-        sides = problem.points2d, problem.points3d
+        sides, rays = (problem.points2d, problem.points3d), bearings(problem.points2d)
         m, n = map(len, sides)
         seed, best, tried, most, matches = 2 * problem.seed(self.seed), None, 0, 0, 0
         while tried < self.max_hypotheses and not deadline.passed() and not self._enough(matches, m, n, tried):
             count = int(min(TRIPLES, self.max_hypotheses - tried))
             pools = (points.new_full((1, count), len(points)) for points in sides)
             triples = (distinct_triples(pool, seed + i, skip=tried)[0] for i, pool in enumerate(pools))
-            rotation, translation = solutions(problem, *triples)
+            found = p3p(*(side[chosen] for side, chosen in zip((rays, sides[1]), triples, strict=True)))
+            rotation, translation = found.rotation[found.valid], found.translation[found.valid]
             tried += count
             if len(rotation) > HYPOTHESES:
                 # A stride takes points from all of the image, should they be in an order.

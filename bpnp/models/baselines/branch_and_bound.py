@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 from bpnp.checks import check_positive
 from bpnp.geometry import bearings
 from bpnp.layers.pnp import weighted_pnp
-from bpnp.loops.parallel import NEVER, Deadline
+from bpnp.loops.parallel import Deadline
 from bpnp.models.baselines.single_problem import Answer, SingleProblem, SingleSolver, weak_perspective_distance
 
 DOMAIN = 1.5  # half side of the cube of camera centres, weak-perspective distances
@@ -193,54 +193,43 @@ class GOPAC(BranchAndBound):
         self.angle = angle
 
     def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
+        """The camera that sees most rays within `angle` of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c))
+        <= angle]; value and bound are shares of the rays without one.
+
+        The outer search is over the camera centre c in the one box of the domain; for each box two inner searches over
+        R: at its centre, for a better pose, which is refined, and with every angle widened by the uncertainty
+        psi_t(p_j), for whether the box can hold one. Boxes under SMALLEST_PLACE are not split: their bound may stay
+        above the count.
+        """
         del away
-        found = maximise_inliers(rays, points, domain, angle=self.angle, max_boxes=self.max_boxes, deadline=deadline)
-        return found._replace(value=1 - found.value / len(rays))
+        best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
+        inner = 1
 
+        def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
+            nonlocal best, inner
+            children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
+            bounds = []
+            for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
+                reach = torch.full_like(moving, self.angle)
+                here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
+                if here.rotation is not None:
+                    best = _refined(rays, points, here.rotation, place, self.angle)
+                wide = (reach + moving).clamp_max(math.pi)
+                there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
+                inner += here.boxes + there.boxes
+                bounds.append(there.bound)
+            return children, rays.new_tensor(bounds), best[2]
 
-def maximise_inliers(
-    rays: Float[Tensor, "m 3"],
-    points: Float[Tensor, "n 3"],
-    domain: Boxes,
-    *,
-    angle: float,
-    max_boxes: int | float = math.inf,
-    deadline: Deadline = NEVER,
-) -> Found:
-    """Most rays within `angle` (radians) of a point: max nu(R, c) = sum_i max_j [angle(f_i, R (p_j - c)) <= angle].
-
-    The outer search is over the camera centre c in the one box of the domain; for each box two inner searches over R:
-    at its centre, for a better pose, which is refined, and with every angle widened by the uncertainty psi_t(p_j),
-    for whether the box can hold one. Boxes under SMALLEST_PLACE are not split: their bound may stay above the count.
-    """
-    best: tuple[Tensor | None, Tensor, int] = (None, domain.place[0], 0)
-    inner = 1
-
-    def expand(box: Boxes) -> tuple[Boxes, Tensor, int | float]:
-        nonlocal best, inner
-        children = split(box, torch.zeros_like(box.turn_half, dtype=torch.bool))
-        bounds = []
-        for place, moving in zip(children.place, translation_uncertainty(children, points), strict=True):
-            reach = torch.full_like(moving, angle)
-            here = best_rotation(rays, points, place, reach, domain, floor=best[2], deadline=deadline)
-            if here.rotation is not None:
-                best = _refined(rays, points, here.rotation, place, angle)
-            wide = (reach + moving).clamp_max(math.pi)
-            there = best_rotation(rays, points, place, wide, domain, floor=best[2], first=True, deadline=deadline)
-            inner += here.boxes + there.boxes
-            bounds.append(there.bound)
-        return children, rays.new_tensor(bounds), best[2]
-
-    left, outer = best_first(
-        domain,
-        rays.new_full((1,), len(rays)),
-        expand,
-        at_once=1,
-        small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST_PLACE,
-        until=lambda done: deadline.passed() or done + inner >= max_boxes,
-    )
-    bound = max(best[2], left)
-    return Found(*best, bound, outer + inner, best[2] >= bound)
+        left, outer = best_first(
+            domain,
+            rays.new_full((1,), len(rays)),
+            expand,
+            at_once=1,
+            small=lambda boxes: boxes.place_half.amax(-1) < SMALLEST_PLACE,
+            until=lambda done: deadline.passed() or done + inner >= self.max_boxes,
+        )
+        value, bound = (1 - count / len(rays) for count in (best[2], max(best[2], left)))
+        return Found(*best[:2], value, bound, outer + inner, best[2] >= left)
 
 
 def _refined(rays: Tensor, points: Tensor, rotation: Tensor, place: Tensor, angle: float) -> tuple[Tensor, Tensor, int]:
@@ -265,7 +254,7 @@ def best_rotation(
     *,
     floor: int,
     first: bool = False,
-    deadline: Deadline = NEVER,
+    deadline: Deadline,
 ) -> Found:
     """Most rays f_i with some angle(f_i, R (p_j - c)) <= reach_j, over the rotations of a domain, at one centre c.
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from bpnp.distinct_poses import turned_by
+from bpnp.geometry import turned_by
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, own_evidence
 from bpnp.search.evidence.image_statistics import label_groups

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import turned_by
+from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.annealing import anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import fdtrc, fdtri, stdtrit
 
-from bpnp.distinct_poses import turned_by
+from bpnp.geometry import turned_by
 from bpnp.search.evidence.partners import Zoomed, across, by_focal_length, facing, partners, with_focal_length
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.point_sets import PointSets

@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.distinct_poses import distinct
+from bpnp.geometry import distinct
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
 from bpnp.search.enumeration.poses import enumerate_poses
