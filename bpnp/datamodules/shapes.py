@@ -4,7 +4,7 @@ import io
 import math
 import re
 import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
@@ -23,9 +23,7 @@ SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 Normalisation = Literal["unit_sphere", "unit_cube", "none"]
 VERSION = 1  # of procedural shapes, raised whenever the same seed makes another one
 PARTS = ("train", "val", "test")
-SPLITS = ("train", "test")
 LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
-ENTRY = re.compile(rf"(?:.*/)?([^/]+)/(train|test)/([^/.][^/]*)(?:{'|'.join(map(re.escape, SUFFIXES))})", re.I)
 Sampler = Callable[[int], NDArray[np.float64]]
 
 
@@ -273,8 +271,13 @@ def open_shapes(source: Path) -> Shapes:
     if not source.is_dir():
         raise ValueError(f"expected a folder with {LAYOUT}, got {source}, which is none; try unpacking its archive")
     for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
-        if entries := _named(str(path) for path in folder.glob("*/*/*") if path.is_file()):
-            meshes = {name: Path(path) for name, path in entries.items()}
+        named = {
+            f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}": path
+            for path in folder.glob("*/[!.]*/[!.]*")
+            if path.suffix.lower() in SUFFIXES and path.parent.name.lower() in ("train", "test") and path.is_file()
+        }
+        if named:
+            meshes = {name: named[name] for name in sorted(named, key=lambda name: ("/test/" in name, name))}
             samplers = {name: partial(_mesh_samples, name, path) for name, path in meshes.items()}
             return Shapes(samplers, fingerprint([list(meshes), files_as_they_are(meshes.values())]))
     raise ValueError(f"expected a folder with {LAYOUT}, got {source} without; try its parent")
@@ -282,11 +285,3 @@ def open_shapes(source: Path) -> Shapes:
 
 def _mesh_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
     return sample_surface(read_mesh(path), count, np.random.default_rng(zlib.crc32(name.encode())))
-
-
-def _named(paths: Iterable[str]) -> dict[str, str]:
-    """Path of each mesh by its name; others are no meshes."""
-    meshes = (ENTRY.fullmatch(path) for path in paths)
-    entries = {f"{mesh[1]}/{mesh[2].lower()}/{mesh[3]}": mesh[0] for mesh in meshes if mesh}
-    order = sorted(entries, key=lambda name: (SPLITS.index(name.split("/")[-2]), name))
-    return {name: entries[name] for name in order}

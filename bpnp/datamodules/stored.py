@@ -130,13 +130,9 @@ class StoredDataModule(ProblemDataModule):
         evaluation = replace(training, max_points=eval_max_points)
         self.augmentations = {"train": training, "val": evaluation, "test": evaluation}
         self.augmentations["predict"] = replace(evaluation, rotate=False)
-        self.splitting: dict[str, Any] = {
-            "train": _scene_list("train_scenes", train_scenes),
-            "val": _scene_list("val_scenes", val_scenes),
-            "test": _scene_list("test_scenes", test_scenes),
-            "val_fraction": val_fraction,
-            "test_fraction": test_fraction,
-        }
+        lists = {"train": train_scenes, "val": val_scenes, "test": test_scenes}
+        self.splitting: dict[str, Any] = {"val_fraction": val_fraction, "test_fraction": test_fraction}
+        self.splitting |= {part: _scene_list(f"{part}_scenes", scenes) for part, scenes in lists.items()}
 
     def setup(self, stage: str | None = None) -> None:
         """Open the scenes of a stage (fit, validate, test, predict; none for all).

@@ -81,7 +81,9 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
     }
     lines = lines_of(runs)
     # Names are text, whatever is in them: what is not Markup is escaped, bytes that are no UTF-8 are replaced.
-    page = Environment(autoescape=True, finalize=_utf8, trim_blocks=True, lstrip_blocks=True)
+    page = Environment(
+        autoescape=True, finalize=lambda it: utf8(it) if type(it) is str else it, trim_blocks=True, lstrip_blocks=True
+    )
     return page.from_string(_asset("page.html")).render(
         style=Markup(_asset("page.css")),
         script=Markup("\n".join(map(_asset, SCRIPTS))),
@@ -164,10 +166,6 @@ def plotly_script() -> str:
 
 def _asset(name: str) -> str:
     return (files("bpnp.report") / "assets" / name).read_text(encoding="utf-8")
-
-
-def _utf8(value: Any) -> Any:
-    return utf8(value) if isinstance(value, str) and not isinstance(value, Markup) else value
 
 
 def compressed(text: str) -> str:

@@ -16,7 +16,7 @@ from bpnp.models.baselines.branch_and_bound import (
     translation_uncertainty,
     within,
 )
-from bpnp.models.baselines.gosma import RayMixture, SceneMixture, align_mixtures, distance, squared_norm
+from bpnp.models.baselines.gosma import GOSMA, RayMixture, SceneMixture, distance, squared_norm
 
 
 def whole(turn: Tensor, turn_half: float, place: Tensor, place_half: float) -> Boxes:
@@ -66,7 +66,7 @@ def planted_mixtures() -> tuple[SceneMixture, RayMixture, Tensor, Tensor]:
 def test_gosma_finds_the_planted_pose_with_a_certificate_that_a_grid_confirms() -> None:
     scene, rays, rotation, place = planted_mixtures()
     domain = whole(torch.zeros(3).double(), 0.45, torch.tensor([0.3, -0.2, -4.1]).double(), 0.2)
-    found = align_mixtures(scene, rays, domain, gap=0.2, max_boxes=100_000)
+    found = GOSMA(max_boxes=100_000, time_limit=None).align(scene, rays, domain, gap=0.2)
     assert found.certified
     # The outliers' weight is missing elsewhere, which moves the optimum a little.
     assert float(roma.rotmat_geodesic_distance(found.rotation, rotation)) < math.radians(1)

@@ -93,74 +93,65 @@ class GOSMA(BranchAndBound):
 
     def search(self, rays: Tensor, points: Tensor, domain: Boxes, away: float, deadline: Deadline) -> Found:
         angle = root_mean_square(torch.acos((rays @ normalize(rays.sum(0), dim=0)).clamp(-1, 1)))
-        return align_mixtures(
-            scene_mixture(points, self.cluster3d),
-            ray_mixture(rays, self.cluster2d * angle),
+        scene, image = scene_mixture(points, self.cluster3d), ray_mixture(rays, self.cluster2d * angle)
+        return self.align(scene, image, domain, closest=CLOSEST * away, deadline=deadline)
+
+    def align(
+        self,
+        scene: SceneMixture,
+        rays: RayMixture,
+        domain: Boxes,
+        *,
+        gap: float = GAP,
+        closest: float = 0.0,
+        deadline: Deadline = NEVER,
+    ) -> Found:
+        """Smallest d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
+
+        The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the less
+        certain; Adam descends from their best centres, and L-BFGS polishes a better pose. Value and bound are shares of
+        the image mixture's squared norm.
+        """
+        norm = float(squared_norm(rays))
+        best = (math.inf, domain.rotation[0], domain.place[0])
+
+        def descend_from(boxes: Boxes) -> None:
+            nonlocal best
+            if len(boxes.turn) == 0:
+                return
+            values = distance(scene, rays, boxes.rotation, boxes.place)
+            chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
+            poses = descend(scene, rays, chosen.rotation, chosen.place)
+            values = distance(scene, rays, *poses)
+            i = int(values.argmin())
+            if float(values[i]) < best[0]:
+                best = float(values[i]), poses[0][i], poses[1][i]
+                turned, moved = descend(scene, rays, *(x[i : i + 1] for x in poses), finely=True)
+                if (end := float(distance(scene, rays, turned, moved))) < best[0]:
+                    best = end, roma.special_procrustes(turned[0]), moved[0]
+
+        def expand(parents: Boxes) -> tuple[Boxes, Tensor, float]:
+            moving = translation_uncertainty(parents, scene.means).amax(-1)
+            children = split(parents, rotation_uncertainty(parents) >= moving)
+            _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
+            children = children.pick(farthest.squeeze(-1) >= closest)
+            bounds = -lower_bound(scene, rays, children)
+            descend_from(children.pick(children.place.norm(dim=-1) >= closest))
+            # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
+            return children, bounds, gap * norm - best[0]
+
+        descend_from(domain)
+        left, boxes = best_first(
             domain,
-            closest=CLOSEST * away,
-            batch=self.batch,
-            max_boxes=self.max_boxes,
-            deadline=deadline,
+            -lower_bound(scene, rays, domain),
+            expand,
+            at_once=self.batch,
+            until=lambda done: deadline.passed() or done + 1 >= self.max_boxes,
         )
-
-
-def align_mixtures(
-    scene: SceneMixture,
-    rays: RayMixture,
-    domain: Boxes,
-    *,
-    gap: float = GAP,
-    closest: float = 0.0,
-    batch: int = 512,
-    max_boxes: int | float = math.inf,
-    deadline: Deadline = NEVER,
-) -> Found:
-    """Smallest d(R, c) over a domain with |c| >= `closest`, to within `gap` of the image mixture's squared norm.
-
-    The `batch` boxes of lowest bound are split together, in rotation or in translation, whichever is the less certain;
-    Adam descends from their best centres, and L-BFGS polishes a better pose. Value and bound are shares of the image
-    mixture's squared norm.
-    """
-    norm = float(squared_norm(rays))
-    best = (math.inf, domain.rotation[0], domain.place[0])
-
-    def descend_from(boxes: Boxes) -> None:
-        nonlocal best
-        if len(boxes.turn) == 0:
-            return
-        values = distance(scene, rays, boxes.rotation, boxes.place)
-        chosen = boxes.pick(values.topk(min(DESCENTS, len(values)), largest=False).indices)
-        poses = descend(scene, rays, chosen.rotation, chosen.place)
-        values = distance(scene, rays, *poses)
-        i = int(values.argmin())
-        if float(values[i]) < best[0]:
-            best = float(values[i]), poses[0][i], poses[1][i]
-            turned, moved = descend(scene, rays, *(x[i : i + 1] for x in poses), finely=True)
-            if (end := float(distance(scene, rays, turned, moved))) < best[0]:
-                best = end, roma.special_procrustes(turned[0]), moved[0]
-
-    def expand(parents: Boxes) -> tuple[Boxes, Tensor, float]:
-        moving = translation_uncertainty(parents, scene.means).amax(-1)
-        children = split(parents, rotation_uncertainty(parents) >= moving)
-        _, farthest = distance_range(children, torch.zeros_like(scene.means[:1]))
-        children = children.pick(farthest.squeeze(-1) >= closest)
-        bounds = -lower_bound(scene, rays, children)
-        descend_from(children.pick(children.place.norm(dim=-1) >= closest))
-        # Boxes whose bound is within the gap of the best cannot change the result by more than the gap.
-        return children, bounds, gap * norm - best[0]
-
-    descend_from(domain)
-    left, boxes = best_first(
-        domain,
-        -lower_bound(scene, rays, domain),
-        expand,
-        at_once=batch,
-        until=lambda done: deadline.passed() or done + 1 >= max_boxes,
-    )
-    value, rotation, place = best
-    certified = -left >= value - gap * norm
-    bound = value - gap * norm if certified else -left
-    return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
+        value, rotation, place = best
+        certified = -left >= value - gap * norm
+        bound = value - gap * norm if certified else -left
+        return Found(rotation, place, value / norm + 1, bound / norm + 1, boxes + 1, certified)
 
 
 def descend(
