@@ -39,7 +39,7 @@ class Tensors:
             # A dtype is for numbers: half precision has no index 257.
             return moved if x.is_floating_point() or moved.dtype == x.dtype else x.to(moved.device)
 
-        return _mapped(self, move)
+        return mapped(self, move)
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,7 @@ class Batch(Tensors):
         return self.mask3d.sum(-1)
 
     def pin_memory(self) -> "Batch":
-        return _mapped(self, lambda x: x.pin_memory())
+        return mapped(self, lambda x: x.pin_memory())
 
     @classmethod
     def from_arrays(
@@ -198,13 +198,13 @@ class Batch(Tensors):
         )
 
 
-def _mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
-    """Apply a function to every tensor in dataclasses and dicts of them; the rest stays."""
+def mapped(value: _T, function: Callable[[Tensor], Tensor]) -> _T:
+    """The value with a function applied to every tensor in dataclasses and dicts of them; the rest stays."""
     if isinstance(value, Tensor):
         return cast(_T, function(value))
     if isinstance(value, dict):
-        return cast(_T, {k: _mapped(v, function) for k, v in value.items()})
+        return cast(_T, {k: mapped(v, function) for k, v in value.items()})
     if is_dataclass(value) and not isinstance(value, type):
-        changed = {f.name: _mapped(getattr(value, f.name), function) for f in fields(value)}
+        changed = {f.name: mapped(getattr(value, f.name), function) for f in fields(value)}
         return cast(_T, type(value)(**changed))
     return value

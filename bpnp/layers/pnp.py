@@ -26,13 +26,11 @@ FARTHEST = 1e4  # scene radii; beyond this distance all bearings coincide: the s
 WELL_POSED = 1e-9  # smallest Hessian eigenvalue, as a part of the trace, at which the pose has a derivative
 
 
-def aggregate(assignment: Float[Tensor, "b m n"], bearings: Float[Tensor, "b m 3"]) -> Columns:
-    """q_j = sum_i P_ij f_i: the mean bearing of each 3D point, its length the point's weight."""
-    return _Aggregate.apply(assignment, bearings.to(assignment.dtype))
-
-
 class _Aggregate(torch.autograd.Function):
-    """F^T P, whose gradients are exact products too."""
+    """F^T P (b, 3, n): q_j = sum_i P_ij f_i, the mean bearing of each 3D point, its length the point's weight.
+
+    Its gradients are exact products too.
+    """
 
     @staticmethod
     def forward(ctx: Any, assignment: Tensor, bearings: Tensor) -> Tensor:
@@ -53,13 +51,6 @@ class Derivatives(NamedTuple):
     value: Float[Tensor, " b"]
     gradient: Float[Tensor, "b 6"]
     hessian: Float[Tensor, "b 6 6"]
-
-
-def pose_gradient(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Float[Tensor, "b 6"]:
-    """Gradient in the step (w, s), differentiable in all arguments: the optimality condition of the layer."""
-    rotated = rotation @ points
-    _, _, h = _point_gradient(q, rotated + translation.unsqueeze(-1))
-    return _gradient(rotated @ h.mT, h)
 
 
 def derivatives(q: Columns, points: Columns, rotation: Rotations, translation: Translations) -> Derivatives:
@@ -189,7 +180,7 @@ def weighted_pnp(
     """
     import roma  # as in `bpnp.geometry.retract`
 
-    q = aggregate(assignment, bearings).double()
+    q: Columns = _Aggregate.apply(assignment, bearings.to(assignment.dtype)).double()
     # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
     q = q / _lengths(q.detach()).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
     points, centre, scale = _normalised(points3d.double().mT.contiguous(), _lengths(q.detach()))
@@ -204,7 +195,9 @@ def weighted_pnp(
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
 
     # One more Newton step y - H^-1 F(y, x), H held fixed, has the derivative -H^-1 dF/dx of the optimum y(x).
-    optimality = pose_gradient(q, points, r, t)
+    rotated = r @ points
+    *_, h = _point_gradient(q, rotated + t.unsqueeze(-1))
+    optimality = _gradient(rotated @ h.mT, h)
     step = -torch.cholesky_solve(optimality.unsqueeze(-1), factor).squeeze(-1)
     step = torch.where(converged[:, None], step - step.detach(), 0)
     if step.requires_grad:

@@ -7,6 +7,7 @@ import math
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +30,7 @@ from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console
 from bpnp.training.task import number_globally
-from bpnp.types import Batch, Prediction
+from bpnp.types import Batch, Prediction, mapped
 
 COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
@@ -119,7 +120,8 @@ class TrainingMonitor(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
     ) -> None:
         if batch_idx == 0 and self.watched is None:
-            self.watched = first_problems(batch, self.problems)
+            some = mapped(batch, lambda values: values[: self.problems].cpu())
+            self.watched = replace(some, ids=batch.ids[: self.problems])
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         if self.watched is None or trainer.sanity_checking:
@@ -136,15 +138,6 @@ class TrainingMonitor(Callback):
                 f"{max(spreads.values()):.2g} at step {trainer.global_step}: the features have collapsed; try a lower "
                 "model.learning_rate, a warm-up, or `centre` of the solver's features"
             )
-
-
-def first_problems(batch: Batch, count: int) -> Batch:
-    """The first problems of a batch, on the CPU."""
-    parts: dict[str, Any] = {
-        name: value[:count].cpu() if isinstance(value, Tensor) else value and value[:count]
-        for name, value in vars(batch).items()
-    }
-    return Batch(**parts)
 
 
 def feature_spreads(solver: nn.Module, batch: Batch) -> dict[str, Tensor]:
