@@ -7,7 +7,7 @@ Geometric Optimization", ECCV 2020; the names and shapes of the 185 tensors are 
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -142,15 +142,9 @@ class _PairwiseDistance(torch.autograd.Function):
         return weight @ -b, weight.mT @ -a
 
 
-class TensorMap(NamedTuple):
-    """One tensor of the authors' file: its shape there, and its name in BPnPNet."""
-
-    shape: tuple[int, ...]
-    ours: str
-
-
-def tensor_maps() -> dict[str, TensorMap]:
-    """The 185 tensors (1,992,841 parameters and the batch norms' buffers) by the authors' names.
+def tensor_maps() -> dict[str, tuple[tuple[int, ...], str]]:
+    """Shape there, and name in BPnPNet, of the 185 tensors (1,992,841 parameters and the batch norms' buffers) by the
+    authors' names.
 
     Their 1x1 convolutions (out, in, 1) are our linear maps (out, in). Both apply the input transform from the right,
     points @ T.
@@ -162,7 +156,7 @@ def tensor_maps() -> dict[str, TensorMap]:
         module, _, kind = ours.rpartition(".")
         theirs = next(re.sub(old, new, module) for old, new in _THEIRS.items() if re.fullmatch(old, module))
         convolution = "conv" in theirs and kind == "weight"
-        maps[f"{theirs}.{kind}"] = TensorMap((*value.shape, 1) if convolution else tuple(value.shape), ours)
+        maps[f"{theirs}.{kind}"] = ((*value.shape, 1) if convolution else tuple(value.shape), ours)
     return maps
 
 
@@ -182,8 +176,8 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
         value = state[key]
         if not isinstance(value, Tensor):
             problems.append(f"{key!r} as a {type(value).__name__}, not a tensor")
-        elif tuple(value.shape) != maps[key].shape:
-            problems.append(f"{key!r} of shape {tuple(value.shape)}, not {maps[key].shape}")
+        elif tuple(value.shape) != maps[key][0]:
+            problems.append(f"{key!r} of shape {tuple(value.shape)}, not {maps[key][0]}")
         elif not value.isfinite().all():
             problems.append(f"{key!r} with NaN or infinity")
     if problems:
@@ -194,7 +188,7 @@ def load_authors_weights(path: str | Path, *, backend: Backend = "auto") -> BPnP
         )
     net = BPnPNet(ransac=RansacPnP(backend=backend))
     shapes = {name: value.shape for name, value in net.state_dict().items()}
-    net.load_state_dict({m.ours: state[key].reshape(shapes[m.ours]) for key, m in maps.items()})
+    net.load_state_dict({ours: state[key].reshape(shapes[ours]) for key, (_, ours) in maps.items()})
     return net.eval()
 
 

@@ -38,7 +38,9 @@ def pairs() -> list[tuple[Tensor, Tensor]]:
 
 def test_counts_are_those_of_the_paper_code(reference: Released) -> None:
     state = reference.state_dict()
-    assert {key: tuple(value.shape) for key, value in state.items()} == {k: m.shape for k, m in tensor_maps().items()}
+    assert {key: tuple(value.shape) for key, value in state.items()} == {
+        k: shape for k, (shape, _) in tensor_maps().items()
+    }
     assert len(state) == 185
     assert sum(p.numel() for p in reference.parameters()) == 1_992_841
     assert sum(p.numel() for p in BPnPNet().parameters()) == 1_992_841
