@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from bpnp.checks import checked_shapes
-from bpnp.layers.implicit import BackwardStats, entropic_plan, record
-from bpnp.layers.laplacian import solve_multipliers
+from bpnp.layers.implicit import BackwardStats
+from bpnp.layers.laplacian import entropic_plan
 from bpnp.layers.transport import solve_plan
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
@@ -78,13 +78,7 @@ def sinkhorn(
     exact_mu = torch.as_tensor(mu, dtype=torch.float64, device=cost.device)
     with torch.no_grad():
         plan, stats = solve_plan(cost, rows, cols, mu=exact_mu, tolerance=tolerance, max_iterations=max_iterations)
-
-    def solve_adjoint(plan: Tensor, gradient: Tensor) -> tuple[Tensor, Tensor]:
-        a, b, converged = solve_multipliers(plan, gradient)
-        record(backward_stats, "sinkhorn", converged)
-        return a, b
-
-    plan = entropic_plan(plan, cost, exact_mu.to(cost.dtype), rows, cols, solve_adjoint)
+    plan = entropic_plan(plan, cost, exact_mu.to(cost.dtype), rows, cols, backward_stats)
     return (plan if dustbin is None else plan[:, :m, :n]), stats
 
 

@@ -2,15 +2,17 @@
 
 [diag(P1) P; P^T diag(P^T 1)] [a; b] = [x; y] is singular along (1, -1) and consistent when sum x = sum y. Eliminating a
 leaves S b = y - P^T (x / P1) with S = diag(P^T 1) - P^T diag(1 / P1) P, the Laplacian of a graph between columns.
-`solve_multipliers` are those of the gradient (`bpnp.layers.implicit.entropic_plan`).
+`solve_multipliers` are those of the gradient, which `entropic_plan` has.
 """
+
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 import bpnp.layers.compiled as compiled
-from bpnp.layers.implicit import projected
+from bpnp.layers.implicit import BackwardStats, first_derivative, record
 from bpnp.layers.plan import Plan, cached_parts, divide, times, transpose_times
 
 ITERATIONS = 150  # of conjugate gradients; slower systems are factorised
@@ -110,6 +112,56 @@ def _mean(b: Float[Tensor, "b n"], cols: Float[Tensor, "b n"]) -> Float[Tensor, 
     return (cols * b).sum(-1, keepdim=True) / cols.sum(-1, keepdim=True)
 
 
+def entropic_plan(
+    plan: Float[Tensor, "b m n"],
+    cost: Float[Tensor, "b m n"],
+    mu: Float[Tensor, ""],
+    row_marginal: Float[Tensor, "b m"],
+    col_marginal: Float[Tensor, "b n"],
+    backward_stats: BackwardStats | None,
+) -> Float[Tensor, "b m n"]:
+    """Return `plan`, the minimiser of <P, cost> + mu P (log P - 1) with the given marginals, with its gradients.
+
+    With V = dL/dP and multipliers a, b from [diag(P1) P; P^T diag(P^T 1)] [a; b] = [(P.V)1; (P.V)^T 1]:
+    dL/dcost = -P.(V - a1^T - 1b^T)/mu, dL/dmu = <dL/dcost, log P>, dL/drow = a, dL/dcol = b
+    (up to one constant added to a and taken from b, chosen so that the mean of b, weighted by c, is zero).
+    The actual sums of P enter, so that a plan short of convergence has the gradient of the problem that it does solve.
+
+    backward_stats: as for `bpnp.layers.sinkhorn`.
+    """
+    return _EntropicPlan.apply(plan, cost, mu, row_marginal, col_marginal, backward_stats)
+
+
+class _EntropicPlan(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, plan: Tensor, cost: Tensor, mu: Tensor, rows: Tensor, cols: Tensor, stats: BackwardStats | None
+    ) -> Tensor:
+        ctx.save_for_backward(plan, mu)
+        ctx.stats = stats
+        return plan.view_as(plan)
+
+    @staticmethod
+    @first_derivative
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        plan, mu = ctx.saved_tensors
+        a, b, converged = solve_multipliers(plan, gradient)
+        record(ctx.stats, "sinkhorn", converged)
+        to_cost = _projected(plan, gradient, a, b, -1 / mu)
+        to_mu = torch.special.xlogy(to_cost, plan).sum() if ctx.needs_input_grad[2] else None
+        return None, to_cost, to_mu, a, b, None
+
+
+def _projected(
+    plan: Tensor, gradient: Tensor, a: Tensor, b: Tensor, factor: float | Tensor = 1.0
+) -> Float[Tensor, "b m n"]:
+    """factor P.(V - a1^T - 1b^T)."""
+    result = torch.empty_like(plan)
+    for out, p, v, x, y in cached_parts(result, plan, gradient, a, b):
+        torch.sub(v, x.unsqueeze(-1), out=out).sub_(y.unsqueeze(-2)).mul_(p).mul_(factor)
+    return result
+
+
 def solve_multipliers(
     plan: Float[Tensor, "b m n"], gradient: Float[Tensor, "b m n"]
 ) -> tuple[Float[Tensor, "b m"], Float[Tensor, "b n"], Bool[Tensor, " b"]]:
@@ -144,6 +196,6 @@ def _solve(plan: Tensor, gradient: Tensor, tolerance: float) -> tuple[Tensor, Te
     if plan.dtype == torch.float64 and not bool(solved.all()):
         # Links between groups of columns may be so weak that the whole right-hand side is rounding, which nothing
         # solves to a relative precision: it is enough that the projected gradient's column sums are rounding too.
-        sums, size = projected(plan, gradient, a, b).sum(-2), (plan * gradient.square()).sum((-2, -1))
+        sums, size = _projected(plan, gradient, a, b).sum(-2), (plan * gradient.square()).sum((-2, -1))
         solved = solved | ((divide(sums.square(), cols).sum(-1) <= ROUNDING**2 * size) & size.isfinite())
     return a, b, solved, solved & (cols.sum(-1) <= SHARP * degree.sum(-1))
