@@ -12,20 +12,12 @@ import numba
 from numba.core import event
 from numba.core.dispatcher import Dispatcher
 
+from bpnp.loops import shortcuts
 from bpnp.loops.parallel import Clock
 
 # Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
 FAST = {"reassoc", "contract", "arcp", "nsz"}
-KNOWN = (0, 60) <= tuple(map(int, numba.__version__.split(".")[:2])) < (0, 69)  # private parts are as they were tested
 _FILES: dict[Any, set[str]] = {}  # of each compiled function: its own, and those of the functions that these call
-
-if KNOWN:
-    from bpnp.loops import shortcuts
-else:
-    logging.getLogger(__name__).warning(
-        "expected numba 0.60 to 0.68, got %s: loops are compiled slowly and in each process; try numba<0.69",
-        numba.__version__,
-    )
 
 
 def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -42,8 +34,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
     part = "no_cpython_wrapper" in options
     options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    if KNOWN:
-        options["pipeline_class"] = shortcuts.LoopCompiler
+    options["pipeline_class"] = shortcuts.LoopCompiler
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -51,8 +42,8 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         files = {__file__, inspect.getfile(function)}.union(*(_FILES[x] for x in known if isinstance(x, Dispatcher)))
         files |= {inspect.getfile(type(x)) for x in known if isinstance(x, tuple) and hasattr(x, "_fields")}
         try:
-            dispatcher: Any = numba.njit(function, cache=KNOWN and not part, **options)
-            if KNOWN and not part:
+            dispatcher: Any = numba.njit(function, cache=not part, **options)
+            if not part:
                 stats = [os.stat(file) for file in sorted(files)]
                 shortcuts.stamp(dispatcher, [(stat.st_mtime, stat.st_size) for stat in stats])
         except RuntimeError:  # numba finds no folder for its cache
@@ -83,8 +74,7 @@ class _Compilation(event.Listener):
             self.begun = time.monotonic()
             self.collected = gc.isenabled()
             gc.disable()
-            if KNOWN:
-                shortcuts.resolve_once(True)
+            shortcuts.resolve_once(True)
         self.depth += 1
 
     def on_end(self, event: event.Event) -> None:
@@ -92,8 +82,7 @@ class _Compilation(event.Listener):
             self.depth -= 1
             if not self.depth:
                 Clock.compiling += time.monotonic() - self.begun
-                if KNOWN:
-                    shortcuts.resolve_once(False)
+                shortcuts.resolve_once(False)
                 if self.collected:
                     gc.enable()
 

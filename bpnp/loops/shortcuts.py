@@ -1,4 +1,4 @@
-"""Shortcuts through private parts of numba that halve the time to compile; `compilation` knows for which versions."""
+"""Shortcuts through private parts of numba that halve the time to compile, hence the bound of its version."""
 
 from typing import Any
 

@@ -40,7 +40,7 @@ def anneal_on_clusters(
             if k:  # best first, since only the first ones go on after the deadline
                 poses = poses[np.argsort(-poses.score, kind="stable")[: max(len(poses) // 2, 2 * kept)]]
             poses = _annealed(scene, poses, clusters, part, outlier)
-        poses = best_distinct(poses, scene, kept, degrees=stage.apart_deg, shift=math.inf)
+        poses = best_distinct(poses, scene, kept, stage.apart_deg)
     return poses
 
 

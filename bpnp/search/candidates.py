@@ -69,22 +69,13 @@ class Candidates:
         return cls(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(cls)))
 
 
-def best_distinct(
-    candidates: Candidates,
-    scene: Scene,
-    count: int,
-    *,
-    degrees: float | None = None,
-    shift: float | None = None,
-) -> Candidates:
-    """The best `count` poses of a scene of which no two are closer than `degrees` and `shift`, best first.
+def best_distinct(candidates: Candidates, scene: Scene, count: int, apart_deg: float | None = None) -> Candidates:
+    """The best `count` poses of a scene of which no two are the same, or turned by less than `apart_deg`; best first.
 
-    degrees, shift: by default those of the settings. A pose has the hits of all poses that are the same.
+    A pose has the hits of all poses that are the same.
     """
-    limits = (
-        scene.settings.same_deg if degrees is None else degrees,
-        scene.settings.same_shift if shift is None else shift,
-    )
+    settings = scene.settings
+    limits = (settings.same_deg, settings.same_shift) if apart_deg is None else (apart_deg, math.inf)
     poses = candidates.rotation, candidates.translation * scene.shift_weight
     kept = distinct(*poses, candidates.preference, count, *limits)
     if not len(kept):

@@ -111,11 +111,13 @@ class PointSets:
             return 0.0
         if isinstance(self.prior, GravityPrior):
             up = rotation @ (np.asarray(self.prior.up_scene) / np.linalg.norm(self.prior.up_scene))
-            off = _angle(up, np.asarray(self.prior.up_camera, np.float64))
-            return math.log10(_cap(max(off, math.radians(SIGMAS * self.prior.sigma_deg))))
+            camera = np.asarray(self.prior.up_camera, np.float64)
+            off = math.atan2(float(np.linalg.norm(np.cross(up, camera))), float(up @ camera))
+            off = min(max(off, math.radians(SIGMAS * self.prior.sigma_deg)), math.pi)
+            return math.log10(max((1 - math.cos(off)) / 2, 1e-12))
         known = np.asarray(self.prior.rotation, np.float64)
-        off = max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg))
-        share = _ball(off)
+        off = min(max(turned_by(rotation, known), math.radians(SIGMAS * self.prior.rotation_sigma_deg)), math.pi)
+        share = max((off - math.sin(off)) / math.pi, 1e-15)
         if self.prior.translation is not None and math.isfinite(self.prior.translation_sigma):
             expected = known @ self.middle + np.asarray(self.prior.translation)
             distance = max(float(np.linalg.norm(expected)), 1e-12)
@@ -131,18 +133,3 @@ def faces(normals3d: Array, cosines3d: Array | None, camera: Array, rotation: Ar
     if cosines3d is None:
         return np.asarray(towards > 0)
     return np.asarray(towards > cosines3d * np.linalg.norm(camera, axis=-1))
-
-
-def _angle(a: Array, b: Array) -> float:
-    return math.atan2(float(np.linalg.norm(np.cross(a, b))), float(a @ b))
-
-
-def _cap(angle: float) -> float:
-    """Share of all directions within an angle, radians."""
-    return max((1 - math.cos(min(angle, math.pi))) / 2, 1e-12)
-
-
-def _ball(angle: float) -> float:
-    """Share of all rotations within an angle, radians."""
-    angle = min(angle, math.pi)
-    return max((angle - math.sin(angle)) / math.pi, 1e-15)

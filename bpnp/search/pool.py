@@ -110,7 +110,7 @@ class Pool:
     def different(self, parts: list[Candidates]) -> Candidates:
         """The best poses of several sets of them, no two turned by less than `schedule.apart_deg`."""
         rule, together = self.scene.settings.schedule, Candidates.concatenated(parts)
-        return best_distinct(together, self.scene, rule.around_each, degrees=rule.apart_deg, shift=np.inf)
+        return best_distinct(together, self.scene, rule.around_each, rule.apart_deg)
 
     def _missed(self) -> float:
         leaders = self.leaders()

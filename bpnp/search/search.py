@@ -68,11 +68,14 @@ def search_poses(
     if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
     if is_enumerable(sets) and not deadline.passed():
-        enumerated, exhausted = _enumerated(sets, entered, settings, deadline)
+        found, exhaustive = search_by_enumeration(sets, deadline, settings)
+        rule = settings.evidence
+        enumerated = judged(found, sets, batches=0, exhaustive=exhaustive, rule=rule)
+        enumerated = against_rivals(enumerated, sets, entered, rule, exhaustive=exhaustive)
         tell(0)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
-        settled = exhausted or enumerated.log10_false_alarms <= 0
+        settled = exhaustive or enumerated.log10_false_alarms <= 0
         if enumerated.verdict == "confident" or small or (settled and not many):
             return enumerated
     if degenerate(sets.bearings) or degenerate(sets.points3d):
@@ -131,13 +134,3 @@ def search_proposed(
     settings = settings if clutter is None else settings.expecting(clutter)
     pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
     return _until_certain(pool, only_proposed(pool, proposals))
-
-
-def _enumerated(
-    sets: PointSets, entered: Callable[[], Scene], settings: SearchSettings, deadline: Deadline
-) -> tuple[SearchResult, bool]:
-    """The result of few points, and whether every hypothesis was tried."""
-    found = search_by_enumeration(sets, deadline, settings)
-    exhaustive = found.exhausted or found.safe
-    result = judged(found.candidates, sets, batches=0, exhaustive=exhaustive, rule=settings.evidence)
-    return against_rivals(result, sets, entered, settings.evidence, exhaustive=exhaustive), found.exhausted

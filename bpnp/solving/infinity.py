@@ -22,14 +22,12 @@ from bpnp.solving.arguments import (
     check_unit,
     checked_scores,
     image_points,
-    normalised,
     scene_points,
-    unit_bearings,
     unit_vectors,
 )
 from bpnp.solving.focal_length import UnknownCamera
 from bpnp.solving.matches import SCALES, angles_between, count_one_to_one, one_to_one
-from bpnp.solving.problem import check_seen, unit_of
+from bpnp.solving.problem import bearings_of, check_seen, unit_of
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 from bpnp.solving.sources import Options
 
@@ -148,13 +146,9 @@ def _seen_by(
     hit = np.flatnonzero(best.match >= 0)
     residual = noise_of(seen[0][best.match[hit]], bearings[hit], pixel[hit])
     threshold = inlier_threshold or SCALES * residual * middle * per_radian
-    radius, towards = threshold / per_radian, bearings.mean(0)
-    least = float((bearings @ towards).min()) - radius
-    in_view = [np.flatnonzero(each @ towards > least) for each in seen]
-    i, j = one_to_one(bearings, seen[0][in_view[0]], radius).T
-    j = in_view[0][j]
-    others = (each[places] for each, places in zip(seen[1:], in_view[1:], strict=True))
-    counts = [len(i), *(count_one_to_one(bearings, each, radius) for each in others)]
+    radius = threshold / per_radian
+    i, j = one_to_one(bearings, seen[0], radius).T
+    counts = [len(i), *(count_one_to_one(bearings, each, radius) for each in seen[1:])]
     matched = seen[0][j], bearings[i], pixel[i]
     covariance = how_well_known(*matched).covariance
     if unknown is not None and lens is not None:
@@ -181,12 +175,9 @@ def _seen_by(
 def _bearings(image: Array, camera: Camera | None) -> tuple[Array, Array, Array]:
     """Unit bearings (m, 3) and normalised coordinates (m, 2), NaN where there are none, and radians a pixel (m,)."""
     if camera is None:
-        bearings = unit_bearings(image) if image.shape[1] == 3 else normalised(image, None)
-        if image.shape[1] == 2:
-            bearings = np.column_stack([bearings, np.ones(len(bearings))])
-            bearings /= np.linalg.norm(bearings, axis=-1, keepdims=True)
+        bearings, plane = bearings_of(image, None)
         spread = math.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean())
-        return bearings, in_front(bearings)[:, :2], np.full(len(bearings), max(NOMINAL * spread, 1e-12))
+        return bearings, plane, np.full(len(bearings), max(NOMINAL * spread, 1e-12))
     check_unit(image, camera)
     bearings = camera.bearings(image)
     steps = ((camera.bearings(image + step) - bearings) / HALF for step in ([HALF, 0.0], [0.0, HALF]))

@@ -139,14 +139,8 @@ def problem_from(
         raise ValueError(f"expected {what}, got {wrong.shape} (are points2d and points3d swapped?)")
     check_points("points2d", image, (2, 3) if camera is None else (2,), fewest)
     check_points("points3d", scene, (3,), fewest)
-    unit = unit_of(image, camera)
-    if unit == "rad":
-        image = bearings = unit_bearings(image)
-        plane = in_front(bearings)[:, :2]
-    else:
-        plane = normalised(image, camera)
-        rays = np.column_stack([plane, np.ones(len(plane))])
-        bearings = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+    unit, (bearings, plane) = unit_of(image, camera), bearings_of(image, camera)
+    image = bearings if unit == "rad" else image
     usable = np.flatnonzero(np.isfinite(bearings).all(-1))
     check_seen(usable, image, fewest)
     origin, known = _origin(scene), prior if isinstance(prior, (PosePrior, GravityPrior)) else None
@@ -167,6 +161,17 @@ def problem_from(
     sets = chosen(sets, usable)
     degenerate = degenerate_points(sets.bearings, scene, fewest)
     return Problem(sets, usable, image[usable], unit, plane, scene, origin, camera, degenerate, prior)
+
+
+def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
+    """Unit bearings (m, 3) of image points in front of a camera and their normalised coordinates (m, 2), NaN for none.
+    Raises ValueError for pixels without a camera or the reverse."""
+    if image.shape[1] == 3:
+        bearings = unit_bearings(image)
+        return bearings, in_front(bearings)[:, :2]
+    plane = normalised(image, camera)
+    rays = np.column_stack([plane, np.ones(len(plane))])
+    return rays / np.linalg.norm(rays, axis=-1, keepdims=True), plane
 
 
 def unit_of(image: Array, camera: Camera | None) -> Unit:

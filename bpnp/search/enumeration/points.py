@@ -90,14 +90,6 @@ class Heading(NamedTuple):
     sine2: float
 
 
-class KnownPose(NamedTuple):
-    """A prior as the loops read it, and the log of the share of poses that it allows."""
-
-    arrays: PriorArrays
-    heading: Heading
-    log_share: float
-
-
 class SceneSide:
     """The scene of one problem, or of many: a device is seen in frame after frame. size: the extent that is the unit.
 
@@ -263,8 +255,10 @@ def predicted_pose(prior: Prior | None) -> tuple[Array, Array] | None:
     return np.asarray(prior.rotation, np.float64), np.asarray(prior.translation, np.float64)
 
 
-def prior_arrays(sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings) -> KnownPose:
-    """The prior in the frames of both sides.
+def prior_arrays(
+    sets: PointSets, scene: SceneSide, image: ImageSide, settings: EnumerationSettings
+) -> tuple[PriorArrays, Heading, float]:
+    """The prior in the frames of both sides, as the loops read it, and the log of the share of poses that it allows.
 
     Where two matches fix a pose, a direction is taken as known: the vertical, or that of the view, about which the
     image shows a turn best.
@@ -273,7 +267,7 @@ def prior_arrays(sets: PointSets, scene: SceneSide, image: ImageSide, settings: 
     translation, farthest_shift2, log_share, sine2 = np.zeros(3), math.inf, 0.0, 1.0
     if prior is None:
         arrays = PriorArrays(none, none, 0.0, 0.0, translation, farthest_shift2)
-        return KnownPose(arrays, Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share)
+        return arrays, Heading(none, none, np.zeros((3, 3, 3)), sine2), log_share
     if isinstance(prior, GravityPrior):
         camera, up = (np.asarray(v, np.float64) / np.linalg.norm(v) for v in (prior.up_camera, prior.up_scene))
         in_scene, in_camera, off = up[None], (image.turn @ camera)[None], math.radians(prior.sigma_deg)
@@ -294,4 +288,4 @@ def prior_arrays(sets: PointSets, scene: SceneSide, image: ImageSide, settings: 
     heading = Heading(rays, points, from_camera.T @ about @ from_scene, sine2)
     weight, farthest2 = settings.prior_weight / off, (2 * math.sin(min(settings.sigmas * off, math.pi) / 2)) ** 2
     arrays = PriorArrays(in_scene, in_camera, float(weight), float(farthest2), translation, float(farthest_shift2))
-    return KnownPose(arrays, heading, log_share)
+    return arrays, heading, log_share

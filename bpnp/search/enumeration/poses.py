@@ -71,11 +71,11 @@ class Enumeration:
         scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
         self.reach = _reach(sets, scene, radius, settings)
         image = ImageSide(sets.bearings, radius, sets.labels2d, self.reach)
-        known, fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
+        (prior, heading, log_share), fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
         self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
-        self.problem = Problem(scene.arrays, image.arrays, known.arrays, known.heading, fixing, image.density)
+        self.problem = Problem(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
             np.zeros((kept, 4, 3)),
             np.full(kept, -math.inf),
@@ -90,7 +90,7 @@ class Enumeration:
         seen = settings.seen_witnesses * n / max(m - fixing, 1)
         near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
         self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
-        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + known.log_share
+        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + log_share
         self.tests = math.log(RULES.ladder) + max(problems, 0.0)
         self._done: dict[tuple[int, float], tuple[int, int]] = {}
         none = np.empty((0, fixing), np.int64)

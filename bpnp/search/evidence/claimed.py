@@ -21,8 +21,8 @@ from bpnp.search.annealing import anneal_on_points, finish, shaken
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
-from bpnp.search.evidence.false_alarms import directions_of, likeliest_scale, log10_tests
-from bpnp.search.evidence.partners import facing, partners
+from bpnp.search.evidence.false_alarms import likeliest_scale, log10_tests
+from bpnp.search.evidence.partners import explained
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
@@ -102,9 +102,8 @@ def _met(
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     exhaustive, looks = False, 0
     if is_enumerable(sets):
-        found = search_by_enumeration(sets, deadline, settings)
-        parts.append(in_scene_frame(found.candidates, scene))
-        exhaustive = found.exhausted or found.safe
+        found, exhaustive = search_by_enumeration(sets, deadline, settings)
+        parts.append(in_scene_frame(found, scene))
     while looks < settings.schedule.looks and not exhaustive and not deadline.passed():
         leader = merged(parts, scene)[:1]
         parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
@@ -135,14 +134,7 @@ def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
 def _unrefined(sets: PointSets, rotation: Array, translation: Array, settings: SearchSettings) -> Candidates:
     """A pose as it is (1,), at the scale of residuals at which chance explains it least."""
     scale = likeliest_scale(sets, rotation, translation)
-    places = facing(sets, sets.points3d @ rotation.T + translation, rotation)
-    seen, chosen = directions_of(sets, rotation, translation)[places], sets.image.chosen
-    score, matched = -math.inf, 0.0
-    if len(places):
-        i, _, density, every = partners(sets, seen, places, chosen, scale)
-        small = min(len(sets.bearings), len(sets.points3d))
-        matched = min(float((density / every[i]).sum()) * len(sets.bearings) / len(chosen) / small, 1.0)
-        score = float(np.log(2 * math.pi * every).mean())
+    score, matched = explained(sets, rotation, translation, scale)
     pose = Candidates.unscored(rotation[None], translation[None])
     pose = replace(pose, score=np.array([score]), matched=np.array([matched]), scale=np.array([scale]))
     return with_false_alarms(pose, sets)

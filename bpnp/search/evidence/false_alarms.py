@@ -80,19 +80,14 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
     share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
     none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
-    if len(sets.bearings) > _fixing(sets):
-        for k in range(len(none)):
-            seen = directions_of(sets, rotations[k], translations[k])
-            if int(np.isfinite(seen[:, 0]).sum()) <= _fixing(sets):
-                continue
-            ratio = np.ones(len(sets.image.scales)) if scales is None else _ratio(sets.image, float(scales[k]))
-            own, rough = _is_own(ratio), ratio >= ROUGH
-            # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
-            fewer = np.maximum(cells + share[k], 0.0) - none[k]
-            finest = int(own.argmax())
-            evidence = _log_evidence(sets, _terms(sets, seen, finest), finest) - math.log(10) * fewer
-            result.own[k] -= np.logaddexp.reduce(evidence[own]) / math.log(10)
-            result.rough[k] -= np.logaddexp.reduce(evidence[rough], initial=-math.inf) / math.log(10)
+    for k in range(len(none)):
+        seen = directions_of(sets, rotations[k], translations[k])
+        # Fewer tests at a scale are as much more evidence, but a pose has no less chance than all of them.
+        fewer = math.log(10) * (np.maximum(cells + share[k], 0.0) - none[k])
+        scale = None if scales is None else float(scales[k])
+        own, rough = log_evidence_of(sets, seen, scale, [_fixing(sets)], fewer)[0]
+        result.own[k] -= own / math.log(10)
+        result.rough[k] -= rough / math.log(10)
     return result
 
 
@@ -151,16 +146,19 @@ def directions_of(sets: PointSets, rotation: Array, translation: Array) -> Array
     return seen
 
 
-def log_evidence_of(sets: PointSets, seen: Array, scale: float | None, fixing: Sequence[int]) -> Array:
+def log_evidence_of(
+    sets: PointSets, seen: Array, scale: float | None, fixing: Sequence[int], tests: Array | float = 0.0
+) -> Array:
     """(f, 2) log of the evidence of one camera for points seen in directions (n, 3), without each of these numbers of
-    largest terms: at the scales of the residuals, or all of them if that is None, and at rougher ones."""
-    if len(sets.bearings) <= FIXING or int(np.isfinite(seen[:, 0]).sum()) <= FIXING:
+    largest terms: at the scales of the residuals, or all of them if that is None, and at rougher ones; less the `tests`
+    (S,) of each scale."""
+    if min(len(sets.bearings), int(np.isfinite(seen[:, 0]).sum())) <= max(FIXING, *fixing):
         return np.zeros((len(fixing), 2))
     ratio = np.ones(len(sets.image.scales)) if scale is None else _ratio(sets.image, scale)
     own, rough = _is_own(ratio), ratio >= ROUGH
     finest = int(own.argmax())
     terms = _terms(sets, seen, finest)
-    every = (_log_evidence(sets, terms, finest, count) for count in fixing)
+    every = (_log_evidence(sets, terms, finest, count) - tests for count in fixing)
     return np.array([[np.logaddexp.reduce(one[some], initial=-math.inf) for some in (own, rough)] for one in every])
 
 

@@ -73,6 +73,19 @@ def partners(
     return i, j, np.asarray(density, np.float64), np.asarray(every, np.float64)
 
 
+def explained(sets: PointSets, rotation: Array, translation: Array, scale: float) -> tuple[float, float]:
+    """Mean log-likelihood of the bearings under a pose with residuals of `scale`, radians, in nats as the annealing has
+    it: in units in which a kernel is 1 / s^2 where it is largest; and the share of min(m, n) points with a partner."""
+    camera, chosen = sets.points3d @ rotation.T + translation, sets.image.chosen
+    places = facing(sets, camera, rotation)
+    if not len(places):
+        return -math.inf, 0.0
+    seen = camera[places] / np.linalg.norm(camera[places], axis=-1, keepdims=True)
+    i, _, density, every = partners(sets, seen, places, chosen, scale)
+    matched = float((density / every[i]).sum()) * len(sets.bearings) / len(chosen)
+    return float(np.log(2 * math.pi * every).mean()), min(matched / min(len(sets.bearings), len(sets.points3d)), 1.0)
+
+
 def by_focal_length(seen: Array) -> Array:
     """Derivatives (k, 3, 1) of directions (k, 3) by the logarithm of the focal length."""
     return np.asarray(across(seen) @ (seen * (1, 1, 0))[..., None])

@@ -35,7 +35,7 @@ POSE = 6  # numbers that are fitted with every pose
 
 
 def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
-    """Angle, radians, that the error of the rotation exceeds once in a thousand; see `_bound`.
+    """Angle, radians, that the error of the rotation exceeds once in a thousand; see `exceeded_once`.
 
     linear: `linearised` with the standard deviation of the residuals, estimated from `count` matches.
 
@@ -50,11 +50,11 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     [7.8, 0.7]
     """
     covariance = local_covariance(linear)
-    return math.inf if covariance is None else _bound(covariance[:3, :3], 2 * count - sets.fitted)
+    return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - sets.fitted)
 
 
 def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
-    """Share by which the focal length may be wrong, exceeded once in a thousand; see `_bound`."""
+    """Share by which the focal length may be wrong, exceeded once in a thousand; see `exceeded_once`."""
     covariance = local_covariance(linear)
     return math.inf if covariance is None else share_bound(covariance[POSE:, POSE:], 2 * count - sets.fitted)
 
@@ -62,10 +62,10 @@ def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> f
 def share_bound(covariance: Array, free: float) -> float:
     """Share by which a number may be wrong of whose logarithm this is the variance (1, 1), exceeded once in a
     thousand."""
-    return math.expm1(_bound(covariance, free))
+    return math.expm1(exceeded_once(covariance, free))
 
 
-def _bound(covariance: Array, free: float) -> float:
+def exceeded_once(covariance: Array, free: float) -> float:
     """Length that a vector of this covariance (3, 3) exceeds once in a thousand.
 
     The square of its length is about that of d independent axes of equal variance (Satterthwaite 1946), d =

@@ -24,10 +24,10 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import fdtrc, fdtri, stdtrit
+from scipy.special import fdtrc, stdtrit
 
 from bpnp.search.evidence.false_alarms import sum_of_largest
-from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS
+from bpnp.search.evidence.uncertainty import EXCEEDED, ONE_SIGMA, STRAINS, exceeded_once
 from bpnp.search.kernels.neighbours import sums_near
 
 Array = NDArray[np.float64]
@@ -101,8 +101,7 @@ def how_well_known(seen: Array, bearings: Array, pixel: Array) -> Known:
     noise, weight = noise_of(seen, bearings, pixel), pixel**-2
     inverse = np.linalg.pinv(weight.sum() * np.eye(3) - (weight[:, None] * seen).T @ seen, rcond=1e-12)
     covariance = np.asarray(noise**2 * float(stdtrit(free, ONE_SIGMA)) ** 2 * inverse, np.float64)
-    total, axes = float(np.trace(inverse)), float((inverse**2).sum())
-    return Known(covariance, noise * math.sqrt(total * float(fdtri(total**2 / axes, free, 1 - EXCEEDED))))
+    return Known(covariance, noise * exceeded_once(inverse, float(free)))
 
 
 def strain_of(seen: Array, bearings: Array, pixel: Array, all_bearings: Array) -> float:

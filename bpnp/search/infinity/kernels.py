@@ -107,9 +107,13 @@ def vote(neighbours: Any, places: Any, rays: Any, shift: int, bins: Any, value: 
 
 
 @part
-def _invert(matrix: Any) -> None:
-    """A positive definite matrix in place, by Gauss and Jordan."""
+def _invert(normal: Any, matrix: Any) -> None:
+    """matrix (3, 3): the inverse of a positive definite one, a little damped, by Gauss and Jordan."""
     size = len(matrix)
+    for r in range(size):
+        for c in range(size):
+            matrix[r, c] = normal[r, c]
+        matrix[r, r] += 1e-9 * matrix[r, r] + 1e-30
     for c in range(size):
         pivot = 1 / matrix[c, c]
         matrix[c, c] = 1.0
@@ -135,13 +139,10 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
     covariance, step, turned, normal = scratch[:3], scratch[3], result.rotation, result.normal
     directions, widest, total = sky.table.points, sky.table.tolerance, 0.0
     for _ in range(rounds):
+        _invert(normal, covariance)
         for r in range(3):
-            step[r] = 0.0
             for c in range(3):
-                covariance[r, c] = normal[r, c]
                 normal[r, c] = 0.0
-            covariance[r, r] += 1e-9 * covariance[r, r] + 1e-30
-        _invert(covariance)
         trace = covariance[0, 0] + covariance[1, 1] + covariance[2, 2]
         total = gx = gy = gz = 0.0
         for c in range(len(chosen)):
@@ -176,11 +177,7 @@ def fit(image: Any, chosen: Any, sky: Any, reach: float, rounds: int, result: An
                 normal[r, r] += weight
                 for e in range(3):
                     normal[r, e] -= weight * image.bearings[i, r] * image.bearings[i, e]
-        for r in range(3):
-            for c in range(3):
-                covariance[r, c] = normal[r, c]
-            covariance[r, r] += 1e-9 * covariance[r, r] + 1e-30
-        _invert(covariance)
+        _invert(normal, covariance)
         step[0], step[1], step[2] = rotated(covariance, gx, gy, gz)
         turn(turned, step)
     return total

@@ -116,12 +116,16 @@ def search_rotation(
     scores (m,): points with the largest ones are tried first. noise: standard deviation of the image points,
     pixels, if it is known. zooms: of a focal length that is one of several, the log of the largest over the smallest.
     """
-    catalogue = catalogue_of(directions)
+    catalogue, sample = catalogue_of(directions), np.random.default_rng(seed).permutation(len(image.bearings))
+    density = float(np.median(catalogue.density))
     result, turns = RotationResult([], "failed", "no rotation was found"), 0
     for scale in settings.noise if noise is None else (noise,):
         if turns and deadline.passed():
             break
-        sight = _sight(image, catalogue, scale, zooms, seed, settings)
+        reach = settings.reach * scale
+        sky = catalogue.sky(settings.cell * reach * float(np.median(image.pixel)))
+        background = background_of(image.bearings, image.pixel, len(directions), 2 * scale, zooms)
+        sight = Sight(image, catalogue, sky, background, reach, density, sample[: settings.sample], settings)
         new = _search(sight, scores, seed, deadline)
         turns += new.turns
         if new.log10_false_alarms <= result.log10_false_alarms:
@@ -138,32 +142,11 @@ def _matches(sight: Sight, one: Rotated) -> tuple[Array, Array, Array]:
     return seen, sight.image.bearings[hit], sight.image.pixel[hit]
 
 
-def _information(image: Image, places: Labels) -> Array:
-    """Normal matrix (3, 3) of a turn by image points of one pixel's noise."""
-    bearings, weight = image.bearings[places], image.pixel[places] ** -2.0
-    return np.asarray(weight.sum() * np.eye(3) - (weight[:, None] * bearings).T @ bearings)
-
-
-def _sight(
-    image: Image, catalogue: Catalogue, noise: float, zooms: float, seed: int, settings: InfinitySettings
-) -> Sight:
-    """What is looked for at a noise of so many pixels."""
-    reach = settings.reach * noise
-    cell = settings.cell * reach * float(np.median(image.pixel))
-    background = background_of(image.bearings, image.pixel, len(catalogue.directions), 2 * noise, zooms)
-    sample = np.random.default_rng(seed).permutation(len(image.bearings))[: settings.sample]
-    density = float(np.median(catalogue.density))
-    return Sight(image, catalogue, catalogue.sky(cell), background, reach, density, sample, settings)
-
-
 def _search(sight: Sight, scores: Array | None, seed: int, deadline: Deadline) -> RotationResult:
     settings, count = sight.settings, len(sight.image.bearings)
     found: list[Rotated] = []
-    order, tree, tried = (
-        np.random.default_rng(seed).permutation(count),
-        cKDTree(sight.image.bearings, balanced_tree=False),
-        0,
-    )
+    order, tried = np.random.default_rng(seed).permutation(count), 0
+    tree = cKDTree(sight.image.bearings, balanced_tree=False)
     if scores is not None:
         order = order[np.argsort(-scores[order], kind="stable")]
     result = _judged(found, sight, tried)
@@ -245,7 +228,8 @@ def _fitted(
     It is known as well as two points fix it, the first and the farthest that agrees.
     """
     image, settings, m = sight.image, sight.settings, len(sight.image.bearings)
-    known = _information(image, np.array([near[0], farthest]))
+    two, weight = image.bearings[[near[0], farthest]], image.pixel[[near[0], farthest]] ** -2.0
+    known = weight.sum() * np.eye(3) - (weight[:, None] * two).T @ two
     state, scratch = Fit(rotation, known, np.full(m, -1), np.full(m, np.inf)), np.empty((4, 3))
     fit(image, near, sight.sky, sight.reach, settings.rounds, state, scratch)
     nats = fit(image, some, sight.sky, sight.reach, settings.last_rounds, state, scratch)

@@ -29,11 +29,11 @@ def sums_near(
     order = np.argsort(key, kind="stable")
     start = np.searchsorted(key[order], np.arange(side * side + 1))
     place = np.floor((directions @ axes - low) / cell).astype(np.int64)
-    first, last = np.clip(place - 1, 0, side), np.clip(place + 2, 0, side)
+    cells = np.clip(np.stack([place - 1, place + 2], -1), 0, side)
     sums, result = np.zeros((len(radii), len(bearings))), np.empty((len(bearings), len(radii)))
     weights = np.ones(len(directions)) if weights is None else weights
     sorted_bearings = np.ascontiguousarray(bearings[order].T)
-    _add_up(sorted_bearings, start, side, directions, weights, first, last, radii**2, sharpness, sums)
+    _add_up(sorted_bearings, start, side, directions, weights, cells, radii**2, sharpness, sums)
     result[order] = sums.T
     return result
 
@@ -45,18 +45,18 @@ def _add_up(
     side: int,
     directions: Any,
     weights: Any,
-    first: Any,
-    last: Any,
+    cells: Any,
     squares: Any,
     sharpness: Any,
     sums: Any,
 ) -> None:
-    """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. first, last (n, 2): the cells
-    around each direction (n, 3), none for one far beyond the grid. sums (S, k): added to."""
+    """bearings (3, k), sorted by cell: those of (x, y) begin at start[x * side + y]. cells (n, 2, 2): the first ones in
+    x and y around each direction (n, 3), and those after the last; none for one far beyond the grid. sums (S, k): added
+    to."""
     for j in range(len(directions)):
         x, y, z = directions[j, 0], directions[j, 1], directions[j, 2]
-        for row in range(first[j, 0], last[j, 0]):
-            for i in range(start[row * side + first[j, 1]], start[row * side + last[j, 1]]):
+        for row in range(cells[j, 0, 0], cells[j, 0, 1]):
+            for i in range(start[row * side + cells[j, 1, 0]], start[row * side + cells[j, 1, 1]]):
                 dx, dy, dz = bearings[0, i] - x, bearings[1, i] - y, bearings[2, i] - z
                 squared = dx * dx + dy * dy + dz * dz
                 for s in range(len(squares) - 1, -1, -1):

@@ -134,22 +134,19 @@ def _clusters(side: Side, count: int, settings: SearchSettings, rng: np.random.G
     )
 
 
-def lloyd(
-    points: Array, centres: Array, iterations: int, weights: Array | None = None
-) -> tuple[Array, NDArray[np.float64]]:
+def lloyd(points: Array, centres: Array, iterations: int, weights: Array) -> tuple[Array, NDArray[np.float64]]:
     """Centres (k, d) after some iterations of k-means (Lloyd), and the weights of the points that were nearest to each.
 
     A centre that has lost all its points stays where it was, with the weight 0.
     """
-    mass = np.ones(len(points)) if weights is None else weights
     extended = np.column_stack([points, np.ones(len(points), points.dtype)])
     for i in range(iterations + 1):
         # |x - c|^2 without |x|^2: one product of matrices
         nearest = (extended @ np.column_stack([-2 * centres, (centres * centres).sum(1)]).T).argmin(1)
-        members = np.bincount(nearest, mass, len(centres)).astype(np.float64)
+        members = np.bincount(nearest, weights, len(centres)).astype(np.float64)
         if i == iterations:
             break
-        sums = np.stack([np.bincount(nearest, mass * axis, len(centres)) for axis in points.T], -1)
+        sums = np.stack([np.bincount(nearest, weights * axis, len(centres)) for axis in points.T], -1)
         mean = sums / np.maximum(members, 1e-12)[:, None]
         centres = np.where(members[:, None] > 0, mean, centres).astype(np.float32)
     return centres, members

@@ -277,12 +277,10 @@ def assign_sparse(
 @part
 def is_finite(rotation: Any, translation: Any) -> bool:
     """Whether a pose has neither NaN nor infinity."""
-    finite = True
+    total = F(0)
     for r in range(3):
-        for c in range(3):
-            finite = finite and math.isfinite(rotation[r, c])
-        finite = finite and math.isfinite(translation[r])
-    return finite
+        total += rotation[r, 0] + rotation[r, 1] + rotation[r, 2] + translation[r]
+    return math.isfinite(total)
 
 
 @part

@@ -136,8 +136,11 @@ class Together:
             self.take({k: search_beside(scene, pose, scene.settings.beside)}, A_TURN)
 
     def _add(self, refined: Candidates) -> None:
+        """Take up refined poses; the best one has the hits of all starts of any camera that ended there."""
         every = Candidates.concatenated([self.best, refined])
         self.best = every[self._distinct(every, -every.log10_false_alarms, REFINED)]
+        if len(self.best):
+            self.best.hits[0] = sum(int(poses.hits[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met))
 
     def _distinct(self, poses: Candidates, score: Array, count: int) -> NDArray[np.int64]:
         """The places of the best poses, of which no two show the middle of the scene to all cameras alike."""
@@ -148,10 +151,6 @@ class Together:
             distance = np.maximum(np.linalg.norm(middle, axis=-1, keepdims=True), 1e-300)
             places += [middle / distance, np.log(distance)]
         return distinct(poses.rotation, np.concatenate(places, -1), score, count, *SAME)
-
-    def _hits(self) -> int:
-        """Independent starts of all cameras that ended at the best pose."""
-        return sum(int(poses.hits[self._as_best(k, poses)].sum()) for k, poses in enumerate(self.met))
 
     def _looks(self) -> int:
         """How often its surroundings were searched in vain."""
@@ -169,7 +168,6 @@ class Together:
         """Whether chance is excluded, and that a better pose was missed."""
         if not len(self.best) or self.best.log10_false_alarms[0] > self.rule.false_alarms:
             return False
-        self.best.hits[0] = self._hits()
         strongest, seen = self._strongest()
         return missed(seen, self.rig.sets[strongest], self._looks(), self.rule) <= self.rule.missed
 
@@ -200,7 +198,6 @@ class Together:
         return replace(result, candidates=poses)
 
     def _judged(self) -> SearchResult:
-        self.best.hits[0] = self._hits()
         strongest, seen = self._strongest()
         return judged(
             seen,

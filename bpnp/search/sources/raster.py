@@ -41,11 +41,8 @@ def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None
     rule: None for those of the settings, one after the other.
     """
     rules = scene.settings.near if rule is None else (rule,)
-    starts = [starts_of(scene, prior, one) for one in rules]
-    parts = [
-        raster_search(scene, drawn_around(scene, prior, count), one) for count, one in zip(starts, rules, strict=True)
-    ]
-    return Candidates.concatenated(parts)
+    starts = (drawn_around(scene, prior, starts_of(scene, prior, one)) for one in rules)
+    return Candidates.concatenated([raster_search(scene, *each) for each in zip(starts, rules, strict=True)])
 
 
 def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
