@@ -94,10 +94,10 @@ def verify(
     if judged.degenerate is not None:
         return without_pose(judged, judged.degenerate, threshold)
     moved = translation + rotation @ judged.origin
-    claimed = judge_claim(judged.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
-    solution = finished(judged, claimed.result, time.perf_counter() - begun, threshold)
-    if not refine and solution.verdict != "failed" and len(claimed.optimum):
-        solution = replace(solution, covariance=_of_unrefined(judged, claimed.optimum, rotation, moved))
+    result, optimum = judge_claim(judged.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
+    solution = finished(judged, result, time.perf_counter() - begun, threshold)
+    if not refine and solution.verdict != "failed" and len(optimum):
+        solution = replace(solution, covariance=_of_unrefined(judged, optimum, rotation, moved))
     if given is None:
         return solution
     return replace(

@@ -10,7 +10,6 @@ for these alone: many points may have one that few starts meet.
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,14 +37,6 @@ Array = NDArray[np.float64]
 WITHIN = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand: of a claim and the optimum that it means
 
 
-class Claimed(NamedTuple):
-    """The verdict on a claimed pose, the first of the candidates. optimum: (1,) the pose beside it that the points
-    agree with best, if there is one; the first candidate itself where that was asked for."""
-
-    result: SearchResult
-    optimum: Candidates
-
-
 @one_blas_thread
 def judge_claim(
     sets: PointSets,
@@ -56,9 +47,10 @@ def judge_claim(
     seed: int = 0,
     deadline: Deadline = NEVER,
     settings: SearchSettings = DEFAULT,
-) -> Claimed:
-    """The verdict on a pose (3, 3), (3,); with `refine` on the optimum beside it, if that is the same pose: turned and
-    moved by no more than a verdict calls another one, or than the points leave open."""
+) -> tuple[SearchResult, Candidates]:
+    """The verdict on a pose (3, 3), (3,), the first of the candidates; with `refine` on the optimum beside it, if that
+    is the same pose: turned and moved by no more than a verdict calls another one, or than the points leave open. And
+    this optimum (1,), the pose beside the given one that the points agree with best, if there is one."""
     # What is far away is not asked: no starts were drawn from anywhere.
     rule = replace(settings.evidence, another=0.0)
     one = replace(sets, log10_tried=0.0)
@@ -87,7 +79,7 @@ def judge_claim(
         reason = f"a pose {off:.2g} deg away, the optimum beside it, fits better ({number(-lead)} times the number)"
         result = replace(result, verdict="ambiguous", reason=f"{_chance(claim)}, but {reason}")
     refined = refine and result.verdict == "confident"
-    return Claimed(replace(result, batches=max(looks, 1) if refined else 0), optimum)  # no last fit to the matches
+    return replace(result, batches=max(looks, 1) if refined else 0), optimum  # no last fit to the matches
 
 
 def _met(
