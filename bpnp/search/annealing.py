@@ -1,7 +1,6 @@
 """The stages of the search: starts annealed on coarse clusters, the best on finer ones, few on all points."""
 
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,22 +17,16 @@ from bpnp.search.settings import Stages
 from bpnp.search.starts import Array
 
 
-def run_batch(scene: Scene, poses: Candidates, coarse: Stages, best: Candidates) -> Candidates:
-    """One batch of starts, from clusters to all points, and beside them starts around the best poses so far."""
-    starts, middle = len(poses), scene.settings.middle
-    sides = scene.clusters([stage.clusters for stage in (*coarse, *middle)])
-    poses = anneal_on_clusters(scene, poses, coarse, sides[: len(coarse)], starts)
-    poses = Candidates.concatenated([poses, shaken(scene, best)])
-    poses = anneal_on_clusters(scene, poses, middle, sides[len(coarse) :], starts)
-    return anneal_on_points(scene, poses, middle[-1].last_scale * scene.spread)
+def run_batch(scene: Scene, starts: Candidates, coarse: Stages) -> Candidates:
+    """One batch of starts, from clusters to all points."""
+    poses = anneal_on_clusters(scene, starts, (*coarse, *scene.settings.middle), len(starts))
+    return anneal_on_points(scene, poses, scene.settings.middle[-1].last_scale * scene.spread)
 
 
-def anneal_on_clusters(
-    scene: Scene, poses: Candidates, stages: Stages, sides: Sequence[Sides], starts: int
-) -> Candidates:
-    """Poses of a batch of so many starts after stages on clusters of their own, best first, of different rotations."""
+def anneal_on_clusters(scene: Scene, poses: Candidates, stages: Stages, starts: int) -> Candidates:
+    """Poses of a batch of so many starts after stages on clusters, best first, of different rotations."""
     outlier = scene.outlier_density(scene.settings.outliers)
-    for stage, clusters in zip(stages, sides, strict=True):
+    for stage, clusters in zip(stages, scene.clusters([stage.clusters for stage in stages]), strict=True):
         kept = scene.settings.kept_by(stage, starts)
         scales = (scene.spread * np.geomspace(stage.first_scale, stage.last_scale, stage.iterations)).astype(np.float32)
         for k, part in enumerate(np.split(scales, stage.halvings)):
@@ -88,16 +81,6 @@ def anneal_on_points(
         log10_rough=np.full(len(starts), math.nan),
     )  # fmt: skip
     return best_distinct(ends[:done], scene, done)
-
-
-def shaken(scene: Scene, poses: Candidates) -> Candidates:
-    """Starts around the best poses; those of a batch that end there are no evidence for it, hence no hits."""
-    shaking = scene.settings.shaking
-    rotation, translation = (x[: shaking.poses] for x in (poses.rotation, poses.translation))
-    vectors, shifts = scene.rng.standard_normal((2, len(rotation) * shaking.copies, 3), np.float32)
-    length = np.repeat(np.linalg.norm(translation, axis=-1), shaking.copies)
-    shifts *= np.float32(shaking.translation * scene.spread) * length[:, None]
-    return turned_about_middle(scene, rotation, translation, math.radians(shaking.rotation_deg) * vectors, shifts)
 
 
 def turned_about_middle(

@@ -7,12 +7,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.loops.parallel import Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish, shaken
+from bpnp.search.annealing import anneal_on_clusters, anneal_on_points, finish
 from bpnp.search.candidates import Candidates, in_user_frame, merged
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene, degenerate
-from bpnp.search.settings import DEFAULT, SearchSettings, Stages
+from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.sources.raster import around_each
 from bpnp.search.verdict import SearchResult, judged, no_pose
 
 
@@ -25,7 +26,7 @@ def refine_poses(
     seed: int = 0,
     settings: SearchSettings = DEFAULT,
 ) -> SearchResult:
-    """The likeliest poses that annealing reaches from given ones and from poses shaken around them.
+    """The likeliest poses that annealing reaches from given ones and from poses around them.
 
     The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
     beyond `settings.refined_directly` are first annealed on clusters, as the search does, and the likeliest go on.
@@ -41,20 +42,16 @@ def refine_poses(
         return no_pose("no start, or points that fix no pose")
     crowd = len(starts)
     if crowd > settings.refined_directly:
-        starts = _on_clusters(scene, starts, (*settings.coarse, *settings.middle))
-    around = Candidates.concatenated([starts, shaken(scene, starts)])
+        starts = anneal_on_clusters(scene, starts, (*settings.coarse, *settings.middle), settings.starts)
+    around = Candidates.concatenated([starts, around_each(scene, starts[: settings.copied])])
     first_scale = settings.middle[-1].last_scale * scene.spread
-    clustered = anneal_on_points(scene, _on_clusters(scene, around, settings.middle), first_scale)
+    clustered = anneal_on_clusters(scene, around, settings.middle, settings.starts)
+    clustered = anneal_on_points(scene, clustered, first_scale)
     # A start that is right already needs no clusters, which would only shake it.
     direct = anneal_on_points(scene, starts, first_scale)
     poses = finish(scene, merged([clustered, direct], scene))
     annealed = crowd + len(around) - len(starts)
     return judged(in_user_frame(poses, scene), sets, batches=annealed, rule=settings.evidence)
-
-
-def _on_clusters(scene: Scene, poses: Candidates, stages: Stages) -> Candidates:
-    sides = scene.clusters([stage.clusters for stage in stages])
-    return anneal_on_clusters(scene, poses, stages, sides, scene.settings.starts)
 
 
 @one_blas_thread

@@ -35,7 +35,7 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
     if guess is not None:
         for number in range(settings.schedule.around):
-            yield multistart(scene, number, guess, pool.candidates)[0].without_hits()
+            yield multistart(scene, number, guess)[0].without_hits()
     if isinstance(known, PosePrior) and is_near(scene, known):
         near = _near(pool, known, proposals)
         yield from islice(near, settings.schedule.near)
@@ -51,8 +51,8 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
     scene = pool.scene
     for number in count():
         yield search_near(scene, known)
-        yield multistart_near(scene, known, pool.candidates)
-        yield multistart(scene, number, None, pool.candidates)[0]
+        yield multistart_near(scene, known)
+        yield multistart(scene, number, None)[0]
         if number == 1 and proposals is not None and pool.alarms > scene.settings.evidence.false_alarms:
             yield proposed(pool, proposals)
 
@@ -102,8 +102,7 @@ def _look(pool: Pool) -> Candidates:
 def _batches(pool: Pool, known: Prior | None) -> Iterator[tuple[Candidates, float]]:
     """Batches of starts, and their shares of a full one; every third does not know the prior, which may be wrong."""
     for number in count():
-        prior = None if number % 3 == 2 else known
-        yield multistart(pool.scene, number, prior, pool.candidates)
+        yield multistart(pool.scene, number, None if number % 3 == 2 else known)
 
 
 def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:

@@ -62,20 +62,6 @@ class FineStage:
 
 
 @dataclass(frozen=True)
-class Shaking:
-    """Starts around the best poses so far: ways out of a narrow optimum beside a better one.
-
-    poses: that are shaken. copies: of each. rotation_deg, translation: standard deviations; the latter in spreads of
-    the bearings times the depth. Both are about what separates the optima of one basin.
-    """
-
-    poses: int = 4
-    copies: int = 6
-    rotation_deg: float = 6.0
-    translation: float = 0.1
-
-
-@dataclass(frozen=True)
 class Draws:
     """How many starts are drawn around a rough pose.
 
@@ -216,6 +202,8 @@ class SearchSettings:
     end_scale: where the last stage begins, in scales of the pose; wide enough to let other points in.
     finished: candidates that are weighed after each batch, and annealed on all bearings in the end. kept: candidates,
         from turn to turn. refined_directly: starts of `refine_poses` that need no clusters.
+    copied, copies, copied_scale: of the first so many poses that come from elsewhere, so many copies are annealed too,
+        whose points fall so many spreads of the bearings beside its own: about what separates optima of one basin.
     same_deg, same_shift: poses closer than both, in degrees and extents of the scene, are one.
     bulk: in median distances from the median; 3D points further off decide neither the origin nor the unit of length.
     sampled, lloyd_iterations: points a cluster from which cluster centres are computed, and iterations.
@@ -234,7 +222,6 @@ class SearchSettings:
         ClusterStage(256, 0.062, 0.04, iterations=7, kept=10, apart_deg=1.0),
     )
     fine: FineStage = FineStage()
-    shaking: Shaking = Shaking()
     near: tuple[RasterSearch, ...] = tuple(
         RasterSearch(screens=Screens((100, 1000)), narrowing=Narrowing(first, points=600), annealed=12)
         for first in (0.06, 0.03)  # the finer one where keypoints are dense and few points are seen
@@ -260,6 +247,9 @@ class SearchSettings:
     least_outliers: float = 0.02
     finished: int = 3
     refined_directly: int = 8
+    copied: int = 4
+    copies: int = 6
+    copied_scale: float = 0.1
     end_scale: float = 2.0
     kept: int = 8
     same_deg: float = 3.0

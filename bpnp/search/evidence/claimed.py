@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_points, finish, shaken
+from bpnp.search.annealing import anneal_on_points, finish
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
@@ -29,7 +29,7 @@ from bpnp.search.point_sets import SIGMAS, PointSets
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.sources.multistart import multistart
-from bpnp.search.sources.raster import search_beside
+from bpnp.search.sources.raster import around_each, search_beside
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 
@@ -90,7 +90,7 @@ def _met(
     scene = Scene(sets, seed, settings, deadline)
     start = in_scene_frame(claim, scene)
     wide = settings.middle[-1].last_scale * scene.spread
-    around = Candidates.concatenated([start, shaken(scene, start), _mirrored(scene, start)])
+    around = Candidates.concatenated([start, around_each(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
     exhaustive, looks = False, 0
     if is_enumerable(sets):
@@ -101,7 +101,7 @@ def _met(
         parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
         looks += not deadline.passed()
     for batch in range(0 if exhaustive else settings.schedule.claimed):
-        parts.append(multistart(scene, batch, None, merged(parts, scene))[0])
+        parts.append(multistart(scene, batch, None)[0])
     poses = finish(scene, merged(parts, scene), settings.finished)
     return in_user_frame(poses, scene), looks, exhaustive
 

@@ -13,22 +13,19 @@ from bpnp.search.sources.raster import distance_of, drawn_around
 from bpnp.search.starts import PosePrior, Prior, draw_poses
 
 
-def multistart(scene: Scene, number: int, prior: Prior | None, best: Candidates) -> tuple[Candidates, float]:
-    """Distinct poses of one batch of starts, counted from 0, and its share of a full one.
-
-    best: poses found before; copies of the first ones, moved a little, are annealed beside the starts.
-    """
+def multistart(scene: Scene, number: int, prior: Prior | None) -> tuple[Candidates, float]:
+    """Distinct poses of one batch of starts, counted from 0, and its share of a full one."""
     settings = scene.settings
     recipe = settings.recipes[number % len(settings.recipes)]
     drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
     poses = Candidates.unscored(*drawn, hits=1)
-    return run_batch(scene, poses, settings.coarse, best), len(poses) / settings.starts
+    return run_batch(scene, poses, settings.coarse), len(poses) / settings.starts
 
 
-def multistart_near(scene: Scene, prior: PosePrior, best: Candidates) -> Candidates:
+def multistart_near(scene: Scene, prior: PosePrior) -> Candidates:
     """Distinct poses of a full batch of starts drawn from a rough pose with a translation."""
     poses = drawn_around(scene, prior, scene.settings.starts)
-    return run_batch(scene, poses, cooled(scene.settings.coarse, prior, scene), best)
+    return run_batch(scene, poses, cooled(scene.settings.coarse, prior, scene))
 
 
 def cooled(stages: Stages, prior: PosePrior, scene: Scene) -> Stages:

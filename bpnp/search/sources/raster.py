@@ -143,6 +143,11 @@ def moved(scene: Scene, poses: Candidates, scale: float, copies: int) -> Candida
     return replace(copied, hits=poses.hits.repeat(copies))
 
 
+def around_each(scene: Scene, poses: Candidates) -> Candidates:
+    """Copies of poses that come from elsewhere; those that end alike are no evidence, hence no hits."""
+    return moved(scene, poses, scene.settings.copied_scale, scene.settings.copies).without_hits()
+
+
 def looked_up(
     scene: Scene, poses: Candidates, shape: RasterShape, scale: float, points: int, kept: int, family: int = 1
 ) -> tuple[Candidates, NDArray[np.int64]]:
