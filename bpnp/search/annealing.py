@@ -17,10 +17,11 @@ from bpnp.search.settings import Stages
 from bpnp.search.starts import Array
 
 
-def run_batch(scene: Scene, starts: Candidates, coarse: Stages) -> Candidates:
+def run_batch(scene: Scene, starts: Candidates) -> Candidates:
     """One batch of starts, from clusters to all points."""
-    poses = anneal_on_clusters(scene, starts, (*coarse, *scene.settings.middle), len(starts))
-    return anneal_on_points(scene, poses, scene.settings.middle[-1].last_scale * scene.spread)
+    stages = *scene.settings.coarse, *scene.settings.middle
+    poses = anneal_on_clusters(scene, starts, stages, len(starts))
+    return anneal_on_points(scene, poses, stages[-1].last_scale * scene.spread)
 
 
 def anneal_on_clusters(scene: Scene, poses: Candidates, stages: Stages, starts: int) -> Candidates:

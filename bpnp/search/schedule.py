@@ -2,7 +2,7 @@
 
 | the best pose so far            | turn after turn                                                            |
 |---------------------------------|----------------------------------------------------------------------------|
-| near a rough prior              | raster search, annealing of starts, a batch of starts from anywhere        |
+| near a rough prior              | raster search, a batch of starts from anywhere                             |
 | does not exceed chance          | batches from anywhere; then in turns: raster searches around the likeliest |
 |                                 | poses, within the cones of the points, around a network's proposals, and   |
 |                                 | two batches more                                                           |
@@ -22,7 +22,7 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.unseen import far_missed, near_missed
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
-from bpnp.search.sources.multistart import multistart, multistart_near
+from bpnp.search.sources.multistart import multistart
 from bpnp.search.sources.raster import admitted, is_near, raster_search, search_beside, search_everywhere, search_near
 from bpnp.search.starts import PosePrior, Prior
 
@@ -51,7 +51,6 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
     scene = pool.scene
     for number in count():
         yield search_near(scene, known)
-        yield multistart_near(scene, known)
         yield multistart(scene, number, None)[0]
         if number == 1 and proposals is not None and pool.alarms > scene.settings.evidence.false_alarms:
             yield proposed(pool, proposals)

@@ -33,7 +33,7 @@ def warm_up() -> None:
     search_rotation(Image(rays, np.full(POINTS, 1e-3)), rays)
     scene = Scene(sets, 0, DEFAULT)
     start = Candidates.unscored(*scene.enter(np.eye(3)[None], np.array([[0, 0, 6.0]])))
-    run_batch(scene, start, DEFAULT.coarse)
+    run_batch(scene, start)
     looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale
     looked_up(scene, start, *looks, POINTS, 1)
     best_shifts(start, raster_of(scene, *looks), scene.seen_points(POINTS))
