@@ -87,11 +87,6 @@ class Pool:
         """log10 of the fewest false alarms of a pose."""
         return float(np.nanmin(self.candidates.log10_false_alarms, initial=np.inf))
 
-    @property
-    def leader(self) -> Candidates:
-        """The best pose, in the scene's frame."""
-        return in_scene_frame(self.leaders()[:1], self.scene)
-
     def looks(self, leaders: Candidates) -> int:
         """How often the surroundings of the first one, in the user's frame, were searched in vain."""
         if not len(leaders) or not len(self.surrounded):

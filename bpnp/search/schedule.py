@@ -18,7 +18,7 @@ from itertools import count, islice
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.candidates import Candidates
+from bpnp.search.candidates import Candidates, in_scene_frame
 from bpnp.search.evidence.unseen import far_missed, near_missed
 from bpnp.search.pool import Pool
 from bpnp.search.sources.cones import within_cones
@@ -94,7 +94,8 @@ def _sure(pool: Pool, batches: Iterator[Candidates]) -> Iterator[Candidates]:
 
 def _look(pool: Pool) -> Candidates:
     """A raster search around the best pose."""
-    pool.look_around(leader := pool.leader)
+    leader = in_scene_frame(pool.leaders()[:1], pool.scene)
+    pool.look_around(leader)
     return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 

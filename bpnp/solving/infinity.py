@@ -63,8 +63,9 @@ def solve_directions(
     if unknown is None:
         return seen_by(lens)
     ends = list[Solution]()
+    rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
     for rung in unknown.ladder(DEFAULT.zoom):
-        found, camera = seen_by(rung, DEFAULT.of_a_rung()), rung
+        found, camera = seen_by(rung, rough), rung
         for _ in range(DEFAULT.zoom_rounds if found.verdict != "failed" else 0):
             before, camera = camera.focal, _fitted(camera, image, scene, found)
             found = seen_by(camera)

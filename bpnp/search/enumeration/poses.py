@@ -101,11 +101,6 @@ class Enumeration:
         """Evidence of the best pose, nats."""
         return float(self.kept.evidence.max())
 
-    @property
-    def best_pose(self) -> Array:
-        """(4, 3), in these frames."""
-        return self.kept.poses[int(self.kept.evidence.argmax())]
-
     def seconds_to_begin(self, stage: Stage) -> float:
         """About how long the sets of a stage take to build."""
         image, scene = (
@@ -152,7 +147,7 @@ class Enumeration:
         """Refine the best pose again on wider matches."""
         if math.isfinite(self.best):
             for reach in (0.5 * self.reach, self.reach):
-                self.refine(self.best_pose, reach)
+                self.refine(self.kept.poses[int(self.kept.evidence.argmax())], reach)
 
     def refine(self, pose: Array, reach: float) -> None:
         """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""

@@ -1,6 +1,6 @@
 """Every constant that tunes the search for a rotation, in one argument: what it is, its unit, and why."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,6 @@ class InfinitySettings:
     zoom_share: float = 0.4
     zoom_rounds: int = 6
     zoom_same: float = 1e-4
-
-    def of_a_rung(self) -> "InfinitySettings":
-        """These settings where the focal length is only about right."""
-        return replace(self, noise=(self.zoom_noise,), least_share=self.zoom_share)
 
 
 DEFAULT = InfinitySettings()
