@@ -275,8 +275,7 @@ class SceneMap:
                 regions = partial(self._regions, views, solution.camera)
                 photo = Photo(used, solution.camera, every, regions, seed, deadline)
                 if isinstance(lens, Camera):
-                    fitted = on_all_points(solution, photo)
-                    solution = solution if fitted is None else counted(fitted, tries)
+                    solution = on_all_points(solution, photo, tries)
                 if prior is None and solution.verdict == "confident":  # a prior would tell twins apart
                     search = partial(near, photo.camera, options)
                     photo = photo if views is None else replace(photo, place=region)

@@ -191,8 +191,8 @@ class SearchSettings:
         no gap of 25 deg. first_starts: of the first batch; each next one has twice as many until it is full. Easy
         problems need no more. A small batch hands on the square root of its share of a full one from stage to stage,
         and least_kept at least.
-    near, beside, proposed, everywhere: raster searches around a prior, around a pose that was met, from proposed poses,
-        and from poses of all rotations.
+    near, beside, zoomed, proposed, everywhere: raster searches around a prior, around a pose that was met, around one
+        that is a step of the focal length away, from proposed poses, and from poses of all rotations.
     most_volumes: of a prior against the widest that has as many starts as it needs; a map view's has 9. admitted:
         standard deviations of a prior within which a proposed pose is tried, 94 % of those drawn from it.
     least_annealed: points of the smaller side; fewer are enumerated only: they have no smooth optimum.
@@ -231,6 +231,12 @@ class SearchSettings:
         Screens((50, 300), (2**11, 2**8)),
         Narrowing(0.08, 0.015, points=600),
         annealed=12,
+    )
+    zoomed: RasterSearch = RasterSearch(
+        Draws(2**10, 3.0, 0.04, 2**10),
+        Screens((300,), (2**5,)),
+        Narrowing(0.04, 0.015, steps=3, points=600),
+        annealed=3,
     )
     proposed: RasterSearch = RasterSearch()
     everywhere: RasterSearch = RasterSearch(

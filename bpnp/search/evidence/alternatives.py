@@ -46,8 +46,13 @@ def other_pose(candidates: Candidates, sets: PointSets, rule: Evidence) -> Alter
         return None
     k = int(others[np.argmin(candidates.log10_false_alarms[others])])
     decades = float(candidates.log10_false_alarms[k] - candidates.log10_false_alarms[0])
-    what = f"a pose {_degrees(candidates, k):.0f} deg away fits about as well ({number(decades)} times the number)"
-    return Alternative(decades, what)
+    return fits_as_well(candidates.rotation[0], candidates.rotation[k], decades)
+
+
+def fits_as_well(rotation: Array, other: Array, decades: float) -> Alternative:
+    """A different pose, whose false alarms are so many decades above those of the first one."""
+    off = math.degrees(turned_by(rotation, other))
+    return Alternative(decades, f"a pose {off:.0f} deg away fits about as well ({number(decades)} times the number)")
 
 
 def rougher(candidates: Candidates) -> Alternative | None:

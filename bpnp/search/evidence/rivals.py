@@ -4,17 +4,18 @@ those beside it at other focal lengths."""
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.annealing import anneal_on_points, polished
+from bpnp.search.annealing import polished
 from bpnp.search.candidates import Candidates, in_user_frame
-from bpnp.search.evidence.alternatives import of_misfit
+from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.partners import Zoomed, with_focal_length
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
-from bpnp.search.evidence.settings import Evidence
+from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.scene import Scene
@@ -38,12 +39,25 @@ def against_rivals(
 
     The camera is believed as it was given unless another focal length, which is paid for as an unknown, has fewer false
     alarms by the factor `rule.focal_chance`."""
-    result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
-    if result.verdict != "confident" or sets.focal is not None:
+    result = against_repetitions(result, sets, entered, rule, looks, exhaustive)
+    if result.verdict != "confident":
         return result
-    count = match_count(result.candidates, sets)
-    if count < rule.zoomed.fewest:
-        return result
+    other = other_camera(result, sets, entered, rule)
+    return result if other is None else replace(result, verdict="ambiguous", reason=doubted(result.reason, other))
+
+
+def doubted(reason: str, other: Alternative) -> str:
+    """The reason of a confident pose with what speaks against it."""
+    return f"{reason.split(', and no alternative')[0]}, but {other.what}"
+
+
+def other_camera(
+    result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence
+) -> Alternative | None:
+    """Another focal length with which a different pose fits better than the best one, by the factor `focal_chance`
+    though it is paid for as an unknown; None if there is none, or too few matches to tell."""
+    if sets.focal is not None or match_count(result.candidates, sets) < rule.zoomed.fewest:
+        return None
     rotation, translation = result.best
     middle = rotation @ sets.middle + translation
     most = result.log10_false_alarms + math.log10(rule.focal_chance)
@@ -51,68 +65,72 @@ def against_rivals(
         if other is not None and _alarms(sets, other, rule) < most:
             better = of_misfit(misfit_of(rotation, middle, other), rule)
             if better is not None:
-                chance = result.reason.split(", and no alternative")[0]
-                return replace(result, verdict="ambiguous", reason=f"{chance}, but {better.what}")
-    return result
+                return better
+    return None
 
 
 def _at_other_focal_lengths(
     result: SearchResult, sets: PointSets, middle: Array, entered: Callable[[], Scene], rule: Evidence
 ) -> Iterator[Zoomed | None]:
     """Poses with the focal lengths that fit them best: of Gauss-Newton steps from the best pose itself, and from the
-    likeliest of those that annealing reaches from it at other focal lengths.
+    likeliest of those that are found beside it at other focal lengths.
 
-    The latter only where three matches may be coincidences: else the steps meet what there is. Where they rather are
-    than not, poses are looked for around it there. middle: (3,) of the scene, seen from the camera.
+    The latter only where three matches may be coincidences: else the steps meet what there is. middle: (3,) of the
+    scene, seen from the camera.
     """
     rotation, scale = result.best[0], max(result.residual, sets.image.scales[0])
     yield with_focal_length(sets, rotation, middle, scale)
     decades = -result.log10_false_alarms / match_count(result.candidates, sets)
     if -rule.independent * decades > rule.missed:
-        scene = entered()
-        vague = 10 ** (-rule.independent * decades) > 0.5
-        zooms = [
-            (zoom, *near_focal_length(sets, rotation, middle, zoom, scale, scene, looks=vague))
-            for zoom in rule.zoomed.zooms
-        ]
-        zoom, there, poses = max(zooms, key=lambda one: _likelihood(*one[1:]))
-        if not len(poses):  # after the deadline
-            return
-        seen = poses.rotation[0] @ sets.middle + poses.translation[0]
-        fitted = with_focal_length(there, poses.rotation[0], seen, max(float(poses.scale[0]), there.image.scales[0]))
-        yield None if fitted is None else fitted._replace(zoom=zoom * fitted.zoom)
+        best = _likeliest_zoom(_Found(1.0, sets, rotation, middle, scale), entered(), rule.zoomed)
+        fitted = with_focal_length(best.sets, best.rotation, best.middle, max(best.scale, best.sets.image.scales[0]))
+        yield None if fitted is None else fitted._replace(zoom=best.zoom * fitted.zoom)
 
 
-def near_focal_length(
-    sets: PointSets, rotation: Array, middle: Array, zoom: float, scale: float, scene: Scene, *, looks: bool = False
-) -> tuple[PointSets, Candidates]:
-    """The points at `zoom` times the focal length, and the pose that annealing reaches there from the one that sees the
-    scene as large, by some of the bearings, or the likeliest of those that a look around that one meets; none after the
-    deadline.
+class _Found(NamedTuple):
+    """A pose at `zoom` times the focal length, the points there, and its likelihood: of the bearings, nats each,
+    against an even density over the view. middle: (3,) of the scene, seen from the camera."""
 
-    middle: (3,) of the scene, seen from the camera. scale: of the residuals, radians. scene: whose settings and
-    deadline hold.
-    """
-    zoomed, settings = at_focal_length(sets, zoom), scene.settings
-    rule = settings.evidence.zoomed
-    few = replace(settings, fine=replace(settings.fine, bearings=rule.bearings))
-    there = Scene(zoomed, 0, settings if looks else few, scene.deadline)
-    wide = max(scale, rule.width * abs(math.log(zoom)) * sets.image.spread)
-    poses = rotation[None], (middle * (1, 1, zoom) - rotation @ sets.middle)[None]
-    start = Candidates.unscored(*there.enter(*poses))
-    ends = search_beside(there, start, settings.beside) if looks else anneal_on_points(there, start, 2 * wide)
-    return zoomed, in_user_frame(ends[:1], there)
+    zoom: float
+    sets: PointSets
+    rotation: Array
+    middle: Array
+    scale: float
+    likelihood: float = -math.inf
 
 
-def _likelihood(sets: PointSets, poses: Candidates) -> float:
-    """Of the bearings under the first pose, nats each, against an even density over the view; -inf without a pose."""
-    return float(poses.score[0]) + math.log(sets.image.solid_angle) if len(poses) else -math.inf
+def _likeliest_zoom(start: _Found, scene: Scene, rule: OtherFocal) -> _Found:
+    """The likeliest pose at other focal lengths: of a step to either side the likelier one, and farther on that side
+    while it grows likelier. scene: whose settings and deadline hold."""
+    step, best = max(
+        ((step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)), key=lambda x: x[1][-1]
+    )
+    while 1 / rule.widest < best.zoom * step < rule.widest:
+        further = beside(best, step, scene)
+        if further.likelihood <= best.likelihood:
+            break
+        best = further
+    return best
+
+
+def beside(found: _Found, zoom: float, scene: Scene) -> _Found:
+    """The likeliest pose at `zoom` times the focal length of one, beside that which sees the scene as large; the pose
+    itself after the deadline."""
+    sets = at_focal_length(found.sets, zoom)
+    there = Scene(sets, 0, scene.settings, scene.deadline)
+    shift = found.middle * (1, 1, zoom) - found.rotation @ sets.middle
+    start = Candidates.unscored(*there.enter(found.rotation[None], shift[None]))
+    poses = in_user_frame(search_beside(there, start, scene.settings.zoomed)[:1], there)
+    if not len(poses):
+        return found
+    rotation, likelihood = poses.rotation[0], float(poses.score[0]) + math.log(sets.image.solid_angle)
+    middle = rotation @ sets.middle + poses.translation[0]
+    return _Found(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
 
 
 def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:
     """log10 of the false alarms of a pose whose focal length is a seventh unknown."""
-    span = math.log(max(rule.zoomed.zooms) / min(rule.zoomed.zooms))
-    zoomed = replace(at_focal_length(sets, other.zoom), focal=UnknownFocal(span))
+    zoomed = replace(at_focal_length(sets, other.zoom), focal=UnknownFocal(2 * math.log(rule.zoomed.widest)))
     translation = other.middle - other.rotation @ sets.middle
     return float(alarms_of(zoomed, other.rotation[None], translation[None]).own[0])
 
@@ -123,7 +141,7 @@ def at_focal_length(sets: PointSets, zoom: float) -> PointSets:
     return replace(sets, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
 
 
-def _against_repetitions(
+def against_repetitions(
     result: SearchResult,
     sets: PointSets,
     entered: Callable[[], Scene],
@@ -131,6 +149,7 @@ def _against_repetitions(
     looks: int,
     exhaustive: bool,
 ) -> SearchResult:
+    """A confident result beside the poses that a repeated structure would confuse with it; the best of them first."""
     if result.verdict != "confident":
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
@@ -145,4 +164,4 @@ def _against_repetitions(
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside
-    return _against_repetitions(beside, sets, entered, rule, looks, exhaustive)
+    return against_repetitions(beside, sets, entered, rule, looks, exhaustive)

@@ -71,14 +71,12 @@ class Repetitions:
 class OtherFocal:
     """Where another focal length is looked for beside a confident pose (`bpnp.search.evidence.rivals`).
 
-    zooms: over the given one, at which a pose is annealed. width: of the residuals to anneal from, shares of the
-    bearings' spread and of the logarithm of the zoom: a scene is a few tenths as deep as wide. bearings: that are
-    annealed, and that most steps of the focal length are fitted to. fewest: matches; of fewer a seventh unknown
-    explains too much.
+    step: factor from one that is tried to the next; widest: the last one. bearings: that most steps of the focal length
+    are fitted to. fewest: matches; of fewer a seventh unknown explains too much.
     """
 
-    zooms: tuple[float, ...] = (0.66, 0.73, 0.81, 0.9, 1.11, 1.23, 1.37, 1.52)
-    width: float = 0.05
+    step: float = 1.08
+    widest: float = 1.6
     bearings: int = 400
     fewest: int = 24
 
