@@ -1,6 +1,5 @@
 """A map to localise photos in: the points and views of a COLMAP reconstruction."""
 
-import math
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -39,7 +38,7 @@ from bpnp.maps.ranking import RUNG, STEP, Pictures, pictures_of_views, places_fi
 from bpnp.maps.twins import without_twins
 from bpnp.maps.views import Array, Cones, View, viewing_cones
 from bpnp.search.starts import PosePrior
-from bpnp.solving.arguments import check_inside, pixels_from, source_from
+from bpnp.solving.arguments import check_inside, pixels_from, positive, source_from
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options
@@ -248,12 +247,10 @@ class SceneMap:
         if image_size is not None:
             check_inside(pixels, image_size)
         views = None if views is None else list(views)
-        if time_limit is not None and not 0 < time_limit < math.inf:
-            raise ValueError(f"expected a positive `time_limit`, got {time_limit}")
+        deadline = Deadline.after(positive("time_limit", time_limit))
         strongest = None if scores is None else strongest_of(scores, np.shape(pixels)[:1])
         used = pixels if strongest is None else np.asarray(pixels)[strongest]
         module, places = source_from(solver), self.places(views, used, lens)
-        deadline = Deadline(math.inf if time_limit is None else start + time_limit)
         met, tries = list[Solution](), len(places)
 
         def near(camera: Any, options: Options, region: Region, expected: PosePrior | None) -> Solution:
@@ -262,12 +259,11 @@ class SceneMap:
         waiting, longer = deque((place, rule) for rule in (BRIEF, ONCE) for place in places), set[str]()
         while waiting:
             place, settings = waiting.popleft()
-            remaining = None if time_limit is None else time_limit - (Clock.now() - start)
-            if best and remaining is not None and remaining <= 0:
+            limit = deadline.at - Clock.now()
+            if best and limit <= 0:
                 break
-            limit = None if remaining is None else max(remaining, 1e-3)
             asks = solver == "auto" and settings is LONGER  # not of every view of the map
-            options = Options(module, asks, seed=seed, time_limit=limit, settings=settings, until=deadline)
+            options = Options(module, asks, seed=seed, time_limit=max(limit, 1e-3), settings=settings, until=deadline)
             region = self._region(place.view, place.points)
             solution = near(place.lens, options, region, prior)
             if solution.verdict == "confident":
