@@ -61,8 +61,9 @@ def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> f
 
 def share_bound(covariance: Array, free: float) -> float:
     """Share by which a number may be wrong of whose logarithm this is the variance (1, 1), exceeded once in a
-    thousand."""
-    return math.expm1(exceeded_once(covariance, free))
+    thousand; infinite where it may be anything."""
+    with np.errstate(over="ignore"):
+        return float(np.expm1(exceeded_once(covariance, free)))
 
 
 def exceeded_once(covariance: Array, free: float) -> float:
