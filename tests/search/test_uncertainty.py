@@ -38,7 +38,7 @@ def sigma_of(sets: PointSets, rotation: Array, translation: Array) -> float:
 @pytest.mark.parametrize(("variance", "bound"), [(1e-4, math.expm1(0.03416)), (1e9, math.inf)])
 def test_a_share_may_be_without_bound(variance: float, bound: float) -> None:
     """Of 80 degrees of freedom: Student's t is beyond 3.416 standard deviations once in a thousand."""
-    assert share_bound(np.array([[variance]]), 80) == pytest.approx(bound, rel=1e-3)
+    assert share_bound(np.array([[variance]]), 80.0) == pytest.approx(bound, rel=1e-3)
 
 
 def test_bounds_are_exceeded_once_in_a_thousand() -> None:
