@@ -76,7 +76,7 @@ class Answering(torch.nn.Module):
         return Prediction(poses={"fixed": self.pose})
 
 
-def padded(scenes: Sequence[Planted]) -> Batch:
+def padded(scenes: Sequence[Planted | Batch]) -> Batch:
     """The first pair of each, of different sizes, padded to the largest."""
     fields = ("points2d", "points3d", "rotation", "translation", "match3d")
     return Batch.from_arrays(*([getattr(scene, name)[0] for scene in scenes] for name in fields))

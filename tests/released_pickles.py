@@ -1,5 +1,6 @@
 """Planted pairs in the layout of the authors' pickles."""
 
+import os
 import pickle
 from pathlib import Path
 
@@ -8,6 +9,13 @@ from planted import seen
 from scipy.spatial.transform import Rotation
 
 Sample = dict[str, np.ndarray]
+
+
+class Exploit:
+    """Runs a command as it is unpickled."""
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return os.system, ("touch hacked",)
 
 
 def sample(seed: int, *, tiled: int = 40) -> Sample:

@@ -9,7 +9,8 @@ import torch
 from lightning import LightningModule, Trainer
 from torch import Tensor, nn, optim
 
-from bpnp import BPnPNet
+from bpnp import BPnPNet, Matcher
+from bpnp.datamodules import MeshDataModule
 from bpnp.datamodules.shapes import Mesh, procedural_shape
 from bpnp.geometry import project, transform
 from bpnp.layers import RansacPnP
@@ -17,9 +18,10 @@ from bpnp.models import Refinement
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.types import Batch
 
-SMALL_NET = ["--model.solver=bpnp.models.BPnPNet"] + [
+SMALL_FEATURES = [
     f"--model.solver.features{side}.{size}" for side in ("2d", "3d") for size in ("channels=16", "depth=2")
 ]
+SMALL_NET = ["--model.solver=bpnp.models.BPnPNet", *SMALL_FEATURES]
 SMALL_MESHES = [
     "--data.num_points=24",
     "--data.pool_size=64",
@@ -29,6 +31,7 @@ SMALL_MESHES = [
     "--data.train_problems=24",
     "--data.batch_size=4",
 ]
+MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 
 
 def small_net(
@@ -55,10 +58,26 @@ def small_net(
     )
 
 
+def small_matcher(frame: str = "any") -> Matcher:
+    """An untrained Matcher in float64 in which every part has an effect."""
+    torch.manual_seed(0)
+    net = Matcher(channels=16, depth=2, heads=2, neighbours=3, frame=frame).double().eval()  # type: ignore[arg-type]
+    if net.seen is not None:
+        nn.init.normal_(net.seen.weight)  # zero until it is trained
+    return net
+
+
 def quiet_trainer(folder: Path, **settings: Any) -> Trainer:
     """A trainer on the CPU that prints nothing and, unless told to, writes nothing."""
     off = ("logger", "enable_checkpointing", "enable_progress_bar", "enable_model_summary", "num_sanity_val_steps")
     return Trainer(**dict.fromkeys(off, False) | {"default_root_dir": folder, "accelerator": "cpu"} | settings)
+
+
+def small_meshes(cache: Path, **settings: object) -> MeshDataModule:
+    """The data of MESHES, or with other settings."""
+    given = (option.removeprefix("--data.").split("=") for option in SMALL_MESHES)
+    numbers = {name: int(value) for name, value in given}
+    return MeshDataModule(**(numbers | {"cache_dir": str(cache)} | settings))  # type: ignore[arg-type]
 
 
 def check_pairs(batch: Batch, tolerance: float = 2e-6) -> None:
@@ -94,12 +113,10 @@ class Recorder(LightningModule):
         return optim.SGD(self.parameters(), lr=0.1)
 
 
-def recorded(data: object, *, checkpoint: Path | None = None, **options: object) -> list[Batch]:
-    """The batches that a Trainer on the CPU trains on."""
-    quiet = dict.fromkeys(("logger", "enable_progress_bar", "enable_checkpointing", "enable_model_summary"), False)
+def recorded(data: object, folder: Path, *, checkpoint: Path | None = None, **options: object) -> list[Batch]:
+    """The batches that a quiet trainer trains on."""
     recorder = Recorder()
-    trainer = Trainer(accelerator="cpu", **(quiet | options))  # type: ignore[arg-type]
-    trainer.fit(recorder, data, ckpt_path=checkpoint)  # type: ignore[arg-type]
+    quiet_trainer(folder, **options).fit(recorder, data, ckpt_path=checkpoint)  # type: ignore[arg-type]
     return recorder.batches
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from small_data import SMALL_NET
+from small_data import SMALL_FEATURES
 
 from bpnp.cli import main
 
@@ -16,7 +16,6 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
 NUMBER = re.compile(r"-?\d+\.?\d*(?:e-?\d+)?")
 VALUE = re.compile(rf"(?<!\w){NUMBER.pattern}(?!\.?\w)")  # not the number within a name such as 04.png
 SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 2}}
-SMALLER = [argument for argument in SMALL_NET if "=bpnp" not in argument]
 
 
 def run(language: str, code: str, names: dict[str, Any]) -> None:
@@ -28,7 +27,7 @@ def run(language: str, code: str, names: dict[str, Any]) -> None:
         words = shlex.split(line.replace("--limit 10", "--limit 2 --time_limit 2"))
         assert words[0] == "bpnp"
         if words[1] in ("fit", "test"):
-            words += ["--config", "short.yaml", "--data.num_workers", "0", *SMALLER]
+            words += ["--config", "short.yaml", "--data.num_workers", "0", *SMALL_FEATURES]
         main(words[1:])
 
 

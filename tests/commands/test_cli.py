@@ -9,12 +9,10 @@ from pathlib import Path
 
 import docstring_parser
 import pytest
-from small_data import SMALL_MESHES, SMALL_NET, write_mesh_tree
+from small_data import MESHES, SMALL_NET, write_mesh_tree
 
 from bpnp.cli import COMMANDS, main
 from bpnp.files import claimed
-
-MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 
 
 def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,13 +10,12 @@ import yaml
 from authors_network import Released, checkpoint
 from planted_model import plant_model
 from released_pickles import sample, write
-from small_data import SMALL_NET, write_mesh_tree
+from small_data import SMALL_FEATURES, write_mesh_tree
 
 from bpnp.cli import main
 
 ROOT = Path(__file__).parents[2]
 SHORT = {"trainer": {"max_epochs": 1, "limit_train_batches": 1, "limit_val_batches": 1, "limit_test_batches": 1}}
-QUICK = [argument for argument in SMALL_NET if "=bpnp" not in argument]
 
 
 def commands(heading: str) -> list[list[str]]:
@@ -62,6 +61,6 @@ def test_the_commands_run_as_written(
             words += [] if words[1] == "authors" else ["--processes", "1"]
         elif words[0] != "convert-weights":
             words += ["--config", "short.yaml", "--data.num_workers", "0", "--data.batch_size", "2"]
-            words += [] if released else QUICK
+            words += [] if released else SMALL_FEATURES
         main(words)
     assert list(tmp_path.glob("runs/*/test/summary.json"))

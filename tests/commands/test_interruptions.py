@@ -8,28 +8,22 @@ from typing import Any
 import pytest
 import torch
 from lightning.pytorch import Callback
-from small_data import SMALL_MESHES, SMALL_NET
+from small_data import MESHES, SMALL_NET
 
 from bpnp.cli import main
 from bpnp.report import read_results
 from bpnp.report.points import read_points
 from bpnp.training.callbacks import SafeCheckpointIO
 
-MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
-
 
 class Stop(Callback):
     """Ctrl-C after the second batch."""
 
-    def on_train_batch_end(self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+    def on_train_batch_end(self, trainer: Any, module: Any, outputs: Any, batch: Any, batch_idx: int, *_: int) -> None:
         if batch_idx == 1:
             raise KeyboardInterrupt
 
-    def on_test_batch_end(
-        self, trainer: Any, pl_module: Any, outputs: Any, batch: Any, batch_idx: int, *_: int
-    ) -> None:
-        if batch_idx == 1:
-            raise KeyboardInterrupt
+    on_test_batch_end = on_train_batch_end
 
 
 def arguments(command: str, folder: Path) -> list[str]:

@@ -8,21 +8,18 @@ from typing import Any
 
 import pytest
 import torch
-import yaml
 from lightning import LightningModule
-from small_data import SMALL_MESHES, SMALL_NET
+from small_data import MESHES, SMALL_NET, small_meshes
 from torch import Tensor, nn
 
 import bpnp.cli as cli
 import bpnp.commands.parser as parser
 from bpnp import BPnPNet, Matcher
 from bpnp.cli import main
-from bpnp.datamodules import MeshDataModule
 from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
 from bpnp.solving.arguments import checked_prior, source_from
 
-MESHES = ["--data=bpnp.datamodules.MeshDataModule", *SMALL_MESHES]
 SHORT = ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1"]
 seen: list[Any] = []
 
@@ -112,8 +109,7 @@ def test_solver_and_metric_of_the_contributing_guide(
     config = tmp_path / "metric.yaml"
     config.write_text("trainer:\n  callbacks:\n  - class_path: of_the_guide.DistanceError\n")
     main(["test", f"--config={config}", "--model.solver=of_the_guide.InFront", *MESHES, *folders(tmp_path)])
-    options = dict(option.removeprefix("--data.").split("=") for option in SMALL_MESHES)
-    data = MeshDataModule(cache_dir=str(tmp_path), **{name: yaml.safe_load(text) for name, text in options.items()})
+    data = small_meshes(tmp_path)
     data.setup("test")
     away = torch.cat([batch.translation.norm(dim=-1) for batch in data.test_dataloader()])
     (said,) = (text for text in caplog.messages if text.startswith("logged: "))

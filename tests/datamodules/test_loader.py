@@ -114,7 +114,7 @@ def test_lightning_resumes_with_the_pairs_that_were_left(tmp_path: Path, workers
         """ "epoch:index" of each problem of each batch."""
         options = {"max_epochs": 2, "enable_checkpointing": bool(callbacks), "callbacks": list(callbacks)}
         data = Problems(batch_size=6, seed=3, num_workers=workers)
-        batches = recorded(data, checkpoint=checkpoint, limit_val_batches=0, **options)
+        batches = recorded(data, tmp_path, checkpoint=checkpoint, limit_val_batches=0, **options)
         return [tuple(f"{int(p[0, 0])}:{i}" for p, i in zip(b.points3d, b.ids, strict=True)) for b in batches]
 
     whole = fit(ModelCheckpoint(tmp_path, filename="{step}", save_top_k=-1, every_n_train_steps=1))

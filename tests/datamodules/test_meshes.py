@@ -144,7 +144,7 @@ def train(folder: Path, **options: object) -> list[Batch]:
     """The batches of two epochs."""
     outliers = Outliers(ratio=(0.0, 1.0), side="random")
     data = module(folder, train_problems=12, batch_size=4, train_outliers=outliers, **options)
-    return recorded(data, default_root_dir=folder, max_epochs=2, limit_val_batches=0)
+    return recorded(data, folder, max_epochs=2, limit_val_batches=0)
 
 
 @pytest.mark.filterwarnings("ignore")

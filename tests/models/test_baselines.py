@@ -1,12 +1,13 @@
 """The baselines as solvers of batches."""
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import roma
 import torch
-from planted import plant
+from planted import padded, plant
 from scipy.optimize import linear_sum_assignment
 
 from bpnp import Batch, BPnPNet
@@ -31,9 +32,7 @@ each_solver = pytest.mark.parametrize("name", QUICK)
 @each_solver
 def test_a_pose_depends_neither_on_neighbours_nor_on_padding_nor_on_the_modules_history(name: str) -> None:
     small, large = plant(1, 12, seed=1), plant(1, 20, seed=2)
-    together = Batch.from_arrays(
-        [large.points2d[0], small.points2d[0]], [large.points3d[0], small.points3d[0]], index=[5, 9]
-    )
+    together = replace(padded([large, small]), index=torch.tensor([5, 9]))
     alone = Batch.from_arrays(small.points2d, small.points3d, index=[9])
     of_two, of_one = QUICK[name](together).poses[name], QUICK[name](alone).poses[name]
     assert QUICK[name].estimates == (name,)
@@ -118,9 +117,8 @@ def test_blind_ransac_reaches_its_predicted_success_rate() -> None:
 
 def test_hungarian_is_the_assignment_of_least_cost_among_real_points() -> None:
     first, second = plant(1, 9, seed=1), plant(1, 6, seed=2, outliers3d=5)
-    batch = Batch.from_arrays([first.points2d[0], second.points2d[0]], [first.points3d[0], second.points3d[0]])
     cost = torch.rand(2, 9, 11)
-    assignment = hungarian(cost, batch)
+    assignment = hungarian(cost, padded([first, second]))
     for i, (m, n) in enumerate(((9, 9), (6, 11))):
         rows, columns = linear_sum_assignment(cost[i, :m, :n].numpy())
         chosen = cost[i, :m, :n].numpy()[rows, columns].sum()

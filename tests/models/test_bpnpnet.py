@@ -122,13 +122,7 @@ def test_the_pose_loss_reaches_the_first_layers(overfitted: tuple[BPnPNet, Batch
 def test_a_set_of_three_points_spoils_no_neighbour(overfitted: tuple[BPnPNet, Batch, list[float]]) -> None:
     net, batch, _ = overfitted
     tiny = plant(1, 3, dtype=torch.float32)
-    both = Batch.from_arrays(
-        [batch.points2d[0], tiny.points2d[0]],
-        [batch.points3d[0], tiny.points3d[0]],
-        torch.cat([batch.rotation, tiny.rotation]),
-        torch.cat([batch.translation, tiny.translation]),
-        [batch.match3d[0], tiny.match3d[0]],
-    )
+    both = padded([batch, tiny])
     prediction, alone = net(both), net(batch)
     pose = prediction.poses["pnp"]
     assert pose.stats.converged.tolist() == [True, False]

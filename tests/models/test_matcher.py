@@ -1,23 +1,15 @@
 from dataclasses import replace
-from typing import Literal
 
 import pytest
 import torch
 from planted import padded, plant
+from small_data import small_matcher
 
 from bpnp import Batch
 from bpnp.models import Matcher
 from bpnp.models.matcher import image_of
 from bpnp.models.nets import Attention, Neighbourhood
 from bpnp.training.losses import matching_likelihood_loss
-
-
-def small(seed: int = 0, frame: Literal["any", "view"] = "any") -> Matcher:
-    torch.manual_seed(seed)
-    net = Matcher(channels=16, depth=2, heads=2, neighbours=3, frame=frame).double().eval()
-    if net.seen is not None:
-        torch.nn.init.normal_(net.seen.weight)  # zero until it is trained
-    return net
 
 
 def cluttered(*sizes: int) -> Batch:
@@ -27,7 +19,7 @@ def cluttered(*sizes: int) -> Batch:
 
 def test_every_point_shares_its_mass_between_partners_and_its_bin() -> None:
     batch = cluttered(9, 21)
-    prediction = small().match(batch)
+    prediction = small_matcher().match(batch)
     total = (batch.count2d + batch.count3d).unsqueeze(-1).double()
     torch.testing.assert_close(prediction.assignment.sum(2) + prediction.unmatched2d, batch.mask2d / total)
     torch.testing.assert_close(prediction.assignment.sum(1) + prediction.unmatched3d, batch.mask3d / total)
@@ -41,7 +33,7 @@ def test_the_image_of_a_view_holds_what_is_before_it_and_the_rest_at_its_edge() 
 
 def test_each_side_hears_of_the_other() -> None:
     """What BPnPNet's features cannot do: the features of the image change with the scene."""
-    net, batch = small(), cluttered(12)
+    net, batch = small_matcher(), cluttered(12)
     other = replace(batch, points3d=batch.points3d.flip(-1) ** 3)
     assert (net.features(other)[0] - net.features(batch)[0]).abs().max() > 1e-3
 

@@ -4,12 +4,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from planted import seen
+from planted import posed, seen
 from report_data import planted
 from scipy.spatial.transform import Rotation
 
 from bpnp.report.points import MOST, points_from, read_points, thin, write_points
-from bpnp.types import Batch, Pose, Prediction, SolveStats
+from bpnp.types import Batch, Prediction
 
 
 def answered(batch: Batch, degrees: float = 10.0) -> Prediction:
@@ -18,11 +18,10 @@ def answered(batch: Batch, degrees: float = 10.0) -> Prediction:
     assert batch.translation is not None
     assert batch.match3d is not None
     turn = torch.from_numpy(Rotation.from_euler("z", degrees, degrees=True).as_matrix())
-    stats = SolveStats(torch.ones(len(batch)).long(), torch.zeros(len(batch)), torch.ones(len(batch)).bool())
     rotation = turn @ batch.rotation.double()
     assignment = torch.zeros(len(batch), batch.points2d.shape[1], batch.points3d.shape[1])
     assignment.scatter_(1, batch.match3d.clamp(min=0)[:, None], 1.0)
-    return Prediction(assignment, None, {"pnp": Pose(rotation, batch.translation.double(), stats)})
+    return Prediction(assignment, None, {"pnp": posed(rotation, batch.translation.double())})
 
 
 @pytest.mark.parametrize("most", [MOST, 30, 7])

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from planted import posed
 from report_data import planted, row, rows
 from scipy.spatial.transform import Rotation
 
@@ -67,15 +68,14 @@ def test_inliers_are_those_of_a_brute_force_count() -> None:
     points2d, points3d = rng.uniform(-0.5, 0.5, (200, 2)), rng.uniform(-1, 1, (150, 3)) + [0, 0, 0.5]
     batch = Batch.from_arrays(points2d, points3d, np.eye(3), np.zeros(3))
     rotation = torch.from_numpy(Rotation.from_rotvec([[0.1, 0.2, 0.3]]).as_matrix())
-    stats = SolveStats(torch.ones(1, dtype=torch.long), torch.zeros(1), torch.ones(1, dtype=torch.bool))
-    pose = Pose(rotation, torch.tensor([[0.1, 0.0, 0.2]], dtype=torch.float64), stats)
+    pose = posed(rotation, torch.tensor([[0.1, 0.0, 0.2]], dtype=torch.float64))
     camera = points3d @ rotation[0].numpy().T + [0.1, 0, 0.2]
     front = camera[camera[:, 2] > 0]
     distance = np.linalg.norm(points2d[:, None] - (front[:, :2] / front[:, 2:])[None], axis=-1)
     assert 0 < len(front) < 150
     for threshold in (0.01, 0.1):
         assert count_inliers(pose, batch, threshold=threshold) == [(distance.min(1) < threshold).sum()]
-    behind = Pose(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, -9.0]]).double(), stats)
+    behind = posed(torch.eye(3, dtype=torch.float64)[None], torch.tensor([[0.0, 0.0, -9.0]]).double())
     assert count_inliers(behind, batch) == [0]
 
 

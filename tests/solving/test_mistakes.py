@@ -49,7 +49,6 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("points", {"points2d": None}, "`points2d` as an array of numbers"),
         ("points", {"points2d": PIXELS}, "look like pixels; try camera=K"),
         ("points", {"camera": K}, "look normalised"),
-        ("points", {"points2d": PIXELS, "camera": np.zeros((3, 3))}, "last row"),
         ("points", {"points2d": PIXELS, "camera": np.diag([500.0, 0, 1])}, "invertible `camera`"),
         ("points", {"inlier_threshold": 0.0}, "positive `inlier_threshold`"),
         ("points", {"time_limit": -1.0}, "positive `time_limit`"),

@@ -57,13 +57,16 @@ def test_scores_of_scene_points_weigh_the_likelihood() -> None:
     assert weighed - plain == pytest.approx(math.log(160 / 84), abs=0.1)
 
 
-def test_a_prior_says_which_twin_it_is() -> None:
-    """Points that a half turn about z maps onto themselves."""
+def test_twins_are_ambiguous_and_a_prior_says_which_it_is() -> None:
+    """Points that a half turn about z maps onto themselves: both poses are candidates."""
     half = RNG.uniform(-1, 1, (6, 3))
     points = np.concatenate([half, half * [-1, -1, 1]])
     rotation, translation = Rotation.from_rotvec([0.5, 0.3, 0.8]).as_matrix(), np.array([0.0, 0.05, 6.0])
     image = seen(points, rotation, translation)
+    free = solve(image, points)
+    assert free.verdict == "ambiguous"
     for turned in (rotation, rotation @ np.diag([-1.0, -1, 1])):
+        assert min(degrees_between(candidate.rotation, turned) for candidate in free.candidates) < 1
         near = Rotation.from_rotvec([0.03, -0.02, 0.03]).as_matrix() @ turned
         solution = solve(image, points, prior=PosePrior(near, translation, 3.0, 0.2))  # type: ignore[arg-type]
         assert degrees_between(solution.rotation, turned) < 1

@@ -7,10 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from planted import plant
+from planted import plant, posed
 
 from bpnp import solve
-from bpnp.types import Pose, Prediction, SolveStats
+from bpnp.types import Prediction
 
 
 class Recorder(torch.nn.Module):
@@ -28,8 +28,7 @@ class Recorder(torch.nn.Module):
         if self.fails:
             raise RuntimeError("on purpose")
         rotation, translation = torch.eye(3).expand(len(batch), 3, 3), torch.tensor([[0.0, 0.0, 5.0]])
-        stats = SolveStats(torch.tensor([1]), torch.tensor([0.0]), torch.tensor([True]))
-        return Prediction(poses={"fixed": Pose(rotation, translation.expand(len(batch), 3), stats)})
+        return Prediction(poses={"fixed": posed(rotation, translation.expand(len(batch), 3))})
 
 
 seen: set[bool] = set()

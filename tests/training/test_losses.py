@@ -38,9 +38,7 @@ def angle(planted: Planted, b: int, i: int, j: int) -> float:
 def test_correspondence_loss_is_equation_9_with_a_dense_matrix() -> None:
     planted = plant(4, 9, outliers2d=3, outliers3d=5)
     assignment = random_assignment(planted)
-    correct = torch.zeros_like(assignment)
-    for b, j in torch.nonzero(planted.match3d >= 0).tolist():
-        correct[b, planted.match3d[b, j], j] = 1
+    correct = (planted.permutation() > 0).double()
     expected = (assignment * (1 - 2 * correct)).sum((-2, -1))
     torch.testing.assert_close(correspondence_loss(assignment, planted.match3d), expected)
 

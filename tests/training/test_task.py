@@ -5,15 +5,14 @@ from typing import Any
 
 import pytest
 import torch
-from lightning import Callback, LightningDataModule, Trainer
+from lightning import Callback, Trainer
 from planted import padded, plant, posed
-from small_data import SMALL_MESHES, quiet_trainer, small_net
+from small_data import quiet_trainer, small_meshes, small_net
 from torch import nn
-from torch.utils.data import DataLoader, Dataset
+from torch.utils.data import DataLoader
 
 import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
-from bpnp.datamodules import MeshDataModule
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
 from bpnp.training.losses import correspondence_loss, pose_loss
@@ -45,15 +44,10 @@ class CountingSolver(nn.Module):
         return prediction
 
 
-def data(tmp_path: Path, **settings: object) -> MeshDataModule:
-    small = dict(a.removeprefix("--data.").split("=") for a in SMALL_MESHES)
-    return MeshDataModule(**({k: int(v) for k, v in small.items()} | {"cache_dir": str(tmp_path / "cache")} | settings))
-
-
 def fit(tmp_path: Path, task: BlindPnPTask, ckpt_path: str | None = None, **settings: object) -> Trainer:
     """One epoch unless told otherwise, without validation."""
     run = quiet_trainer(tmp_path, **({"max_epochs": 1, "limit_val_batches": 0} | settings))
-    run.fit(task, datamodule=data(tmp_path), ckpt_path=ckpt_path, weights_only=ckpt_path is not None)
+    run.fit(task, datamodule=small_meshes(tmp_path), ckpt_path=ckpt_path, weights_only=ckpt_path is not None)
     return run
 
 
@@ -151,7 +145,7 @@ def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
 
 
 def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
-    module = data(tmp_path, num_points=40, noise_px=0.0)
+    module = small_meshes(tmp_path, num_points=40, noise_px=0.0)
     task = BlindPnPTask(small_net())
     run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
     run.test(task, datamodule=module, verbose=False)
@@ -163,37 +157,18 @@ def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
     assert float(run.callback_metrics["test/correspondence_loss"]) == pytest.approx(results.correspondence_loss)
 
 
-class Numbers(Dataset):
-    """Ten problems without a number, as a user's own data set gives them."""
-
-    def __len__(self) -> int:
-        return 10
-
-    def __getitem__(self, number: int) -> Batch:
-        return plant(1, 12, seed=number, dtype=torch.float32).batch()
-
-
-def collated(problems: list[Batch]) -> Batch:
-    """What docs/data.md says of one's own data: `Batch.from_arrays` of lists, without `index`."""
-    names = ("points2d", "points3d", "rotation", "translation", "match3d")
-    return Batch.from_arrays(*([getattr(problem, name)[0] for problem in problems] for name in names))
-
-
-class OwnData(LightningDataModule):
-    def loader(self) -> DataLoader:
-        return DataLoader(Numbers(), batch_size=2, collate_fn=collated)
-
-    test_dataloader = predict_dataloader = val_dataloader = loader
+# Ten problems without a number, as a user's own data set gives them; `padded` is what docs/data.md says of collating.
+OWN = [plant(1, 12, seed=number, dtype=torch.float32) for number in range(10)]
 
 
 def test_problems_that_are_numbered_within_their_batch_are_all_counted(tmp_path: Path) -> None:
-    task, one_batch = BlindPnPTask(small_net()), collated([Numbers()[i] for i in range(10)])
+    task, one_batch, loader = BlindPnPTask(small_net()), padded(OWN), DataLoader(OWN, 2, collate_fn=padded)
     run = quiet_trainer(tmp_path, callbacks=[ResultsWriter()])
     with warnings.catch_warnings():
         warnings.filterwarnings("error", message="expected one (pair|problem) per")
-        run.test(task, datamodule=OwnData(), verbose=False)
+        run.test(task, loader, verbose=False)
         tested = dict(run.callback_metrics)
-        run.validate(task, datamodule=OwnData(), verbose=False)
+        run.validate(task, loader, verbose=False)
         validated = dict(run.callback_metrics)
     rows = read_results(tmp_path / "test").of("ransac")
     assert [(row.index, row.id) for row in rows] == [(i, str(i)) for i in range(10)]
@@ -229,9 +204,8 @@ def test_what_a_solver_returns_is_checked(answer: Any, estimates: Any, error: st
         forward = staticmethod(answer)
 
     Answering.estimates = estimates
-    loader = DataLoader([Numbers()[0], Numbers()[1]], 2, collate_fn=collated)
     with pytest.raises(ValueError, match=error):
-        quiet_trainer(tmp_path).test(BlindPnPTask(Answering()), loader)
+        quiet_trainer(tmp_path).test(BlindPnPTask(Answering()), DataLoader(OWN[:2], 2, collate_fn=padded))
 
 
 def test_a_loader_that_gives_no_batch_is_named(tmp_path: Path) -> None:
@@ -241,7 +215,7 @@ def test_a_loader_that_gives_no_batch_is_named(tmp_path: Path) -> None:
 
 
 def test_several_processes_cannot_number_anew() -> None:
-    first, second = (collated([Numbers()[i], Numbers()[i + 1]]) for i in (0, 2))
+    first, second = padded(OWN[:2]), padded(OWN[2:4])
     numbers = set[int]()
     number_globally(first, numbers, processes=2)
     assert numbers == {0, 1}
@@ -279,7 +253,7 @@ def test_overfit_batches_repeats_the_same_problems(tmp_path: Path) -> None:
             seen.append(batch.ids)
 
     run = quiet_trainer(tmp_path, callbacks=[Seen()], max_epochs=3, overfit_batches=2)
-    run.fit(BlindPnPTask(small_net()), datamodule=data(tmp_path, train_problems=32, batch_size=4))
+    run.fit(BlindPnPTask(small_net()), datamodule=small_meshes(tmp_path, train_problems=32, batch_size=4))
     assert len(seen) == 6
     assert len(set(seen)) == 2
     assert seen[:2] * 3 == seen

@@ -11,14 +11,13 @@ from pathlib import Path
 
 import pytest
 import torch
-from small_data import SMALL_MESHES, SMALL_NET
+from small_data import MESHES, SMALL_NET
 
 from bpnp.cli import main
 from bpnp.report import read_results
 
 ARGUMENTS = [
-    "--data=bpnp.datamodules.MeshDataModule",
-    *SMALL_MESHES,
+    *MESHES,
     *SMALL_NET,
     "--model.learning_rate=1e-3",
     "--data.fresh_views=true",
