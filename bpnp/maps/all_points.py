@@ -29,7 +29,7 @@ def on_all_points(solution: Solution, photo: Photo, tries: int) -> Solution:
     if len(region.points3d) < len(solution.matches):
         return solution
     problem = problem_near(region, photo.keypoints, photo.camera, None)
-    scene = Scene(problem.sets, photo.seed, DEFAULT, photo.deadline)
+    scene = Scene(problem.sets, photo.seed, DEFAULT)
     rotation, shift = solution.rotation, solution.translation + solution.rotation @ problem.origin
     scale = max(solution.stats.residual, problem.sets.image.scales[0])
     ends = polished(scene, rotation[None], shift[None], scale)
@@ -42,8 +42,6 @@ def on_all_points(solution: Solution, photo: Photo, tries: int) -> Solution:
     alone = judged(ends, problem.sets, batches=1, exhaustive=True)
     result = against_rivals(alone, problem.sets, lambda: scene, rule, exhaustive=True)
     rotations, shifts = np.stack([rotation, result.best[0]]), np.stack([shift, result.best[1]])
-    if photo.deadline.passed():
-        return solution
     if not problem.sets.same_pose(rotations, shifts, rule.other_deg, rule.other_shift)[1]:
         behind = result.log10_false_alarms - solution.log10_false_alarms
         return solution if behind >= rule.lead else _doubted(solution, fits_as_well(rotation, result.best[0], behind))

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.cameras import camera_from
-from bpnp.loops.parallel import Deadline
 from bpnp.maps.views import Cones, View
 from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.settings import DEFAULT
@@ -75,14 +74,13 @@ def near_view(region: Region, keypoints: Any, camera: Any, prior: PosePrior | No
 @dataclass(frozen=True, eq=False)
 class Photo:
     """What is localised, among which points, and near which views of the map, by their rank for image points (k, 2);
-    `deadline` and `seed` are of the search."""
+    `seed` is of the search."""
 
     keypoints: Array
     camera: Any
     place: Region
     regions: Callable[[NDArray[np.float64]], Iterable[Region]]
     seed: int = 0
-    deadline: Deadline = Deadline()
 
     @cached_property
     def problem(self) -> Problem:

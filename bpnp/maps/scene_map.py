@@ -230,7 +230,8 @@ class SceneMap:
         solver: as for `bpnp.solve`; a network that expects the points in the camera of a view gets them in that of the
             view that is tried, or of the prior.
         seed: of the search.
-        time_limit: seconds for all views together, after which no search begins; None for no limit.
+        time_limit: seconds for all views together, after which no search begins, but what speaks against a confident
+            pose is still looked for, about a second; None for no limit.
 
         Poses near each view are tried briefly until one is confident, longer at once where hardly any unrelated points
         would fit as well; then near each view once more, and near the most promising ones longer; else the pose with
@@ -269,7 +270,7 @@ class SceneMap:
             if solution.verdict == "confident":
                 every = self._region(place.view, np.arange(len(self.points3d)))
                 regions = partial(self._regions, views, solution.camera)
-                photo = Photo(used, solution.camera, every, regions, seed, deadline)
+                photo = Photo(used, solution.camera, every, regions, seed)
                 if isinstance(lens, Camera):
                     solution = on_all_points(solution, photo, tries)
                 if prior is None and solution.verdict == "confident":  # a prior would tell twins apart

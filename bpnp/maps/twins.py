@@ -80,7 +80,7 @@ def best_rival(photo: Photo, solution: Solution, met: Sequence[Solution]) -> tup
     apart = different(rotations, translations)
     if not apart.any():
         return None
-    scene = Scene(sets, photo.seed, DEFAULT, photo.deadline)
+    scene = Scene(sets, photo.seed, DEFAULT)
     ends = polished(scene, rotations[apart], translations[apart], scale)
     ends = ends[different(ends.rotation, ends.translation)]
     if not len(ends):
@@ -107,14 +107,14 @@ def _looks(photo: Photo, solution: Solution, problem: Problem) -> Iterator[tuple
     seen = _seen(photo, solution)
     rasters: dict[tuple[RasterShape, float], Raster] = {}  # all of the same image points
     for region in photo.regions(explained) if len(explained) >= TWINS.fewest else ():
-        if looks == TWINS.looks or photo.deadline.passed():
+        if looks == TWINS.looks:
             return
         unseen = ~np.isin(region.point_ids, seen)
         if unseen.sum() < TWINS.fewest or unseen.mean() < TWINS.unseen:
             continue
         looks += 1
         near = problem_near(region, explained, photo.camera, region.prior())
-        scene = Scene(near.sets, photo.seed, DEFAULT, photo.deadline)
+        scene = Scene(near.sets, photo.seed, DEFAULT)
         scene.rasters = rasters
         known = scene.enter_prior(near.sets.prior or region.prior())
         assert isinstance(known, PosePrior)

@@ -10,8 +10,12 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
+from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.rivals import AtZoom, likeliest_zoom, other_camera
 from bpnp.search.point_sets import PointSets
+from bpnp.search.scene import Scene
+from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged
 
 Array = NDArray[np.float64]
@@ -91,3 +95,29 @@ def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, v
     assert alarms[0] < min(alarms[1] - 3, -5)
     assert found.verdict == verdict
     assert ("50 deg away explains" in found.reason) == (verdict == "ambiguous")
+
+
+@pytest.mark.parametrize("factor", [1.0, 1.3, 0.75])
+def test_another_focal_length_is_climbed_to(factor: float) -> None:
+    """1,500 dense points, seen with `factor` times the true focal length by a pose that is three degrees off. It is an
+    alternative; so is that there was no time to look, unless Gauss-Newton steps from the pose itself had found it."""
+    rng = np.random.default_rng(2)
+    points, shift = rng.uniform(-1, 1, (1500, 3)), np.array([0.0, 0.0, 4.0])
+    exact = directions(points + shift) + 4e-3 * rng.standard_normal((1500, 3))
+    sets = PointSets(directions(exact / (factor, factor, 1)), points)
+    turned = Rotation.from_euler("x", 3, degrees=True).as_matrix()
+    met = AtZoom(1.0, sets, turned, shift * (1, 1, factor), 4e-3)
+    climbed = likeliest_zoom(met, Scene(sets, 0, DEFAULT), DEFAULT.evidence.zoomed)
+    assert climbed.zoom == pytest.approx(1 / factor, rel=0.09 if factor == 1 else 0.045)  # half a step; never none
+    assert np.degrees(Rotation.from_matrix(climbed.rotation).magnitude()) < 0.5
+    seen = verdict_on(sets, np.eye(3)[None], met.middle[None], 4e-3, 0.6)
+    other, untried = (
+        other_camera(seen, sets, lambda end=end: Scene(sets, 0, DEFAULT, end), DEFAULT.evidence)
+        for end in (NEVER, Deadline(0.0))
+    )
+    assert untried is not None
+    if other is None:
+        assert (factor, untried.what) == (1.0, "there was no time to try other focal lengths")
+    else:
+        zoom = float(re.search(r"with (\S+) times the focal length", other.what)[1])
+        assert zoom == pytest.approx(1 / factor, rel=0.03)

@@ -2,7 +2,7 @@
 those beside it at other focal lengths."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -55,39 +55,40 @@ def other_camera(
     result: SearchResult, sets: PointSets, entered: Callable[[], Scene], rule: Evidence
 ) -> Alternative | None:
     """Another focal length with which a different pose fits better than the best one, by the factor `focal_chance`
-    though it is paid for as an unknown; None if there is none, or too few matches to tell."""
-    if sets.focal is not None or match_count(result.candidates, sets) < rule.zoomed.fewest:
-        return None
-    rotation, translation = result.best
-    middle = rotation @ sets.middle + translation
-    most = result.log10_false_alarms + math.log10(rule.focal_chance)
-    for other in _at_other_focal_lengths(result, sets, middle, entered, rule):
-        if other is not None and _alarms(sets, other, rule) < most:
-            better = of_misfit(misfit_of(rotation, middle, other), rule)
-            if better is not None:
-                return better
-    return None
+    though it is paid for as an unknown; None if there is none, or too few matches to tell.
 
-
-def _at_other_focal_lengths(
-    result: SearchResult, sets: PointSets, middle: Array, entered: Callable[[], Scene], rule: Evidence
-) -> Iterator[Zoomed | None]:
-    """Poses with the focal lengths that fit them best: of Gauss-Newton steps from the best pose itself, and from the
-    likeliest of those that are found beside it at other focal lengths.
-
-    The latter only where three matches may be coincidences: else the steps meet what there is. middle: (3,) of the
-    scene, seen from the camera.
+    Of Gauss-Newton steps from the best pose itself; and, where three matches may be coincidences, so that these miss
+    what there is, from the likeliest pose that is found beside it at other focal lengths. That there was no time for
+    these speaks against it too.
     """
-    rotation, scale = result.best[0], max(result.residual, sets.image.scales[0])
-    yield with_focal_length(sets, rotation, middle, scale)
-    decades = -result.log10_false_alarms / match_count(result.candidates, sets)
-    if -rule.independent * decades > rule.missed:
-        best = _likeliest_zoom(_Found(1.0, sets, rotation, middle, scale), entered(), rule.zoomed)
-        fitted = with_focal_length(best.sets, best.rotation, best.middle, max(best.scale, best.sets.image.scales[0]))
-        yield None if fitted is None else fitted._replace(zoom=best.zoom * fitted.zoom)
+    count = match_count(result.candidates, sets)
+    if sets.focal is not None or count < rule.zoomed.fewest:
+        return None
+    (rotation, translation), scale = result.best, max(result.residual, sets.image.scales[0])
+    middle = rotation @ sets.middle + translation
+
+    def better(found: AtZoom) -> Alternative | None:
+        least = max(found.scale, found.sets.image.scales[0])
+        fitted = with_focal_length(found.sets, found.rotation, found.middle, least)
+        if fitted is None:
+            return None
+        other = fitted._replace(zoom=found.zoom * fitted.zoom)
+        if _alarms(sets, other, rule) >= result.log10_false_alarms + math.log10(rule.focal_chance):
+            return None
+        return of_misfit(misfit_of(rotation, middle, other), rule)
+
+    known = AtZoom(1.0, sets, rotation, middle, scale)
+    other = better(known)
+    if other is not None or rule.independent * result.log10_false_alarms / count <= rule.missed:
+        return other
+    scene = entered()
+    likeliest = likeliest_zoom(known, scene, rule.zoomed)
+    if scene.deadline.passed():
+        return Alternative(-math.inf, "there was no time to try other focal lengths")
+    return better(likeliest)
 
 
-class _Found(NamedTuple):
+class AtZoom(NamedTuple):
     """A pose at `zoom` times the focal length, the points there, and its likelihood: of the bearings, nats each,
     against an even density over the view. middle: (3,) of the scene, seen from the camera."""
 
@@ -99,7 +100,7 @@ class _Found(NamedTuple):
     likelihood: float = -math.inf
 
 
-def _likeliest_zoom(start: _Found, scene: Scene, rule: OtherFocal) -> _Found:
+def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
     """The likeliest pose at other focal lengths: of a step to either side the likelier one, and farther on that side
     while it grows likelier. scene: whose settings and deadline hold."""
     step, best = max(
@@ -113,7 +114,7 @@ def _likeliest_zoom(start: _Found, scene: Scene, rule: OtherFocal) -> _Found:
     return best
 
 
-def beside(found: _Found, zoom: float, scene: Scene) -> _Found:
+def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     """The likeliest pose at `zoom` times the focal length of one, beside that which sees the scene as large; the pose
     itself after the deadline."""
     sets = at_focal_length(found.sets, zoom)
@@ -125,7 +126,7 @@ def beside(found: _Found, zoom: float, scene: Scene) -> _Found:
         return found
     rotation, likelihood = poses.rotation[0], float(poses.score[0]) + math.log(sets.image.solid_angle)
     middle = rotation @ sets.middle + poses.translation[0]
-    return _Found(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
+    return AtZoom(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
 
 
 def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:
