@@ -39,7 +39,7 @@ def against_rivals(
 
     The camera is believed as it was given unless another focal length, which is paid for as an unknown, has fewer false
     alarms by the factor `rule.focal_chance`."""
-    result = against_repetitions(result, sets, entered, rule, looks, exhaustive)
+    result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
     if result.verdict != "confident":
         return result
     other = other_camera(result, sets, entered, rule)
@@ -103,9 +103,8 @@ class AtZoom(NamedTuple):
 def likeliest_zoom(start: AtZoom, scene: Scene, rule: OtherFocal) -> AtZoom:
     """The likeliest pose at other focal lengths: of a step to either side the likelier one, and farther on that side
     while it grows likelier. scene: whose settings and deadline hold."""
-    step, best = max(
-        ((step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)), key=lambda x: x[1][-1]
-    )
+    steps = [(step, beside(start, step, scene)) for step in (1 / rule.step, rule.step)]
+    step, best = max(steps, key=lambda one: one[1].likelihood)
     while 1 / rule.widest < best.zoom * step < rule.widest:
         further = beside(best, step, scene)
         if further.likelihood <= best.likelihood:
@@ -142,7 +141,7 @@ def at_focal_length(sets: PointSets, zoom: float) -> PointSets:
     return replace(sets, bearings=bearings / np.linalg.norm(bearings, axis=-1, keepdims=True))
 
 
-def against_repetitions(
+def _against_repetitions(
     result: SearchResult,
     sets: PointSets,
     entered: Callable[[], Scene],
@@ -165,4 +164,4 @@ def against_repetitions(
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside
-    return against_repetitions(beside, sets, entered, rule, looks, exhaustive)
+    return _against_repetitions(beside, sets, entered, rule, looks, exhaustive)
