@@ -1,4 +1,8 @@
-"""How loops on the CPU are compiled, and where the result is kept."""
+"""How loops on the CPU are compiled, and where the result is kept.
+
+The second half takes shortcuts through private parts of numba that halve the time to compile, hence the bound of its
+version.
+"""
 
 import gc
 import inspect
@@ -9,10 +13,15 @@ from collections.abc import Callable
 from typing import Any
 
 import numba
+from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import event
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import Compiler
 from numba.core.dispatcher import Dispatcher
+from numba.core.typed_passes import InlineOverloads, IRLegalization, NopythonRewrites
+from numba.core.types import BaseFunction
+from numba.core.untyped_passes import InlineClosureLikes
 
-from bpnp.loops import shortcuts
 from bpnp.loops.parallel import Clock
 
 # Of `fastmath`: sums in any order, but NaN and infinity keep their meaning, for they mark a lost pose or sample.
@@ -34,7 +43,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """
     part = "no_cpython_wrapper" in options
     options |= {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    options["pipeline_class"] = shortcuts.LoopCompiler
+    options["pipeline_class"] = _LoopCompiler
 
     def compiled(function: Callable[..., Any]) -> Any:
         function = inspect.unwrap(function)
@@ -45,7 +54,7 @@ def compiler(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             dispatcher: Any = numba.njit(function, cache=not part, **options)
             if not part:
                 stats = [os.stat(file) for file in sorted(files)]
-                shortcuts.stamp(dispatcher, [(stat.st_mtime, stat.st_size) for stat in stats])
+                _stamp(dispatcher, [(stat.st_mtime, stat.st_size) for stat in stats])
         except RuntimeError:  # numba finds no folder for its cache
             dispatcher = numba.njit(function, **options)
         _FILES[dispatcher] = files
@@ -74,7 +83,7 @@ class _Compilation(event.Listener):
             self.begun = time.monotonic()
             self.collected = gc.isenabled()
             gc.disable()
-            shortcuts.resolve_once(True)
+            _resolve_once(True)
         self.depth += 1
 
     def on_end(self, event: event.Event) -> None:
@@ -82,13 +91,83 @@ class _Compilation(event.Listener):
             self.depth -= 1
             if not self.depth:
                 Clock.compiling += time.monotonic() - self.begun
-                shortcuts.resolve_once(False)
+                _resolve_once(False)
                 if self.collected:
                     gc.enable()
 
 
 def _is_ours(event: event.Event) -> bool:
     return event.data["dispatcher"].py_func.__module__.startswith("bpnp.")
+
+
+class _PartCode(JITCodeLibrary):
+    """The code of a function that is linked into those that call it, as numba translated it."""
+
+    def _optimize_final_module(self) -> None:
+        """Leave it to the callers."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalized = True
+
+
+class _LoopCompiler(Compiler):
+    """Compiles a loop, or a part of one, which gets no machine code of its own."""
+
+    def __init__(self, typing: Any, target: Any, code: Any, args: Any, result: Any, flags: Any, *rest: Any) -> None:
+        if flags.no_cpython_wrapper:
+            code = _PartCode(target.codegen(), "part")
+            code.enable_object_caching()
+        super().__init__(typing, target, code, args, result, flags, *rest)
+        if flags.no_cpython_wrapper:
+            self.state.targetctx.get_executable = _without_machine_code
+
+    def define_pipelines(self) -> Any:
+        """Without the passes for closures, inlined functions and expressions of arrays, which the loops lack, and for
+        the end of each variable's life, which matters where references are counted."""
+        (pipeline,) = super().define_pipelines()
+        unused: set[Any] = {InlineClosureLikes, InlineOverloads, NopythonRewrites}
+        if not self.state.flags.nrt:
+            unused.add(IRLegalization)
+        pipeline.passes = [entry for entry in pipeline.passes if entry[0] not in unused]
+        pipeline.finalize()
+        return [pipeline]
+
+
+def _without_machine_code(library: Any, description: Any, environment: Any) -> Any:
+    """What stands for the function among numba's; `Compiler` gives each compilation a copy of the target."""
+    return _dynfunc.make_function(description.lookup_module(), description.qualname, "", 0, environment, (library,))
+
+
+_FUNCTION: Any = BaseFunction  # of numba, or an operator
+_resolve = _FUNCTION.get_call_type
+_RESOLVED: dict[Any, Any] = {}
+
+
+def _resolve_once(once: bool) -> None:
+    """Whether numba looks up what an operator does with some types once, not at each use, which takes a sixth."""
+    _FUNCTION.get_call_type = _resolved_once if once else _resolve
+
+
+def _resolved_once(function: Any, context: Any, args: Any, kws: Any) -> Any:
+    """As `get_call_type` of a function of numba's, whose answer for each kind of arguments is kept."""
+    key = function, context, tuple(args), tuple(kws.items())
+    if key not in _RESOLVED:
+        _RESOLVED[key] = _resolve(function, context, args, kws)
+    return _RESOLVED[key]
+
+
+def _stamp(dispatcher: Any, source: Any) -> None:
+    """Compile again where `source` is not as it was, or the types that a kept loop takes are gone or elsewhere."""
+    kept = dispatcher._cache._cache_file
+    kept._source_stamp, load = source, kept._load_index
+
+    def loaded() -> Any:
+        try:
+            return load()
+        except (ImportError, AttributeError):
+            return {}
+
+    kept._load_index = loaded
 
 
 event.register("numba:compile", _Compilation())

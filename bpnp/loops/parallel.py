@@ -1,18 +1,25 @@
-"""Loops on the CPU: how they are shared among threads, and ended when their time is over."""
+"""Work on the CPU: how it is shared among threads or processes, and ended when its time is over."""
 
 import math
+import multiprocessing
 import os
+import signal
 import threading
 import time
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ContextDecorator
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
-from threadpoolctl import ThreadpoolController
+from threadpoolctl import ThreadpoolController, threadpool_limits
+
+Result = TypeVar("Result")
+_work: dict[str, Callable[[int], Any]] = {}  # of a worker process
 
 
 def in_threads(work: Callable[[int, int], object], count: int) -> None:
@@ -37,6 +44,42 @@ def in_threads(work: Callable[[int, int], object], count: int) -> None:
 def _pool(process: int) -> ThreadPoolExecutor:
     """The threads of a process; a fork inherits none of its parent's, so each has its own."""
     return ThreadPoolExecutor(os.cpu_count(), f"bpnp-{process}")
+
+
+def in_processes(work: Callable[[int], Result], items: Sequence[int], count: int) -> Iterator[tuple[int, Result]]:
+    """Items and work(item) in `count` forks of this process, each with one thread; in the order they end.
+
+    For work that is mostly Python, which threads would do one after the other.
+    Raises what a worker raises, and RuntimeError if one is killed; all of them end with the iteration.
+    """
+    others, context = multiprocessing.active_children(), multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(min(count, len(items)), context, initializer=_begin, initargs=(work,))
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DeprecationWarning)  # other threads: none has a lock that workers take
+            running = {pool.submit(_run, item): item for item in items}
+        for done in as_completed(running):
+            yield running[done], done.result()
+    except BrokenProcessPool as error:
+        raise RuntimeError(
+            "a process that solved problems was killed, possibly out of memory; try fewer threads "
+            "(torch.set_num_threads, OMP_NUM_THREADS)"
+        ) from error
+    finally:
+        for worker in set(multiprocessing.active_children()) - set(others):
+            worker.kill()  # what they work on is not waited for
+        pool.shutdown(cancel_futures=True)
+
+
+def _begin(work: Callable[[int], Any]) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent ends its workers
+    torch.set_num_threads(1)
+    threadpool_limits(1)  # numpy's BLAS has threads of its own, which would wait for each other's cores
+    _work["work"] = work
+
+
+def _run(item: int) -> Any:
+    return _work["work"](item)
 
 
 class _OneBlasThread(ContextDecorator):

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from bpnp.loops.parallel import Deadline
-from bpnp.loops.processes import in_processes
+from bpnp.loops.parallel import Deadline, in_processes
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings

@@ -13,7 +13,7 @@ import torch
 
 import bpnp
 from bpnp.examples import load
-from bpnp.loops.processes import in_processes
+from bpnp.loops.parallel import in_processes
 from bpnp.solving import sources
 
 EXAMPLES = [load("photo", seed=seed) for seed in range(6)]
