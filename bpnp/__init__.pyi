@@ -1,9 +1,9 @@
 from .maps.scene_map import SceneMap as SceneMap
 from .models.bpnpnet import BPnPNet as BPnPNet
 from .models.matcher import Matcher as Matcher
+from .search.search import warm_up as warm_up
 from .search.starts import GravityPrior as GravityPrior
 from .search.starts import PosePrior as PosePrior
-from .search.warm_up import warm_up as warm_up
 from .solving.solution import Solution as Solution
 from .solving.solve import solve as solve
 from .solving.solve import solve_many as solve_many

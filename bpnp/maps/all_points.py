@@ -11,9 +11,9 @@ from bpnp.search.annealing import finish, polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import Alternative, fits_as_well
 from bpnp.search.evidence.rivals import against_rivals, doubted, other_camera
+from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
-from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import judged
 from bpnp.solving.matches import finished
 from bpnp.solving.solution import Solution

@@ -21,9 +21,9 @@ from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.kernels.raster import Raster
+from bpnp.search.raster_search import search_beside, search_near
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, Draws, Narrowing, RasterSearch, RasterShape, Screens
-from bpnp.search.sources.raster import search_beside, search_near
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import weighed
 from bpnp.solving.matches import count_one_to_one

@@ -21,8 +21,7 @@ from bpnp.geometry import bearings, choose, chords
 from bpnp.loops.parallel import Deadline
 from bpnp.robust.proposals import pose_hypotheses
 from bpnp.search.point_sets import PointSets
-from bpnp.search.refine import refine_poses
-from bpnp.search.search import search_poses
+from bpnp.search.search import refine_poses, search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.types import Batch, Pose, Prediction, SolveStats

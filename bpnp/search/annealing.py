@@ -14,7 +14,17 @@ from bpnp.search.kernels.dense import dense_scratch, descend
 from bpnp.search.kernels.sparse import descend_sparse, sparse_scratch
 from bpnp.search.scene import Scene, Sides
 from bpnp.search.settings import Stages
-from bpnp.search.starts import Array
+from bpnp.search.starts import Array, Prior, draw_poses
+
+
+def multistart(scene: Scene, number: int, prior: Prior | None) -> tuple[Candidates, float]:
+    """Distinct poses of one batch of starts over all rotations, or those that a prior allows; and its share of a full
+    one. number: of the batch, counted from 0."""
+    settings = scene.settings
+    recipe = settings.recipes[number % len(settings.recipes)]
+    drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
+    poses = Candidates.unscored(*drawn, hits=1)
+    return run_batch(scene, poses), len(poses) / settings.starts
 
 
 def run_batch(scene: Scene, starts: Candidates) -> Candidates:

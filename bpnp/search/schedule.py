@@ -18,12 +18,19 @@ from itertools import count, islice
 import numpy as np
 from numpy.typing import NDArray
 
+from bpnp.search.annealing import multistart
 from bpnp.search.candidates import Candidates, in_scene_frame
-from bpnp.search.evidence.unseen import far_missed, near_missed
+from bpnp.search.evidence.alternatives import far_missed, near_missed
 from bpnp.search.pool import Pool
-from bpnp.search.sources.cones import within_cones
-from bpnp.search.sources.multistart import multistart
-from bpnp.search.sources.raster import admitted, is_near, raster_search, search_beside, search_everywhere, search_near
+from bpnp.search.raster_search import (
+    admitted,
+    is_near,
+    raster_search,
+    search_beside,
+    search_everywhere,
+    search_near,
+    within_cones,
+)
 from bpnp.search.starts import PosePrior, Prior
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)

@@ -117,7 +117,7 @@ class RasterShape:
 
 @dataclass(frozen=True)
 class RasterSearch:
-    """One raster search (`bpnp.search.sources.raster`): draw, screen, narrow, and anneal so many poses."""
+    """One raster search (`bpnp.search.raster_search`): draw, screen, narrow, and anneal so many poses."""
 
     draws: Draws = Draws()
     screens: Screens = Screens()
@@ -128,7 +128,7 @@ class RasterSearch:
 
 @dataclass(frozen=True)
 class Cones:
-    """Raster searches within the cones of the points (`bpnp.search.sources.cones`), one a turn.
+    """Raster searches within the cones of the points (`bpnp.search.raster_search`), one a turn.
 
     log_depth: starts are exp(u) times the weak-perspective distance away, u uniform in [-log_depth, log_depth].
     aim_cells: of the raster, a scale, in which a start is aimed; with 1 no more poses are found, in twice the time.

@@ -2,9 +2,9 @@
 
 The currency is the number of false alarms (`bpnp.search.evidence.false_alarms`): how many poses would fit as well if
 the image had nothing to do with the scene. "confident": chance is excluded (`Evidence.false_alarms`), every alternative
-that was met is less likely by `Evidence.lead` decades (`evidence.alternatives`), and so is that a better optimum was
-not met (`evidence.unseen`). "ambiguous": better than chance, but one of the three is not excluded. "failed": no pose,
-or none better than chance.
+that was met is less likely by `Evidence.lead` decades, and so is that a better optimum was not met
+(`bpnp.search.evidence.alternatives`). "ambiguous": better than chance, but one of the three is not excluded. "failed":
+no pose, or none better than chance.
 """
 
 import math
@@ -15,11 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.candidates import Candidates
-from bpnp.search.evidence.alternatives import Seen, contesting, misfit, number, other_pose, rougher
+from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, linearised, rotation_bound
-from bpnp.search.evidence.unseen import log10_missed
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT
 

@@ -14,8 +14,7 @@ from bpnp.loops.parallel import Clock, Deadline, one_blas_thread
 from bpnp.search.evidence.uncertainty import ONE_SIGMA
 from bpnp.search.infinity.evidence import how_well_known, noise_of
 from bpnp.search.infinity.kernels import Image
-from bpnp.search.infinity.search import search_rotation
-from bpnp.search.infinity.settings import DEFAULT, InfinitySettings
+from bpnp.search.infinity.search import DEFAULT, InfinitySettings, search_rotation
 from bpnp.solving.arguments import (
     Array,
     check_points,

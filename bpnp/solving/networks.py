@@ -9,8 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from bpnp.loops.parallel import Deadline
-from bpnp.search.refine import score_poses
 from bpnp.search.schedule import Proposals
+from bpnp.search.search import score_poses
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult
 from bpnp.solving.arguments import Array

@@ -70,7 +70,7 @@ import sys
 import numpy as np
 from numba.core.dispatcher import Dispatcher
 from bpnp import GravityPrior, PosePrior, solve
-from bpnp.search.warm_up import warm_up
+from bpnp.search.search import warm_up
 def signatures():
     loops = {loop for name in list(sys.modules) if name.startswith("bpnp.search.")
              for loop in vars(sys.modules[name]).values()

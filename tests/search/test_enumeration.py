@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import Clock
 from bpnp.robust.minimal_solvers import p3p
-from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses
+from bpnp.search.enumeration.search import EnumeratedPoses, enumerate_poses
 from bpnp.search.point_sets import PointSets
 
 Array = NDArray[np.float64]

@@ -1,18 +1,277 @@
-"""The enumeration as a search: candidates with their likelihood, and an end when the verdict on them is certain."""
+"""Poses of few points (4 to some hundred a side) by exact enumeration: every small group of points is tried.
 
+Triples of an image point and its nearest are paired with triples of a scene point and its nearest, nearest first, and
+each pair is solved (P3P), rejected by the points beside it, or refined on all points, one-to-one. The neighbourhoods
+grow until the verdict is safe, every triple was tried, or the time is up.
+"""
+
+import math
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import numpy as np
 
-from bpnp.loops.parallel import Deadline
+from bpnp.loops.parallel import Clock, Deadline
 from bpnp.search.candidates import Candidates
-from bpnp.search.enumeration.points import predicted_pose
-from bpnp.search.enumeration.poses import EnumeratedPoses, enumerate_poses, margin
-from bpnp.search.enumeration.settings import DEFAULT, EnumerationSettings
+from bpnp.search.enumeration.hypotheses import Block, Kept, Work, explore
+from bpnp.search.enumeration.matching import Matches, Problem
+from bpnp.search.enumeration.points import (
+    Array,
+    ImageSide,
+    Places,
+    SceneSide,
+    pairs,
+    predicted_pose,
+    prior_arrays,
+    scene_side,
+    sets_within,
+)
+from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.evidence.partners import explained
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
+from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import is_certain, weighed
+
+ORDERS = {
+    2: np.array([[0, 1, 1], [1, 0, 0]]),
+    3: np.array([[0, 1, 2], [1, 2, 0], [2, 0, 1], [0, 2, 1], [1, 0, 2], [2, 1, 0]]),
+}
+
+SLOWEST = 2e-6  # seconds a hypothesis, before it is known
+BUILT, BUILT_FACING = 5e-7, 5e-6  # seconds a set of points when a stage begins, and one with normals
+SHORTEST = 5e-5  # seconds, in which no hypothesis is begun
+Ended = Literal["exhausted", "safe", "interrupted", "most"]
+
+
+class EnumeratedPoses(NamedTuple):
+    """Distinct poses camera = R p + t, likeliest first.
+
+    rotation: (c, 3, 3). translation: (c, 3). evidence: (c,) nats beyond chance, before the number of tests counts.
+    match: (c, m) the scene point that each image point is, -1 for none. residual: (c, m) its angle, radians, infinite
+    where there is none. fixing, tests, solved: of `Enumeration`. ended: why; "exhausted" where every hypothesis was
+    tried, "safe" where `is_safe` said so, "interrupted" by the deadline, "most" after as many as are allowed.
+    """
+
+    rotation: Array
+    translation: Array
+    evidence: Array
+    match: Places
+    residual: Array
+    fixing: int
+    tests: float
+    solved: int
+    ended: Ended
+
+
+class Enumeration:
+    """Of one problem. fixing: matches that fix a pose. reach: largest radius at which matches are looked up.
+
+    tests: log of the number of minimal problems that these points hold, times the radii that are looked at. solved: how
+    many were solved.
+    """
+
+    def __init__(self, sets: PointSets, radius: float, settings: EnumerationSettings) -> None:
+        scene = scene_side(sets.points3d, sets.normals3d, sets.labels3d)
+        self.reach = _reach(sets, scene, radius, settings)
+        image = ImageSide(sets.bearings, radius, sets.labels2d, self.reach)
+        (prior, heading, log_share), fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
+        self.scene, self.image, self.settings = scene, image, settings
+        self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
+        m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
+        self.problem = Problem(scene.arrays, image.arrays, prior, heading, fixing, image.density)
+        self.kept = Kept(
+            np.zeros((kept, 4, 3)),
+            np.full(kept, -math.inf),
+            np.zeros(kept, np.int64),
+            np.full((kept, m), -1),
+            np.zeros((kept, m)),
+            np.zeros(1, np.int64),
+            np.zeros(1),
+        )
+        matches = Matches(np.empty(m, np.int64), np.empty(m))
+        self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
+        seen = settings.seen_witnesses * n / max(m - fixing, 1)
+        near = int(np.clip(seen, settings.fewest_witnesses, settings.most_witnesses))
+        self._witnesses = np.ascontiguousarray(scene.nearest[:, :near])
+        problems = _log_choose(m, fixing) + _log_choose(n, fixing) + math.lgamma(fixing + 1) + log_share
+        self.tests = math.log(RULES.ladder) + max(problems, 0.0)
+        self._done: dict[tuple[int, float], tuple[int, int]] = {}
+        none = np.empty((0, fixing), np.int64)
+        self._block = Block(fixing, none, ORDERS[fixing], pairs(none), 0, 0, self._witnesses, 0, 1.0)
+
+    @property
+    def best(self) -> float:
+        """Evidence of the best pose, nats."""
+        return float(self.kept.evidence.max())
+
+    def seconds_to_begin(self, stage: Stage) -> float:
+        """About how long the sets of a stage take to build."""
+        image, scene = (
+            len(side) * min(near, side.shape[1]) ** (stage.matches - 1) / 2
+            for side, near in ((self.image.nearest, stage.near2d), (self.scene.nearest, stage.near3d))
+        )
+        if self.scene.has_triangles(stage.matches, stage.near3d):
+            scene = 0
+        return BUILT * image + (BUILT_FACING if len(self.scene.arrays.normals) else BUILT) * scene
+
+    def begin(self, stage: Stage) -> None:
+        """Go on with the hypotheses of a stage; those that were solved before are not solved again."""
+        m, n = len(self.image.arrays.rays), len(self.scene.arrays.points)
+        sets = sets_within(self.image.nearest, stage.near2d, stage.matches)
+        triangles = self.scene.triangles(stage.matches, stage.near3d)
+        before = self._done.get((stage.matches, stage.reach), (0, 0))
+        self._done[stage.matches, stage.reach] = len(sets), len(triangles.triples)
+        # How many witnesses make a hypothesis worth a look depends on what chance gives it.
+        chance = self._witnesses.shape[1] * m * self.image.density * stage.reach**2
+        one, two = self.settings.witness_chances
+        need = (1 if chance < one else 2 if chance < two else 3) + (stage.matches == 2)
+        need = min(need, m - stage.matches, n - stage.matches)
+        size, orders = stage.matches, ORDERS[stage.matches]
+        self._block = Block(size, sets, orders, triangles, *before, self._witnesses, need, stage.reach)
+        self._row, self._triangle = 0, 0
+        self.kept.most[0] = 0.0
+
+    @property
+    def ended(self) -> bool:
+        """Whether all hypotheses of the stage were tried."""
+        return self._row >= len(self._block.sets) * len(self._block.orders)
+
+    def sweep(self, most: int, deadline: float) -> None:
+        """Solve `most` hypotheses, or fewer if the best pose becomes better, or half of the time to the deadline is
+        over."""
+        start, stop = Clock.now(), max(self.best + 1e-9, self.tests)
+        most = int(min(most, max(0.5 * (deadline - start) / self._pace, 1)))
+        self._row, self._triangle, solved = self._explored(self._row, self._triangle, most, stop, 1.0)
+        self.solved += solved
+        if solved >= most:
+            self._pace = (Clock.now() - start) / solved
+
+    def vary_best(self) -> None:
+        """Refine the best pose again on wider matches."""
+        if math.isfinite(self.best):
+            for reach in (0.5 * self.reach, self.reach):
+                self.refine(self.kept.poses[int(self.kept.evidence.argmax())], reach)
+
+    def refine(self, pose: Array, reach: float) -> None:
+        """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
+        self.work.poses[0] = pose
+        self._explored(0, 0, 0, 0.0, reach)
+
+    def _explored(self, *where: int | float) -> tuple[int, int, int]:
+        return explore(*where, self._block, self.problem, self.kept, self.work)
+
+    def enter(self, rotation: Array, translation: Array) -> Array:
+        """A pose of the given points as (4, 3) in these frames."""
+        middle = self.image.turn @ (rotation @ self.scene.centre + translation)
+        return np.vstack([self.image.turn @ rotation, middle / self.scene.size])
+
+    def leave(self, poses: Array) -> tuple[Array, Array]:
+        """Poses (c, 4, 3) of these frames as rotations (c, 3, 3) and translations (c, 3) of the given points."""
+        rotation = self.image.turn.T @ poses[:, :3]
+        return rotation, self.scene.size * poses[:, 3] @ self.image.turn - rotation @ self.scene.centre
+
+
+def enumerate_poses(
+    sets: PointSets,
+    *,
+    radius: float,
+    deadline: float = math.inf,
+    is_safe: Callable[[EnumeratedPoses], bool] | None = None,
+    settings: EnumerationSettings = DEFAULT,
+) -> EnumeratedPoses:
+    """Poses under which image points see scene points, one-to-one within `radius`.
+
+    radius: radians, the largest residual of a match, a few standard deviations of the noise. deadline: of `Clock`.
+    is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
+    gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
+    first.
+
+    >>> import numpy as np
+    >>> rng = np.random.default_rng(0)
+    >>> points = rng.uniform(-1, 1, (8, 3))
+    >>> seen = points[:6] + [0, 0, 5]
+    >>> sets = PointSets(seen / np.linalg.norm(seen, axis=1, keepdims=True), points)
+    >>> found = enumerate_poses(sets, radius=2e-3)
+    >>> np.allclose(found.rotation[0], np.eye(3)), found.match[0].tolist()
+    (True, [0, 1, 2, 3, 4, 5])
+    """
+    run = Enumeration(sets, radius, settings)
+
+    def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
+        if run.best < run.tests:
+            return None
+        run.vary_best()
+        poses = _poses(run, "safe")
+        if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
+            is_safe is None or is_safe(poses)
+        ):
+            return poses
+        return poses._replace(ended="most") if run.solved >= 2 * settings.patience else None
+
+    complete = False
+    if (predicted := predicted_pose(sets.prior)) is not None:
+        run.refine(run.enter(*predicted), run.reach)
+        if (poses := enough(0.0)) is not None:
+            return poses
+    for stage in settings.stages:
+        if stage.matches < run.fixing:
+            continue
+        if run.seconds_to_begin(stage) > deadline - Clock.now():
+            run.vary_best()
+            return _poses(run, "interrupted")
+        run.begin(stage)
+        while not run.ended:
+            run.sweep(settings.look if run.best >= run.tests else settings.chunk, deadline)
+            if (poses := enough()) is not None:
+                return poses
+            late = deadline - Clock.now() < SHORTEST
+            if late or run.solved > settings.most:
+                run.vary_best()
+                return _poses(run, "interrupted" if late else "most")
+        complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
+        if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
+            break
+    run.vary_best()
+    return _poses(run, "exhausted" if complete else "most")
+
+
+def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: EnumerationSettings) -> float:
+    """Radii within which points are looked up: as far as a predicted pose may be off, `settings.widest` at most."""
+    needed = max([1.0, *(stage.reach for stage in settings.stages)])
+    if (predicted := predicted_pose(sets.prior)) is not None and isinstance(sets.prior, PosePrior):
+        distance = max(float(np.linalg.norm(predicted[0] @ scene.centre + predicted[1])), 1e-12)
+        turn = math.radians(sets.prior.rotation_sigma_deg) * min(scene.size / distance, 1.0)
+        off = 2 * math.hypot(turn, sets.prior.translation_sigma / distance)
+        needed = max(needed, min(off / radius, settings.widest))
+    return needed
+
+
+def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
+    """The kept poses, likeliest first."""
+    kept = run.kept
+    order = np.argsort(-kept.evidence, kind="stable")
+    order = order[np.isfinite(kept.evidence[order])]
+    rotation, translation = run.leave(kept.poses[order])
+    match, radii = kept.point[order], np.sqrt(kept.distance2[order])
+    residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
+    evidence = kept.evidence[order]
+    return EnumeratedPoses(rotation, translation, evidence, match, residual, run.fixing, run.tests, run.solved, ended)
+
+
+def margin(poses: EnumeratedPoses, settings: EnumerationSettings = DEFAULT) -> float:
+    """Nats by which the best pose exceeds both chance after all tests, and every different pose."""
+    if not len(poses.evidence):
+        return -math.inf
+    traces = np.einsum("cij,ij->c", poses.rotation, poses.rotation[0])
+    other = poses.evidence[traces < 1 + 2 * math.cos(math.radians(settings.other_deg))]
+    lead = float(poses.evidence[0] - other.max()) if len(other) else math.inf
+    return min(float(poses.evidence[0]) - poses.tests, lead)
+
+
+def _log_choose(n: int, k: int) -> float:
+    return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if n >= k else 0.0
 
 
 def is_enumerable(sets: PointSets, rule: EnumerationSettings = DEFAULT) -> bool:

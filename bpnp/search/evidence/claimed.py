@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_points, finish
+from bpnp.search.annealing import anneal_on_points, finish, multistart
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
@@ -26,10 +26,9 @@ from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.point_sets import SIGMAS, PointSets
+from bpnp.search.raster_search import around_each, search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT, SearchSettings
-from bpnp.search.sources.multistart import multistart
-from bpnp.search.sources.raster import around_each, search_beside
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 

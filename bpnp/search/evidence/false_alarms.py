@@ -40,9 +40,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.search.evidence.image_statistics import ImageStatistics, label_groups
 from bpnp.search.kernels.neighbours import sums_near
-from bpnp.search.point_sets import PointSets, faces
+from bpnp.search.point_sets import ImageStatistics, PointSets, faces, label_groups
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]

@@ -18,8 +18,8 @@ from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
+from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
-from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import SearchResult, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]

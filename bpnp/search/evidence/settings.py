@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class ImagePoints:
-    """What is evidence of image points (`bpnp.search.evidence.image_statistics`).
+    """What is evidence of image points (`bpnp.search.point_sets`).
 
     scale_step: from one scale of the residuals to the next. coarsest: scale in spacings sqrt(A / m) of the points;
     beyond, only the outline fits. floor: smallest scale in spreads of the bearings, some hundredths of a pixel of an
@@ -89,7 +89,7 @@ class Evidence:
     above 1 in 999 of 1000 cases, and never came below 0.1.
     lead: by which every alternative must be less likely: once in a thousand a wrong one is by chance. other_deg,
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
-    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.unseen`).
+    missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.alternatives`).
     independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
         a better optimum though several starts ended at a pose that exceeds chance. look_fails: that starts around a
         wrong pose miss a better one beside it, as 40 of 922 did; again_fails: that others miss it after these, as 8 of

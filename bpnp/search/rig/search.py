@@ -7,7 +7,7 @@ raster search around that with most evidence.
 """
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -16,19 +16,17 @@ from numpy.typing import NDArray
 from bpnp.geometry import distinct
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
-from bpnp.search.enumeration.poses import enumerate_poses
-from bpnp.search.enumeration.search import is_enumerable
+from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
-from bpnp.search.rig.cameras import Rig
-from bpnp.search.rig.proposals import agreement, proposals_of
+from bpnp.search.raster_search import search_beside
+from bpnp.search.rig.cameras import WIDE, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import turns
 from bpnp.search.search import lacks_partners
 from bpnp.search.settings import DEFAULT
-from bpnp.search.sources.raster import search_beside
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
 
 Array = NDArray[np.float64]
@@ -37,6 +35,8 @@ A_TURN = 2  # poses that a turn of a camera finds and that are refined
 COMPARED = 64  # proposals of which it is asked how much evidence they have
 SAME = (1.0, 0.02)  # degrees and distances of the scene within which a pose is not refined twice
 BEFORE = 1e9  # nats, more than any pose explains: of those that were refined before
+AGREE_DEG, AGREE, PAIRS = 6.0, 0.2, 50_000  # of poses of two cameras that tell a scale: turn, shift in distances, most
+LEAST_APART = 0.01  # of two cameras, in distances of the scene: a scale with which they are nearer cannot be told
 
 
 @one_blas_thread
@@ -105,11 +105,11 @@ class Together:
         """Refine at most so many of the poses that cameras propose, in the frames of their scenes if they have one,
         those that all agree with best."""
         new = {k: in_user_frame(p, self.pools[k].scene) if k in self.pools else p for k, p in new.items()}
-        rotation, translation = proposals_of(self.rig, new, self.met)
+        rotation, translation = _proposals(self.rig, new, self.met)
         for k, poses in new.items():
             self.met[k] = Candidates.concatenated([self.met[k], poses])
         if len(rotation) > COMPARED:
-            best = np.argsort(-agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
+            best = np.argsort(-_agreement(self.rig, rotation, translation), kind="stable")[:COMPARED]
             rotation, translation = rotation[best], translation[best]
         score = np.array([self.rig.evidence(*pose).sum() for pose in zip(rotation, translation, strict=True)])
         poses, known = replace(Candidates.unscored(rotation, translation), score=score), len(self.starts)
@@ -208,3 +208,54 @@ class Together:
             rule=self.rule,
             rig=[(self.rig.seen(k, self.best), sets) for k, sets in enumerate(self.rig.sets)],
         )
+
+
+def _proposals(rig: Rig, new: Mapping[int, Candidates], met: Sequence[Candidates]) -> Pose:
+    """Poses of the rig: those of each camera; or, of an unknown scale, those in which two cameras that are apart agree,
+    one of them with what it had `met` before, the middle of the scene where it is with least squares."""
+    if rig.unknowns == 6:
+        parts = [rig.rig_of(k, poses.rotation, poses.translation) for k, poses in new.items()]
+    else:
+        pairs = [(k, other, poses) for k, poses in new.items() for other in range(len(met))]
+        parts = []
+        for k, other, poses in pairs:
+            others = [met[other], *([new[other]] if other in new and other > k else [])]
+            if (min(k, other), max(k, other)) in rig.apart:
+                parts.append(_told_by(rig, (k, other), poses, Candidates.concatenated(others)))
+    if not parts:
+        return np.empty((0, 3, 3)), np.empty((0, 4))
+    rotation, translation = map(np.concatenate, zip(*parts, strict=True))
+    return rotation, translation
+
+
+def _told_by(rig: Rig, pair: tuple[int, int], first: Candidates, second: Candidates) -> Pose:
+    """Poses of the rig in which two cameras agree."""
+    (turn, shift), (other, moved) = (rig.mounts[k] for k in pair)
+    middle = rig.sets[0].middle
+    turns, others = (turn.T @ first.rotation).reshape(-1, 9), (other.T @ second.rotation).reshape(-1, 9)
+    traces = turns.astype(np.float32) @ others.T.astype(np.float32)
+    near = np.flatnonzero(traces.ravel() > 1 + 2 * math.cos(math.radians(AGREE_DEG)))
+    i, j = np.divmod(near[np.argsort(-traces.ravel()[near], kind="stable")[:PAIRS]], max(len(others), 1))
+    rotation = turn.T @ first.rotation[i]
+    seen = (first.rotation[i] @ middle + first.translation[i]) @ turn  # from the first camera, in the axes of the rig
+    way = seen - (second.rotation[j] @ middle + second.translation[j]) @ other
+    apart = shift @ turn - moved @ other
+    distance, length = np.linalg.norm(seen, axis=-1), float(np.linalg.norm(apart))
+    unit = np.maximum(way @ apart / length, LEAST_APART * distance)[:, None] / length
+    translation = np.concatenate(
+        [seen - unit * (shift @ turn) - (way - unit * apart) / 2 - rotation @ middle, unit], -1
+    )
+    agree = np.linalg.norm(way - unit * apart, axis=-1) < AGREE * distance
+    return rotation[agree], translation[agree]
+
+
+def _agreement(rig: Rig, rotations: Array, translations: Array) -> Array:
+    """How well poses (p, 3, 3), (p, 4) explain the bearings of all cameras at a wide scale, nats (p,)."""
+    total, scale = np.zeros(len(rotations)), WIDE * rig.floor
+    for k, sets in enumerate(rig.sets):
+        turns, shifts = rig.pose_of(k, rotations, translations)
+        seen = sets.points3d @ turns.transpose(0, 2, 1) + shifts[:, None]
+        seen /= np.maximum(np.linalg.norm(seen, axis=-1, keepdims=True), 1e-300)
+        nearest = (sets.bearings @ seen.transpose(0, 2, 1)).max(-1)
+        total += np.logaddexp((nearest - 1) / scale**2, -4.0).sum(-1)
+    return total
