@@ -9,7 +9,7 @@ distance from which they are seen, and a third of them dropped. Photos of the sc
 points that then fewer than two views see. Right is within 5 degrees, the centre within a tenth of the distance.
 --twice: every place is there twice, this share of the points of the second one gone; no pose there is right. A row
 begins with what it takes to open the map as a COLMAP model, and again, with the index of a large one: CPU seconds and
-peak memory of a new process before the first photo; then the rank of the views (`bpnp.maps.ranking`): of how many
+peak memory of a new process before the first photo; then the rank of the views (`bpnp.maps.views`): of how many
 photos one of the first 1, 10 and 50 views is turned by less than 30 degrees and lies within half the distance.
 """
 

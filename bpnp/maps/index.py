@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from bpnp.cameras import camera_from, plain_camera
 from bpnp.datamodules.colmap.model_files import FILES
 from bpnp.files import files_as_they_are, fingerprint, written_whole
-from bpnp.maps.ranking import RANK, Pictures
-from bpnp.maps.views import MARGIN_DEG, Array, Cones, View
+from bpnp.maps.views import MARGIN_DEG, RANK, Array, Cones, Pictures, View
 
 FILE = "bpnp_index.npz"
 LARGE = 200_000  # points of a map from which on it has an index: smaller ones are opened in two seconds without

@@ -18,7 +18,6 @@ from bpnp.datamodules.colmap.reconstruction import read_reconstruction
 from bpnp.geometry import MIN_POINTS
 from bpnp.loops.parallel import Clock, Deadline
 from bpnp.maps import index
-from bpnp.maps.all_points import on_all_points
 from bpnp.maps.localize import (
     BRIEF,
     LIKELY,
@@ -30,13 +29,24 @@ from bpnp.maps.localize import (
     among_all,
     counted,
     near_view,
+    on_all_points,
     rank,
     strongest_of,
 )
 from bpnp.maps.photos import focal_from_exif, photo_keypoints, photo_size
-from bpnp.maps.ranking import RUNG, STEP, Pictures, pictures_of_views, places_first, scores_of_views
 from bpnp.maps.twins import without_twins
-from bpnp.maps.views import Array, Cones, View, viewing_cones
+from bpnp.maps.views import (
+    RUNG,
+    STEP,
+    Array,
+    Cones,
+    Pictures,
+    View,
+    pictures_of_views,
+    places_first,
+    scores_of_views,
+    viewing_cones,
+)
 from bpnp.search.starts import PosePrior
 from bpnp.solving.arguments import check_inside, pixels_from, positive, source_from
 from bpnp.solving.focal_length import UnknownCamera, unknown_camera
@@ -155,7 +165,7 @@ class SceneMap:
         """What to look near a photo's keypoints, in this order.
 
         Each of the given views, in their order, with the points that any of them sees, since they show one place; or
-        all views of the map, each with its own points, by their rank (`bpnp.maps.ranking`). Of an unknown focal length
+        all views of the map, each with its own points, by their rank (`bpnp.maps.views`). Of an unknown focal length
         several in turns, from the likeliest, the next one after `RUNG` views with that before. None with fewer points
         than fix a pose.
 

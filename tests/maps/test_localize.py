@@ -109,7 +109,7 @@ def test_a_doubt_that_all_points_raise_is_kept_though_they_explain_no_more(
     keypoints, _ = photo_of(truth, 1)
     known = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     for name, stage in stages.items():
-        monkeypatch.setattr(f"bpnp.maps.all_points.{name}", stage)
+        monkeypatch.setattr(f"bpnp.maps.localize.{name}", stage)
     solution = scene.localize(keypoints, PINHOLE, views=["photo 1.jpg"])
     assert (known.verdict, solution.verdict) == ("confident", "ambiguous")
     assert reason in solution.reason

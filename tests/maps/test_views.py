@@ -6,8 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp import SceneMap
 from bpnp.cameras import camera_from
-from bpnp.maps.ranking import places_first, scores_of_views
-from bpnp.maps.views import View
+from bpnp.maps.views import View, places_first, scores_of_views
 
 Array = NDArray[np.float64]
 PLACES, POINTS = 60, 900
