@@ -39,15 +39,10 @@ def part(name: str) -> str:
 
 
 @functools.cache
-def imports(file: Path, *, run: bool = False) -> frozenset[str]:
-    """Modules that a file imports, anywhere in it; run: without those that only a type checker reads."""
+def imports(file: Path) -> frozenset[str]:
+    """Modules that a file imports, anywhere in it, for its types alone too."""
     found = set()
-    tree = ast.parse(file.read_text())
-    checks = [node for node in ast.walk(tree) if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"]
-    unread = {inner for node in checks for inner in ast.walk(node)} if run else set()
-    for node in ast.walk(tree):
-        if node in unread:
-            continue
+    for node in ast.walk(ast.parse(file.read_text())):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -83,7 +78,7 @@ def test_lightning_has_its_places() -> None:
 
 
 def test_modules_do_not_import_in_circles() -> None:
-    graph = {module(file): {used for used in imports(file, run=True) if used.startswith("bpnp")} for file in FILES}
+    graph = {module(file): {used for used in imports(file) if used.startswith("bpnp")} for file in FILES}
     done: set[str] = set()
 
     def visit(name: str, path: tuple[str, ...]) -> None:
@@ -95,6 +90,12 @@ def test_modules_do_not_import_in_circles() -> None:
 
     for name in graph:
         visit(name, ())
+
+
+def test_files_and_folders_have_their_sizes() -> None:
+    assert len(FILES) <= 150
+    for folder in {file.parent for file in FILES}:
+        assert 3 <= len(list(folder.glob("*.py"))) <= 12, named(folder)
 
 
 def test_no_assertion_decides_anything() -> None:

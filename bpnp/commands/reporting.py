@@ -89,8 +89,7 @@ def view(
 
 def _solution(path: Path) -> "ProblemPoints":
     """The points of a solution's file. Raises ValueError that names the file."""
-    from bpnp.solving.pictures import solution_points
-    from bpnp.solving.solution import Solution
+    from bpnp.solving.solution import Solution, solution_points
 
     try:
         return solution_points(Solution.from_json(path), title=path.stem)

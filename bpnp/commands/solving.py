@@ -102,7 +102,7 @@ def solve(
             save_figure,
             size_in_camera,
         )
-        from bpnp.solving.pictures import solution_picture
+        from bpnp.solving.solution import solution_picture
 
         if picture.suffix.lower() not in SUFFIXES:
             raise ValueError(f"expected a --picture that ends in {', '.join(SUFFIXES)}, got {picture.name!r}")

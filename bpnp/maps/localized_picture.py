@@ -9,8 +9,7 @@ from bpnp.cameras import camera_from
 from bpnp.report.figures import size_in_camera
 from bpnp.report.terminal import LIGHT, QUIET, VERDICTS
 from bpnp.search.evidence.uncertainty import centre_covariance
-from bpnp.solving.pictures import solution_points
-from bpnp.solving.solution import Solution
+from bpnp.solving.solution import Solution, solution_points
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

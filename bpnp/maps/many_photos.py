@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import camera_from, plain_camera
 from bpnp.datamodules.colmap.model_files import FILES, model_format
@@ -21,7 +21,6 @@ from bpnp.maps.localized_picture import localized_picture
 from bpnp.maps.photos import photo_keypoints
 from bpnp.maps.scene_map import UNKNOWN, SceneMap
 from bpnp.report.figures import read_photo, save_figure
-from bpnp.solving.pictures import pose_text
 from bpnp.solving.solution import Solution
 
 CHANGES = {"photo": "another photo", "map": "another map", "views": "other views", "keypoints": "other keypoints"}
@@ -259,7 +258,8 @@ class SolutionFolder:
         lines = [POSES_HEADER]
         for name, record in photos.items():
             if record["verdict"] == "confident" and name not in others:
-                lines.append(f"{name} {pose_text(*(np.array(record[key]) for key in ('rotation', 'translation')))}\n")
+                x, y, z, w = Rotation.from_matrix(record["rotation"]).as_quat(canonical=True).tolist()
+                lines.append(f"{name} {' '.join(map(repr, (w, x, y, z, *record['translation'])))}\n")
         write_text(self.path / "poses.txt", "".join(lines))
 
     def _record(self, name: str, text: str) -> None:

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 SUFFIXES = (".png", ".svg", ".pdf")
 POINTS = 981  # of a curve
 MARGIN = 0.15  # of the extent of the image points, around them
+WIDTH, CLOSE_UP, CAPTIONS = 10.0, 3.5, 1.3  # inches, of an image beside its residuals
 LIMITS: dict[Error, float] = {"rotation_deg": 20.0, "translation": 1.0, "joint": 20.0, "reprojection_deg": 2.0}
 Lines = Literal["match3d", "assigned3d"]
 
@@ -194,6 +195,22 @@ def plot_residuals(
     axes.set_title(f"residuals, {_unit(problem)}", fontsize=9)
     axes.tick_params(labelsize=7)
     return axes
+
+
+def plot_matches(problem: ProblemPoints, *, colour: str, photo: Array | None = None) -> "Figure":
+    """The image of a problem and a close-up of its residuals below its id, in a colour; photo: as for `plot_image`."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(layout="constrained")
+    axes, close = figure.subplots(1, 2, width_ratios=(WIDTH, CLOSE_UP))
+    plot_image(axes, problem, photo=photo)
+    plot_residuals(close, problem)
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    height = float(np.clip(WIDTH * (bottom - top) / (right - left), 3, 10))
+    figure.set_size_inches(WIDTH + CLOSE_UP, height + CAPTIONS)
+    figure.suptitle(problem.id.replace("$", r"\$"), fontsize=10, color=colour)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", ncols=3, frameon=False, fontsize=8)
+    return figure
 
 
 def save_figure(figure: "Figure", path: Path | str, *, dpi: int = 110) -> Path:

@@ -4,6 +4,7 @@ import base64
 import io
 import json
 import math
+import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import partial
@@ -22,9 +23,12 @@ from bpnp.solving.problem import Unit
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from bpnp.report.points import ProblemPoints
+
 Array = npt.NDArray[np.float64]
 ROTATION = 3  # numbers of a turn: of points at infinity, no more is known
 FORMAT = 2  # 2 has the false alarms
+LINE = 130  # characters of the reason in a picture
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,7 +189,6 @@ class Solution:
         camera. Raises ValueError for a photo without a camera, and if no image point is in front of the camera.
         """
         from bpnp.report.figures import read_photo
-        from bpnp.solving.pictures import solution_picture
 
         picture = read_photo(photo) if isinstance(photo, (Path, str)) else photo
         drawn = self if camera is None else replace(self, camera=camera_from(camera))
@@ -210,9 +213,14 @@ class Solution:
         the image file. size: its width and height, pixels; by default the camera's, or what holds the points. Raises
         ValueError without a pose.
         """
-        from bpnp.solving.pictures import write_colmap
+        from bpnp.datamodules.colmap.reconstruction import write_image
 
-        return write_colmap(self, Path(folder), camera=camera, name=name, size=size)
+        if not self.found:
+            raise ValueError(f"expected a solution with a pose to export, got none: {self.reason}")
+        pose = self.rotation, self.translation / self.scale  # a camera does not see the unit
+        lens = self.camera if camera is None else camera
+        points = self.points2d, self.points3d, self.match_places
+        return write_image(Path(folder), *points, pose, camera=lens, name=name, size=size)
 
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""
@@ -269,6 +277,40 @@ def with_pose(
         log10_false_alarms=candidates[0].log10_false_alarms,
         stats=replace(solution.stats, residual=residual, converged=solution.verdict == "confident"),
     )
+
+
+def solution_points(solution: Solution, *, title: str | None = None) -> "ProblemPoints":
+    """The points of a solution, ready to draw; its id is the title, the verdict with its figures, and the reason.
+
+    Raises ValueError if a match has no point.
+    """
+    from bpnp.report.points import ProblemPoints
+
+    shown = "no match"
+    if len(solution.matches):
+        share, error = f"{100 * solution.inlier_ratio:.0f} %", f"{solution.reprojection_error:.3g} {solution.unit}"
+        shown = f"{solution.inlier_count} matches ({share}), mean error {error}"
+    matches, points2d, points3d = solution.match_places, solution.points2d, solution.points3d
+    assigned = np.full(len(points3d), -1, np.int32)
+    if len(matches):
+        most = np.max(matches, axis=0)
+        if np.min(matches) < 0 or most[0] >= len(points2d) or most[1] >= len(points3d):
+            sizes = f"{len(points2d)} 2D and {len(points3d)} 3D points"
+            raise ValueError(f"expected `matches` of {sizes}, got indices up to {most.tolist()}")
+        assigned[matches[:, 1]] = matches[:, 0]
+    lines = [*([] if title is None else [title]), f"{solution.verdict}: {shown}", textwrap.fill(solution.reason, LINE)]
+    return ProblemPoints(
+        0, "\n".join(lines), points2d, points3d, np.full_like(assigned, -1), assigned,
+        estimates={"solution": (solution.rotation, solution.translation / solution.scale)}, camera=solution.camera,
+    )  # fmt: skip
+
+
+def solution_picture(solution: Solution, *, title: str | None = None, photo: Any = None) -> "Figure":
+    """`solution_points` drawn, and a close-up of the residuals; photo: (h, w, 3) uint8 under the points."""
+    from bpnp.report.figures import plot_matches
+    from bpnp.report.terminal import VERDICTS
+
+    return plot_matches(solution_points(solution, title=title), colour=VERDICTS[solution.verdict], photo=photo)
 
 
 def _largest(covariance: Array) -> float:

@@ -1,19 +1,22 @@
-"""From COLMAP models to the 2D and 3D points of every image, as numpy arrays."""
+"""From COLMAP models to the 2D and 3D points of every image, as numpy arrays; and from those of an image to a model."""
 
 import logging
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, colmap_camera
+from bpnp.cameras import Camera, Lens, camera_from, colmap_camera
 from bpnp.datamodules.colmap.model_files import CameraRecord, ColmapError, ImageRecord, read_records
+from bpnp.files import written_whole
 
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
+NOMINAL_FOCAL = 1000.0  # pixels, of points without a camera
 logger = logging.getLogger(__name__)
 
 
@@ -143,3 +146,61 @@ def _image_points(
     points2d, clutter2d = undistorted[matched[by_error[first]]], undistorted[~has_point & usable]
     pose, sides = (rotation, record.translation), (points2d.astype(np.float32), seen, clutter2d.astype(np.float32))
     return ImagePoints(record.name, record.image_id, camera, *pose, observed, *sides)
+
+
+def write_image(
+    folder: Path,
+    points2d: NDArray[np.float64],
+    points3d: NDArray[np.float64],
+    matches: NDArray[np.int64],
+    pose: tuple[NDArray[np.float64], NDArray[np.float64]],
+    *,
+    camera: Any,
+    name: str,
+    size: tuple[int, int] | None,
+) -> Path:
+    """Write a COLMAP model of one image in text files: normalised points (m, 2) and (n, 3), places (k, 2) of those that
+    match, and rotation and translation; camera, name and size are those of `Solution.to_colmap`."""
+    if not name or name.split() != [name]:
+        raise ValueError(f"expected a `name` without spaces, which COLMAP's text files do not hold, got {name!r}")
+    import pycolmap  # after bpnp.cameras, which loads zlib before it
+
+    lens, (rotation, translation) = _colmap_lens(camera, points2d), pose
+    pixels = lens.project(np.column_stack([points2d, np.ones(len(points2d))]))
+    model = pycolmap.Reconstruction()
+    width, height = size or (lens.camera.width, lens.camera.height)
+    if not width:
+        width, height = np.ceil(np.nanmax(pixels, axis=0)).astype(int).tolist()
+    described = {"model": lens.camera.model, "params": lens.camera.params, "width": width, "height": height}
+    model.add_camera_with_trivial_rig(pycolmap.Camera(camera_id=1, **described))
+    projected = np.flatnonzero(np.isfinite(pixels).all(-1))
+    number = {int(i): k for k, i in enumerate(projected)}  # of the 2D points that the image has
+    seen = [pycolmap.Point2D(pixel) for pixel in pixels[projected]]
+    image = pycolmap.Image(name=name, image_id=1, camera_id=1, points2D=seen)
+    model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation))
+    partner = {j: i for i, j in matches.tolist() if i in number}
+    reprojected = lens.project(points3d @ rotation.T + translation)
+    for j, point in enumerate(points3d):
+        track = pycolmap.Track([pycolmap.TrackElement(1, number[partner[j]])] if j in partner else [])
+        added = model.add_point3D(point, track, np.full(3, 128, np.uint8))
+        if j in partner:
+            model.points3D[added].error = float(np.linalg.norm(pixels[partner[j]] - reprojected[j]))
+    with written_whole(folder) as temporary:
+        temporary.mkdir()
+        model.write_text(temporary)
+    return folder
+
+
+def _colmap_lens(camera: Any, points2d: NDArray[np.float64]) -> Lens:
+    """The camera as one of COLMAP's; without one a pinhole of `NOMINAL_FOCAL` pixels that holds all points."""
+    if camera is None:
+        half = NOMINAL_FOCAL * np.nanmax(np.abs(points2d), axis=0)
+        camera = ("PINHOLE", (NOMINAL_FOCAL, NOMINAL_FOCAL, *half.tolist()))
+    lens: Camera = camera_from(camera)
+    if not isinstance(lens, Lens):
+        matrix = lens.matrix
+        if abs(matrix[0, 1]) > 1e-9 * matrix[0, 0]:
+            raise ValueError(f"expected a camera without skew, which COLMAP has none of, got {matrix.tolist()}")
+        lens = camera_from(("PINHOLE", (matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2])))
+    assert isinstance(lens, Lens)
+    return lens
