@@ -74,50 +74,50 @@ def diagonal_mass(assignment: Tensor) -> float:
     return float(assignment.detach().diagonal(dim1=-2, dim2=-1).sum(-1).mean())
 
 
-Race = tuple[float, float, float]  # milliseconds of ours and of the paper's, and how many times longer the second takes
+Row = tuple[str, str, Callable[[], object], Callable[[], object]]  # what, on which inputs, by ours and the paper's way
 
 
-def race(ours: Callable[[], object], papers: Callable[[], object], *, rounds: int) -> Race:
-    """Processor time of both in turns, after each was called once to warm up and once to see how long it takes."""
+def race(ours: Callable[[], object], papers: Callable[[], object], rounds: int) -> tuple[float, float, float]:
+    """Processor milliseconds of both in turns, after each was called once to warm up and once to see how long it takes,
+    and how many times longer the second takes."""
     timers = [Timer(candidate, timer=time.process_time) for candidate in (ours, papers)]
     repeats = [max(1, round(SHORTEST / max(timer.repeat(2, 1)[1], 1e-6))) for timer in timers]
     turns = [[1000 * t.timeit(n) / n for t, n in zip(timers, repeats, strict=True)] for _ in range(rounds)]
     return *(float(x) for x in np.median(turns, 0)), float(np.median([b / a for a, b in turns]))  # type: ignore[return-value]
 
 
-def rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:
-    """What, on which inputs, and its race."""
-    yield from pnp_rows(points, batch, rounds)
+def rows(points: int, batch: int) -> Iterator[Row]:
+    yield from pnp_rows(points, batch)
     for kind, level, mu, iterations in FORWARD:
         cost = planted(batch, points, kind=kind, level=level)[1]
         tolerance = SINKHORN_TOLERANCE if iterations == MANY else 0
         ours, papers = partial(sinkhorn, cost, mu=mu), partial(PaperSinkhorn.apply, cost, mu, iterations, tolerance)
         ends = "to its tolerance" if tolerance else f"{iterations} iterations"
         inputs = f"{kind}, {diagonal_mass(ours()[0]):.0%}"
-        yield f"Sinkhorn forward, mu {mu}, the paper's {ends}", inputs, race(ours, papers, rounds=rounds)
+        yield f"Sinkhorn forward, mu {mu}, the paper's {ends}", inputs, ours, papers
     for kind, level in BACKWARD:
         cost = planted(batch, points, kind=kind, level=level)[1].requires_grad_()
         plan = sinkhorn(cost, mu=MU)[0]
         back = [gradient_of(each, cost, 1 - 2 * torch.eye(points).expand_as(plan))
                 for each in (plan, PaperSinkhorn.apply(cost, MU))]  # fmt: skip
-        yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", race(*back, rounds=rounds)
+        yield "Sinkhorn backward", f"{kind}, {diagonal_mass(plan):.0%}", back[0], back[1]
 
 
-def pnp_rows(points: int, batch: int, rounds: int) -> Iterator[tuple[str, str, Race]]:
+def pnp_rows(points: int, batch: int) -> Iterator[Row]:
     problems, cost = planted(batch, points, kind="smooth", level=10)
     plan, rays, points3d = sinkhorn(cost)[0], bearings(problems.points2d), problems.points3d
     start = ransac_pnp(plan, problems.points2d, points3d)[:2]
     inputs, vector = f"smooth, {diagonal_mass(plan):.0%}", torch.cat([roma.rotmat_to_rotvec(start[0]), start[1]], -1)
     ours = partial(weighted_pnp, plan, rays, points3d, *start)
     papers = partial(PaperPnP.apply, *(x.double() for x in (plan, rays, points3d, vector)))
-    yield "PnP forward, from RANSAC", inputs, race(ours, papers, rounds=rounds)
+    yield "PnP forward, from RANSAC", inputs, ours, papers
 
     leaf = plan.clone().requires_grad_()
     solved, pose = weighted_pnp(leaf, rays, points3d, *start)[:2], PaperPnP.apply(leaf, rays, points3d, vector)
     incoming = [torch.randn(x.shape, generator=torch.Generator().manual_seed(0)) for x in solved]
     papers_pose = roma.rotvec_to_rotmat(pose[:, :3]), pose[:, 3:]
     back = [gradient_of(each, leaf, incoming) for each in (solved, papers_pose)]
-    yield "PnP backward", inputs, race(*back, rounds=rounds)
+    yield "PnP backward", inputs, back[0], back[1]
 
 
 def gradient_of(outputs: Any, inputs: Tensor, incoming: Any) -> Callable[[], object]:
@@ -133,8 +133,10 @@ def main() -> None:
     keep_freed_memory()
     torch.set_num_threads(1)
     found = []
-    for what, inputs, (ours, papers, ratio) in rows(chosen.points, chosen.batch, chosen.rounds):
-        print(f"{what}; {inputs}: ours {ours:.3g} CPU ms, the paper's {papers:.3g}, ratio {ratio:.3g}", flush=True)
-        found.append({"what": what, "inputs": inputs, "ms": [ours, papers], "ratio": ratio})
+    for what, inputs, ours, papers in rows(chosen.points, chosen.batch):
+        if any(part in f"{what}; {inputs}" for part in chosen.only):
+            *ms, ratio = race(ours, papers, chosen.rounds)
+            print(f"{what}; {inputs}: ours {ms[0]:.3g} CPU ms, the paper's {ms[1]:.3g}, ratio {ratio:.3g}", flush=True)
+            found.append({"what": what, "inputs": inputs, "ms": ms, "ratio": ratio})
     if chosen.output:
         write(chosen.output, {"points": chosen.points, "batch": chosen.batch, "rows": found})

@@ -2,6 +2,7 @@
 
 import json
 import runpy
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import partial
@@ -96,6 +97,9 @@ def test_layers_command_writes_what_it_measured(tmp_path: Path, monkeypatch: pyt
     assert record["machine"]["threads"] == 1
     what = {row["what"].split(",")[0] for row in record["rows"]}
     assert what == {"PnP forward", "PnP backward", "Sinkhorn forward", "Sinkhorn backward"}
+    monkeypatch.setattr("sys.argv", [*sys.argv, "--only", "PnP backward"])
+    bench_layers.main()
+    assert [row["what"] for row in json.loads(out.read_text())["rows"]] == ["PnP backward"]
 
 
 def test_shapes_are_seen_where_the_pose_puts_them() -> None:

@@ -60,12 +60,11 @@ def localize(
         time_limit: seconds a photo.
         seed: of the search.
     """
-    from bpnp.checks import check_positive
     from bpnp.datamodules.colmap.model_files import model_format
     from bpnp.maps.many_photos import SolutionFolder, content_of_map, localize_photos, read_views
     from bpnp.maps.photos import photo_files
     from bpnp.maps.scene_map import SceneMap
-    from bpnp.solving.arguments import source_from
+    from bpnp.solving.arguments import positive, source_from
 
     swapped = any(model_format(photo) for photo in photos)
     if map.is_file() or (swapped and not model_format(map)):
@@ -74,9 +73,8 @@ def localize(
     if keypoints is not None and not keypoints.is_file():
         raise ValueError(f"expected hloc's or COLMAP's file of keypoints, got {keypoints}, which is no file")
     source_from(solver)  # raises, where each photo would
+    positive("time_limit", time_limit)
     files, scene = photo_files(photos, besides=output), SceneMap.from_colmap(map)
-    if time_limit is not None:
-        check_positive(time_limit=time_limit)
     attempts, lens = _attempts(cluster), None if camera is None else _camera(camera, map, scene)
     tried = None if views is None else read_views(views)
     with claimed(output), progress() as shown:

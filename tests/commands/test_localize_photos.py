@@ -83,7 +83,7 @@ def test_bad_input_is_one_clear_error(place: tuple[Path, Path], tmp_path: Path, 
         (("--keypoints", "nothing.h5"), "of keypoints, got nothing.h5, which is no file"),
         (("--solver", "nothing"), "or packaged weights"),
         (("--model", str(model)), "nrecognized arguments: --model"),
-        (("--time_limit", "-1"), "expected `time_limit` > 0, got -1.0"),
+        (("--time_limit", "-1"), "expected a positive `time_limit`, got -1.0"),
         (("--views", "nothing.txt"), "expected a text file of lines `photo view`"),
         (("--output", str(tmp_path / "plain.jpg")), "expected a folder to write to, got"),
     ):
