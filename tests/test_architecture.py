@@ -6,7 +6,7 @@ from pathlib import Path
 
 PACKAGE = Path(__file__).parents[1] / "bpnp"
 FILES = sorted(PACKAGE.rglob("*.py"))
-GROUND = {"types", "geometry", "cameras", "files", "lazy", "metrics", "loops", "precision", "checks"}
+GROUND = {"types", "geometry", "cameras", "files", "metrics", "loops", "precision", "checks"}
 # What each part may import beside itself and the ground floor.
 MAY_IMPORT = {
     **dict.fromkeys(GROUND, set()),

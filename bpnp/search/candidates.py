@@ -1,4 +1,4 @@
-"""Candidate poses of one pair: the one record of them, and how poses that are the same are merged."""
+"""Candidate poses of one problem: the one record of them, and how poses that are the same are merged."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ EXCEEDS = 1e3  # nats a bearing, more than any log-likelihood
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """c poses of one pair, camera = R p + t, and how well they explain the bearings.
+    """c poses of one problem, camera = R p + t, and how well they explain the bearings.
 
     rotation: (c, 3, 3). translation: (c, 3). In the frame of a `Scene` in float32, in that of the user in float64.
     score: (c,) mean log-likelihood of the bearings, nats; -inf for a pose that the points do not fix.

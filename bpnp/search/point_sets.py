@@ -16,7 +16,7 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
-TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two pairs fix a pose
+TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two matches fix a pose
 SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
 LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
 IMAGE = ImagePoints()
@@ -148,7 +148,7 @@ class PointSets:
 
     @property
     def pairs_that_fix(self) -> int:
-        """How many pairs of points fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
+        """How many matches fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
         return 2 if self.knows_rotation or isinstance(self.prior, GravityPrior) else 3
 
     @property
@@ -159,8 +159,8 @@ class PointSets:
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.
 
-        Of poses that fit pairs of these points: their rotations fill SO(3) evenly, the directions to the middle of the
-        scene fill the view, and the logarithms of its distance a factor of 30.
+        Of poses that fit matches of these points: their rotations fill SO(3) evenly, the directions to the middle of
+        the scene fill the view, and the logarithms of its distance a factor of 30.
         """
         if self.prior is None:
             return 0.0

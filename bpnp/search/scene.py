@@ -1,4 +1,4 @@
-"""A pair of point sets as the search sees it: normalised, shuffled, and summed up in weighted clusters."""
+"""A problem as the search sees it: normalised, shuffled, and summed up in weighted clusters."""
 
 import math
 from collections.abc import Sequence
@@ -39,7 +39,7 @@ class Companion(NamedTuple):
 
 
 class Scene:
-    """One pair, the points centred and scaled to unit extent, the camera turned to the mean bearing, in random order.
+    """A problem, the points centred and scaled to unit extent, the camera turned to the mean bearing, in random order.
 
     offsets: (m, 3) of the unit bearings from (0, 0, 1), their mean direction after `frame` (3, 3) has turned the
     camera: float32 keeps the digits of a narrow view in them. points3d: (n, 3). bulk3d: those of them that decide

@@ -148,25 +148,18 @@ def search_proposed(
 
 
 @one_blas_thread
-def refine_poses(
-    sets: PointSets,
-    rotation: NDArray[np.float64],
-    translation: NDArray[np.float64],
-    *,
-    seed: int = 0,
-    settings: SearchSettings = DEFAULT,
-) -> SearchResult:
+def refine_poses(sets: PointSets, rotation: NDArray[np.float64], translation: NDArray[np.float64]) -> SearchResult:
     """The likeliest poses that annealing reaches from given ones and from poses around them.
 
     The objective is that of `search_poses`. A start may be some 10 degrees off, and more where there are many: those
-    beyond `settings.refined_directly` are first annealed on clusters, as the search does, and the likeliest go on.
+    beyond `refined_directly` are first annealed on clusters, as the search does, and the likeliest go on.
 
     rotation (s, 3, 3), translation (s, 3): the starts; those with NaN are missing.
 
     `batches` of the result is the number of starts that were annealed. Without a start, or with points that fix no
     pose, there are no candidates.
     """
-    scene = Scene(sets, seed, settings)
+    settings, scene = DEFAULT, Scene(sets, 0, DEFAULT)
     starts = _entered(scene, rotation, translation)
     if not len(starts) or degenerate(sets.bearings) or degenerate(sets.points3d):
         return no_pose("no start, or points that fix no pose")

@@ -274,10 +274,10 @@ def _log_choose(n: int, k: int) -> float:
     return math.lgamma(n + 1) - math.lgamma(k + 1) - math.lgamma(n - k + 1) if n >= k else 0.0
 
 
-def is_enumerable(sets: PointSets, rule: EnumerationSettings = DEFAULT) -> bool:
+def is_enumerable(sets: PointSets) -> bool:
     """Whether the points have so few hypotheses that they are enumerated."""
     products = len(sets.bearings) * len(sets.points3d)
-    return products <= (rule.most_products if sets.pairs_that_fix == 3 else rule.most_products_known)
+    return products <= (DEFAULT.most_products if sets.pairs_that_fix == 3 else DEFAULT.most_products_known)
 
 
 def exceeds_enumeration(sets: PointSets) -> bool:
@@ -285,9 +285,7 @@ def exceeds_enumeration(sets: PointSets) -> bool:
     return not is_enumerable(replace(sets, prior=None))
 
 
-def search_by_enumeration(
-    sets: PointSets, deadline: Deadline, settings: SearchSettings, rule: EnumerationSettings = DEFAULT
-) -> tuple[Candidates, bool]:
+def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
     """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried, or none
     needs to be, since the best pose is certain.
 
@@ -301,30 +299,28 @@ def search_by_enumeration(
 
     def is_safe(poses: EnumeratedPoses) -> bool:
         nonlocal certain
-        candidates = weighed(_candidates(poses, annotated, settings, rule), sets, settings.evidence)
+        candidates = weighed(_candidates(poses, annotated, settings), sets, settings.evidence)
         certain = candidates if is_certain(candidates, sets, settings.evidence) else None
         return certain is not None
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
         radius = rule.radius_at(sets.floor)
         poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
-        return poses, _candidates(poses, annotated, settings, rule) if certain is None else certain
+        return poses, _candidates(poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
-    poses, candidates = enumerated(sets, replace(rule, stages=()) if near else rule)
-    if certain is None and tracked and (near or margin(poses, rule) < 0):
-        poses, others = enumerated(replace(sets, prior=None), rule)
+    poses, candidates = enumerated(sets, replace(DEFAULT, stages=()) if near else DEFAULT)
+    if certain is None and tracked and (near or margin(poses) < 0):
+        poses, others = enumerated(replace(sets, prior=None), DEFAULT)
         candidates = Candidates.concatenated([candidates, others])
         candidates = candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]]
     return candidates, certain is not None or poses.ended == "exhausted"
 
 
-def _candidates(
-    poses: EnumeratedPoses, sets: PointSets, settings: SearchSettings, rule: EnumerationSettings
-) -> Candidates:
+def _candidates(poses: EnumeratedPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
     """The poses that are not far less likely than the best one; scale and likelihood as the annealing defines them."""
-    rivals = poses.evidence >= (poses.evidence.max() if len(poses.evidence) else 0.0) - rule.near_nats
+    rivals = poses.evidence >= (poses.evidence.max() if len(poses.evidence) else 0.0) - DEFAULT.near_nats
     rivals &= np.arange(len(rivals)) < settings.kept
     rotation, translation, residual = (x[rivals] for x in (poses.rotation, poses.translation, poses.residual))
     matched = np.isfinite(residual)

@@ -127,7 +127,7 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
         apart = others_alone >= limits.alone * alone and alone + others_alone >= least
         decades = max(float(gap.sum()), 0.0) ** 2 / max(squared, 1e-300) / (2 * math.log(10))
         if decades < rule.lead and (apart or (same & first.near & other.near).sum() < limits.same * other.near.sum()):
-            degrees = _degrees(candidates, k)
+            degrees = math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
             what = f"a pose {degrees:.0f} deg away explains so many other points that both may be chance"
             return Alternative(decades, what)
     return None
@@ -136,10 +136,6 @@ def contesting(seen: Seen, rule: Evidence) -> Alternative | None:
 def number(log10: float) -> str:
     """10^x in words that can be read at a glance."""
     return f"{10**log10:.2g}" if -3 < log10 < 5 else f"1e{log10:.0f}"
-
-
-def _degrees(candidates: Candidates, k: int) -> float:
-    return math.degrees(turned_by(candidates.rotation[0], candidates.rotation[k]))
 
 
 class _Partners(NamedTuple):

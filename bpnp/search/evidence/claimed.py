@@ -28,7 +28,7 @@ from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.point_sets import SIGMAS, PointSets
 from bpnp.search.raster_search import around_each, search_beside
 from bpnp.search.scene import Scene
-from bpnp.search.settings import DEFAULT, SearchSettings
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 
@@ -45,16 +45,15 @@ def judge_claim(
     refine: bool = True,
     seed: int = 0,
     deadline: Deadline = NEVER,
-    settings: SearchSettings = DEFAULT,
 ) -> tuple[SearchResult, Candidates]:
     """The verdict on a pose (3, 3), (3,), the first of the candidates; with `refine` on the optimum beside it, if that
     is the same pose: turned and moved by no more than a verdict calls another one, or than the points leave open. And
     this optimum (1,), the pose beside the given one that the points agree with best, if there is one."""
     # What is far away is not asked: no starts were drawn from anywhere.
-    rule = replace(settings.evidence, another=0.0)
+    rule = replace(DEFAULT.evidence, another=0.0)
     one = replace(sets, log10_tried=0.0)
-    claim = _unrefined(one, rotation, translation, settings)
-    others, looks, exhaustive = _met(sets, claim, seed, deadline, settings)
+    claim = _unrefined(one, rotation, translation)
+    others, looks, exhaustive = _met(sets, claim, Scene(sets, seed, DEFAULT, deadline))
     others = _weighed_anew(others, one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
@@ -69,7 +68,7 @@ def judge_claim(
         claim = optimum
     candidates = _weighed_anew(Candidates.concatenated([claim, others[~same]]), one)
     result = judged(candidates, one, batches=looks, looks=looks, exhaustive=exhaustive, rule=rule)
-    scene = Scene(one, seed, settings, deadline)
+    scene = Scene(one, seed, DEFAULT, deadline)
     result = against_rivals(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
     result = _of_claim(result, candidates[:1])
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
@@ -81,13 +80,10 @@ def judge_claim(
     return replace(result, batches=max(looks, 1) if refined else 0), optimum  # no last fit to the matches
 
 
-def _met(
-    sets: PointSets, claim: Candidates, seed: int, deadline: Deadline, settings: SearchSettings
-) -> tuple[Candidates, int, bool]:
+def _met(sets: PointSets, claim: Candidates, scene: Scene) -> tuple[Candidates, int, bool]:
     """Distinct poses that annealing reaches from a claim, and others around it and far away; how often was looked
     around it, and whether all poses of these points were tried."""
-    scene = Scene(sets, seed, settings, deadline)
-    start = in_scene_frame(claim, scene)
+    start, settings, deadline = in_scene_frame(claim, scene), scene.settings, scene.deadline
     wide = settings.middle[-1].last_scale * scene.spread
     around = Candidates.concatenated([start, around_each(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
@@ -99,8 +95,7 @@ def _met(
         leader = merged(parts, scene)[:1]
         parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
         looks += not deadline.passed()
-    for batch in range(0 if exhaustive else settings.schedule.claimed):
-        parts.append(multistart(scene, batch, None)[0])
+    parts += [multistart(scene, batch, None)[0] for batch in range(0 if exhaustive else settings.schedule.claimed)]
     poses = finish(scene, merged(parts, scene), settings.finished)
     return in_user_frame(poses, scene), looks, exhaustive
 
@@ -122,7 +117,7 @@ def _mirrored(scene: Scene, pose: Candidates) -> Candidates:
     return Candidates.unscored(rotation[None], (seen - rotation @ middle)[None].astype(np.float32))
 
 
-def _unrefined(sets: PointSets, rotation: Array, translation: Array, settings: SearchSettings) -> Candidates:
+def _unrefined(sets: PointSets, rotation: Array, translation: Array) -> Candidates:
     """A pose as it is (1,), at the scale of residuals at which chance explains it least."""
     scale = likeliest_scale(sets, rotation, translation)
     score, matched = explained(sets, rotation, translation, scale)

@@ -14,16 +14,16 @@ at most 1 / b (Markov). From this follow
 
     log10 NFA = log10 T - log10 mean_{s, w} prod_i x_i^(1 / c_i),
 
-T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three pairs exactly, (m)_3 = m (m - 1) (m - 2); at a scale s at
+T = 2 (m)_3 (n)_3 / 6, the number of poses that fit three matches exactly, (m)_3 = m (m - 1) (m - 2); at a scale s at
 which fewer poses can be told apart, the number of these (`log10_cells`). The three largest x_i are left out, whatever
-their c_i: three pairs fix the six degrees of freedom and are no evidence. c_i is the number of image points within 2 s
-of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained from
-one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where more points lie within 2 s'
-than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was looked at.
-A prior reduces T to the share of the poses that it allows.
+their c_i: three matches fix the six degrees of freedom and are no evidence. c_i is the number of image points within
+2 s of point i: keypoints that lie together are one observation. So is the place of a clump: of log x_i, what is gained
+from one scale to the next finer one s' counts with 1 / c_i(s'), over its expected value, where more points lie within
+2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was
+looked at. A prior reduces T to the share of the poses that it allows.
 
-Where the focal length is fitted too, four pairs fix the seven unknowns: T = 2 (m)_4 (n)_4 / 4!, or that of a pose times
-the focal lengths that can be told apart, if these are fewer; and the four largest x_i are left out.
+Where the focal length is fitted too, four matches fix the seven unknowns: T = 2 (m)_4 (n)_4 / 4!, or that of a pose
+times the focal lengths that can be told apart, if these are fewer; and the four largest x_i are left out.
 
 A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
 factor of two of it count; the terms from four times it on say how well a rougher alignment explains the image.
@@ -46,7 +46,7 @@ from bpnp.search.point_sets import ImageStatistics, PointSets, faces, label_grou
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 
-FIXING = 3  # pairs that fix a pose; one more fixes a focal length too
+FIXING = 3  # matches that fix a pose; one more fixes a focal length too
 SHARES = np.array([0.15, 0.4, 0.75])  # w
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
@@ -91,7 +91,7 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
 
 
 def log10_tests(sets: PointSets) -> float:
-    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three pairs with about two poses each; of labels that agree, if given.
+    """log10 of 2 (m)_3 (n)_3 / 3!: choices of three matches with about two poses each; of labels that agree, if given.
 
     The number of poses that were tried, where the sets say it.
     """
