@@ -17,14 +17,13 @@ from bpnp.search.settings import Stages
 from bpnp.search.starts import Array, Prior, draw_poses
 
 
-def multistart(scene: Scene, number: int, prior: Prior | None) -> tuple[Candidates, float]:
-    """Distinct poses of one batch of starts over all rotations, or those that a prior allows; and its share of a full
-    one. number: of the batch, counted from 0."""
+def multistart(scene: Scene, number: int, prior: Prior | None) -> Candidates:
+    """Distinct poses of one batch of starts over all rotations, or those that a prior allows. number: of the batch,
+    counted from 0."""
     settings = scene.settings
     recipe = settings.recipes[number % len(settings.recipes)]
     drawn = draw_poses(scene.spread, scene.bulk3d, settings.batch(number), recipe, prior, scene.rng)
-    poses = Candidates.unscored(*drawn, hits=1)
-    return run_batch(scene, poses), len(poses) / settings.starts
+    return run_batch(scene, Candidates.unscored(*drawn, hits=1))
 
 
 def run_batch(scene: Scene, starts: Candidates) -> Candidates:

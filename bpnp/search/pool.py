@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import same_pose
 from bpnp.search.annealing import finish
-from bpnp.search.candidates import Candidates, best_distinct, in_scene_frame, in_user_frame, merged
+from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
 from bpnp.search.evidence.false_alarms import log10_tests
 from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.point_sets import PointSets
@@ -20,8 +20,7 @@ class Pool:
     """Distinct poses of a scene, best first, from all turns of a search.
 
     enumerated: the result of the enumeration of few points, whose poses are the first. candidates: at most
-    `settings.kept`. rotations: the likeliest ones of different rotations. turns: so far. missed: log10 of the
-    probability that a better optimum than the best pose was not met.
+    `settings.kept`. turns: so far. missed: log10 of the probability that a better optimum was not met.
     surrounded, searched: poses around which was searched in vain, of those that exceed chance, and of others.
     """
 
@@ -35,7 +34,7 @@ class Pool:
 
     def forget(self) -> None:
         """Drop all poses."""
-        self.candidates = self.rotations = self.surrounded = Candidates.none()
+        self.candidates = self.surrounded = Candidates.none()
         self.searched: list[Candidates] = []
         self._around: Candidates | None = None
         self.missed = 0.0
@@ -55,7 +54,6 @@ class Pool:
             self.candidates = self._weighed(self.candidates)
             self.candidates = self.candidates[np.argsort(-self.candidates.preference, kind="stable")]
             self.missed = self._missed()
-        self.rotations = self.different([self.rotations, found])
 
     def look_around(self, pose: Candidates) -> None:
         """The next turn searches the surroundings of a pose (1,): in vain, if none is much less likely by chance."""
@@ -101,11 +99,6 @@ class Pool:
         together, settings = Candidates.concatenated([pose, *self.searched]), self.scene.settings
         poses = together.rotation, together.translation * self.scene.shift_weight
         return bool(same_pose(*poses, 0, settings.same_deg, settings.same_shift)[1:].any())
-
-    def different(self, parts: list[Candidates]) -> Candidates:
-        """The best poses of several sets of them, no two turned by less than `schedule.apart_deg`."""
-        rule, together = self.scene.settings.schedule, Candidates.concatenated(parts)
-        return best_distinct(together, self.scene, rule.around_each, rule.apart_deg)
 
     def _missed(self) -> float:
         leaders = self.leaders()

@@ -38,7 +38,7 @@ from bpnp.search.kernels.sides import WeightedPoints
 from bpnp.search.kernels.sparse import LANES
 from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
-from bpnp.search.starts import Array, PosePrior, Prior, draw_poses
+from bpnp.search.starts import Array, PosePrior, Prior, aim_of, draw_poses
 
 WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 NARROW = 4.0  # cells of the raster, of the standard deviation of a smoothing that is added up cell by cell
@@ -83,13 +83,14 @@ def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
 
 
 def search_everywhere(scene: Scene, number: int, prior: Prior | None) -> Candidates:
-    """Distinct poses from as many starts as for a wide prior, but over all rotations, drawn as those of a batch.
+    """Distinct poses from as many starts as for a wide prior, but over all rotations, aimed at one place of the view.
 
-    number: of the search, counted from 0. Finds what clusters hide where no cones say from where points are seen.
+    number: of the search, counted from 0, on which the place depends. Near one place the right pose competes with fewer
+    others, and where it is the right one few searches of all rotations miss it.
     """
     settings = scene.settings
-    recipe, rule = settings.recipes[number % len(settings.recipes)], settings.everywhere
-    drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, recipe, prior, scene.rng)
+    rule, aim = settings.everywhere, aim_of(number)
+    drawn = draw_poses(scene.spread, scene.bulk3d, rule.draws.starts, settings.recipes[0], prior, scene.rng, aim)
     return raster_search(scene, Candidates.unscored(*drawn, hits=1), rule)
 
 

@@ -3,15 +3,14 @@
 | the best pose so far            | turn after turn                                                            |
 |---------------------------------|----------------------------------------------------------------------------|
 | near a rough prior              | raster search, a batch of starts from anywhere                             |
-| does not exceed chance          | batches from anywhere; then in turns: raster searches around the likeliest |
-|                                 | poses, within the cones of the points, around a network's proposals, and   |
-|                                 | two batches more                                                           |
+| does not exceed chance          | in turns: a batch of starts from anywhere, and raster searches within the  |
+|                                 | cones of the points or of all rotations; once around a network's           |
+|                                 | proposals; after each, raster searches around its likeliest poses          |
 | exceeds chance, and is not sure | batches and raster searches around it, in turns                            |
 
 Every turn draws starts, screens them, anneals the best, and gives distinct poses, which the pool merges.
 """
 
-import math
 from collections.abc import Callable, Iterator
 from itertools import count, islice
 
@@ -19,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.search.annealing import multistart
-from bpnp.search.candidates import Candidates, in_scene_frame
+from bpnp.search.candidates import Candidates, best_distinct, in_scene_frame
 from bpnp.search.evidence.alternatives import far_missed, near_missed
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import (
@@ -42,7 +41,7 @@ def turns(pool: Pool, around: Prior | None, proposals: Proposals | None) -> Iter
     guess, known = (None if prior is None else scene.enter_prior(prior) for prior in (around, pool.sets.prior))
     if guess is not None:
         for number in range(settings.schedule.around):
-            yield multistart(scene, number, guess)[0].without_hits()
+            yield multistart(scene, number, guess).without_hits()
     if isinstance(known, PosePrior) and is_near(scene, known):
         near = _near(pool, known, proposals)
         yield from islice(near, settings.schedule.near)
@@ -58,7 +57,7 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
     scene = pool.scene
     for number in count():
         yield search_near(scene, known)
-        yield multistart(scene, number, None)[0]
+        yield multistart(scene, number, None)
         if number == 1 and proposals is not None and pool.alarms > scene.settings.evidence.false_alarms:
             yield proposed(pool, proposals)
 
@@ -67,26 +66,20 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
     scene, settings = pool.scene, pool.scene.settings
     batches = _batches(pool, known)
     rules = settings.cones.searches if pool.sets.cones3d is not None else ()
-    best, since = -math.inf, 0.0
-    while since < settings.schedule.patience and pool.alarms > 0:  # full batches that bettered nothing
-        found, share = next(batches)
-        yield found
-        score = float(pool.candidates.score.max(initial=-np.inf))
-        best, since = (score, 0.0) if score >= best + settings.schedule.better else (best, since + share)
+    yield next(batches)
     for number in count():
         if pool.alarms < 0:
-            yield from _sure(pool, (found for found, _ in batches))
+            yield from _sure(pool, batches)
             continue
-        yield from _beside(pool, pool.rotations)
-        if rules:
-            yield from _with_surroundings(pool, within_cones(scene, rules[number % len(rules)]))
-        else:
-            yield from _with_surroundings(pool, search_everywhere(scene, number, known))
-        if proposals is not None and number == 0 and pool.alarms > 0:
-            yield from _with_surroundings(pool, proposed(pool, proposals))
+        yield from _with_surroundings(pool, next(batches))
         if pool.alarms > 0:
-            for found, _ in islice(batches, settings.schedule.between):
-                yield found
+            drawn = (
+                within_cones(scene, rules[number % len(rules)]) if rules else search_everywhere(scene, number, known)
+            )
+            yield from _with_surroundings(pool, drawn)
+        if pool.alarms > 0 and proposals is not None and number >= settings.schedule.unaided:
+            yield from _with_surroundings(pool, proposed(pool, proposals))
+            proposals = None
 
 
 def _sure(pool: Pool, batches: Iterator[Candidates]) -> Iterator[Candidates]:
@@ -106,21 +99,18 @@ def _look(pool: Pool) -> Candidates:
     return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 
-def _batches(pool: Pool, known: Prior | None) -> Iterator[tuple[Candidates, float]]:
-    """Batches of starts, and their shares of a full one; every third does not know the prior, which may be wrong."""
+def _batches(pool: Pool, known: Prior | None) -> Iterator[Candidates]:
+    """Batches of starts; every third does not know the prior, which may be wrong."""
     for number in count():
         yield multistart(pool.scene, number, None if number % 3 == 2 else known)
 
 
 def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:
-    """Poses, and raster searches around the best of different rotations."""
+    """Poses, and raster searches around each of the best of different rotations, none twice, until several are in vain
+    or a pose exceeds chance."""
     yield found
-    yield from _beside(pool, pool.different([found]))
-
-
-def _beside(pool: Pool, poses: Candidates) -> Iterator[Candidates]:
-    """Raster searches around each of the poses, none twice, until several are in vain or a pose exceeds chance."""
     settings, since = pool.scene.settings, 0
+    poses = best_distinct(found, pool.scene, settings.schedule.around_each, settings.schedule.apart_deg)
     for k in range(len(poses)):
         if since == settings.schedule.in_vain or pool.alarms < 0:
             break

@@ -149,19 +149,17 @@ class Schedule:
     turns: at most. enumerated: of points few enough to be enumerated, where that leaves a doubt; clusters hide nothing
         of them, so that more turns end where these did. around: from a guess of the pose, before all others. near: with
         a rough prior before it may be wrong.
-    patience: full batches that do not better the best log-likelihood by `better` nats a bearing before other sources
-        are asked. between: batches between these. around_each: poses that raster searches are made around, no two
-        turned by less than `apart_deg`, until `in_vain` of them better nothing. looks: in vain around a pose that
-        exceeds chance, at most. claimed: batches from anywhere beside a pose that comes from elsewhere.
+    unaided: rounds of batches and raster searches before proposals are asked for. around_each: poses of a source that
+        raster searches are made around, no two turned by less than `apart_deg`, until `in_vain` of them better nothing.
+        looks: in vain around a pose that exceeds chance, at most. claimed: batches from anywhere beside a pose that
+        comes from elsewhere.
     """
 
-    turns: int = 96
+    turns: int = 400
     enumerated: int = 12
     around: int = 4
     near: int = 12
-    patience: float = 4.0
-    better: float = 0.002
-    between: int = 2
+    unaided: int = 4
     around_each: int = 6
     apart_deg: float = 10.0
     in_vain: int = 3

@@ -10,6 +10,8 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.settings import Recipe
 
 Array = NDArray[np.float32]
+FORWARD = np.array([0.0, 0.0, 1.0])
+AIM_STEP = 0.16  # spreads of the bearings; a spiral of places with radii of so much times sqrt(k) leaves no gaps
 
 
 class PosePrior(NamedTuple):
@@ -71,12 +73,19 @@ def draw_rotations(count: int, prior: Prior | None, rng: np.random.Generator) ->
 
 
 def draw_poses(
-    spread: float, points3d: Array, count: int, recipe: Recipe, prior: Prior | None, rng: np.random.Generator
+    spread: float,
+    points3d: Array,
+    count: int,
+    recipe: Recipe,
+    prior: Prior | None,
+    rng: np.random.Generator,
+    aim: NDArray[np.float64] | None = None,
 ) -> tuple[Array, Array]:
     """Rotations (count, 3, 3) and translations (count, 3) to start from, for a camera that looks along (0, 0, 1).
 
     The weak-perspective translation puts a point of the scene on this axis, at the distance at which the points' extent
-    across it is seen under the angle `spread`, that of the bearings.
+    across it is seen under the angle `spread`, that of the bearings; or, with `aim` (2,), within `AIM_STEP` of this
+    place beside it, in spreads.
     """
     rotation = draw_rotations(count, prior, rng)
     middle = points3d.mean(0)
@@ -87,8 +96,27 @@ def draw_poses(
     seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )
-    translation = depth[:, None] * np.array([0.0, 0.0, 1.0]) - np.einsum("sij,sj->si", rotation, seen)
+    towards = np.zeros((count, 3)) + FORWARD
+    if aim is not None:
+        angle, away = 2 * math.pi * rng.random(count), AIM_STEP * np.sqrt(rng.random(count))
+        towards[:, :2] = spread * (aim + (away * np.stack([np.cos(angle), np.sin(angle)])).T)
+        towards /= np.linalg.norm(towards, axis=-1, keepdims=True)
+    translation = depth[:, None] * towards - np.einsum("sij,sj->si", rotation, seen)
     return rotation.astype(np.float32), translation.astype(np.float32)
+
+
+def aim_of(number: int) -> NDArray[np.float64]:
+    """Where in the view, (2,) in spreads from its middle, a search aims: on a spiral that covers the view evenly, begun
+    anew after 1, 4, 16, 64, 64 ... places.
+
+    >>> aim_of(0), aim_of(1)
+    (array([0., 0.]), array([0., 0.]))
+    """
+    turn = 1
+    while number >= turn:
+        number, turn = number - turn, min(4 * turn, 64)
+    angle = number * math.pi * (3 - math.sqrt(5))
+    return AIM_STEP * math.sqrt(number) * np.array([math.cos(angle), math.sin(angle)])
 
 
 def turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:

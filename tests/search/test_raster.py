@@ -2,7 +2,6 @@
 clusters can stand."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.search.point_sets import PointSets
 from bpnp.search.search import search_poses
-from bpnp.search.settings import DEFAULT, Schedule
+from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 
 Array = NDArray[np.float64]
@@ -77,6 +76,6 @@ def test_a_pose_among_six_outliers_a_match_is_found_from_where_points_are_seen()
     bearings, points, rotation, translation = view_with_outliers(np.random.default_rng(0), 150, 900)
     axes = Rotation.from_rotvec([0.35, 0, 0]).apply(directions(-rotation.T @ translation - points))
     sets = PointSets(bearings, points, axes, cosines3d=np.full(len(points), np.cos(np.radians(35))))
-    found = search_poses(sets, settings=replace(DEFAULT, schedule=Schedule(patience=0.01, turns=40)))
+    found = search_poses(sets, settings=DEFAULT.limited(40))
     np.testing.assert_allclose(found.best[0], rotation, atol=5e-3)
     np.testing.assert_allclose(found.best[1], translation, atol=0.05)

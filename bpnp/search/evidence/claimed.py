@@ -95,7 +95,7 @@ def _met(sets: PointSets, claim: Candidates, scene: Scene) -> tuple[Candidates, 
         leader = merged(parts, scene)[:1]
         parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
         looks += not deadline.passed()
-    parts += [multistart(scene, batch, None)[0] for batch in range(0 if exhaustive else settings.schedule.claimed)]
+    parts += [multistart(scene, batch, None) for batch in range(0 if exhaustive else settings.schedule.claimed)]
     poses = finish(scene, merged(parts, scene), settings.finished)
     return in_user_frame(poses, scene), looks, exhaustive
 
