@@ -1,5 +1,5 @@
-"""Raster search: of many starts, around a rough pose or within the cones from which points are seen, those go on whose
-points fall on bearings more often than chance lets them.
+"""Raster search: of many starts, around a rough pose or over all rotations, those go on whose points fall on bearings
+more often than chance lets them.
 
 Annealing on clusters loses a pose among many outliers even if it begins there: at scales at which 64 clusters stand for
 a thousand points the true pose is no optimum. At a scale of a few hundredths of the view it is one, in a basin so
@@ -15,11 +15,6 @@ adds nothing in the mean if it falls where it does by chance, wherever the beari
 The scale s then shrinks by steps. At each the poses that are left are copied, each copy moved about as far as s, and
 all are looked up again: an annealed particle filter (Deutscher, Blake, Reid, CVPR 2000). At a smaller scale a point
 that falls on a bearing tells more, and the copies find the narrower optimum within the wide one.
-
-A point with a cone is seen by cameras within it. So a start from anywhere takes a point, a direction within its cone, a
-distance and a roll: four numbers instead of the six of a pose. The other two say where the camera looks, and all of
-them are tried at once: the score as a function of the shift of the points in the image is a sum of copies of the view's
-raster, each shifted to the place of a point.
 """
 
 import math
@@ -28,21 +23,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from bpnp.loops.parallel import in_time
 from bpnp.search.annealing import anneal_on_points, turned_about_middle
 from bpnp.search.candidates import Candidates
-from bpnp.search.kernels.raster import Raster, add_shifted, add_up
-from bpnp.search.kernels.sides import WeightedPoints
-from bpnp.search.kernels.sparse import LANES
+from bpnp.search.kernels.raster import Raster, add_up
 from bpnp.search.scene import Scene
 from bpnp.search.settings import RasterSearch, RasterShape
-from bpnp.search.starts import Array, PosePrior, Prior, aim_of, draw_poses
+from bpnp.search.starts import PosePrior, Prior, aim_of, draw_poses
 
 WIDE = 5.0  # standard deviations of a smoothing beyond which its kernel is 0
 NARROW = 4.0  # cells of the raster, of the standard deviation of a smoothing that is added up cell by cell
-AT_ONCE = 256  # scores of so many poses for all shifts in memory; for 32 x 32 shifts 1 MB
 
 
 def search_near(scene: Scene, prior: PosePrior, rule: RasterSearch | None = None) -> Candidates:
@@ -59,21 +50,14 @@ def raster_search(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candid
     """Distinct poses from those starts under which most points fall on bearings by a raster, annealed."""
     for points, kept in zip(rule.screens.points, rule.screens.kept, strict=True):
         poses, _ = looked_up(scene, poses, rule.raster, rule.narrowing.first_scale, points, kept)
-    return narrowed(scene, poses, rule)
-
-
-def narrowed(scene: Scene, poses: Candidates, rule: RasterSearch) -> Candidates:
-    """Distinct poses from those that are left at the first scale: step by step to the last one, annealed."""
     steps, scale = rule.narrowing, rule.narrowing.first_scale
     origin = np.arange(len(poses))  # the start that each pose is a copy of
     for step in range(1, steps.steps + 1):
         if scene.deadline.passed():
             break
         scale = steps.first_scale * (steps.last_scale / steps.first_scale) ** (step / steps.steps)
-        copies, family, kept = moved(scene, poses, scale, steps.copies), 1, rule.screens.kept[-1]
-        if steps.halved:
-            family, kept = steps.copies, kept // 2**step
-        poses, chosen = looked_up(scene, copies, rule.raster, scale, steps.points, kept, family)
+        copies = moved(scene, poses, scale, steps.copies)
+        poses, chosen = looked_up(scene, copies, rule.raster, scale, steps.points, rule.screens.kept[-1])
         origin = origin[chosen // steps.copies]
     poses, origin = poses[: rule.annealed], origin[: rule.annealed]
     once = np.isin(np.arange(len(poses)), np.unique(origin, return_index=True)[1])
@@ -160,10 +144,10 @@ def around_each(scene: Scene, poses: Candidates) -> Candidates:
 
 
 def looked_up(
-    scene: Scene, poses: Candidates, shape: RasterShape, scale: float, points: int, kept: int, family: int = 1
+    scene: Scene, poses: Candidates, shape: RasterShape, scale: float, points: int, kept: int
 ) -> tuple[Candidates, NDArray[np.int64]]:
     """The `kept` poses under which so many points fall best on the bearings, of all companions too, best first, and
-    their places; of `family` in a row the best one only."""
+    their places."""
     score = np.zeros(len(poses), np.float32)
     cameras = [(scene, poses.rotation, poses.translation)]
     cameras += [(x.scene, x.turn @ poses.rotation, poses.translation @ x.turn.T + x.shift) for x in scene.companions]
@@ -176,7 +160,7 @@ def looked_up(
             score[i:j] += own
 
     done = in_time(look_up, len(poses), scene.deadline, scene.settings.lookups_a_check)
-    best = score[: done - done % family].reshape(-1, family).argmax(1) + np.arange(0, done - done % family, family)
+    best = np.arange(done)
     if len(best) > kept:  # much faster than to sort all of them
         best = best[np.sort(np.argpartition(-score[best], kept)[:kept])]
     best = best[np.argsort(-score[best], kind="stable")]
@@ -228,71 +212,3 @@ def _smoothed(values: NDArray[np.float32], cells: float) -> NDArray[np.float32]:
     away = (np.arange(len(values))[:, None] - np.arange(-3 * cells, len(values) + 3 * cells, step)) / cells
     kernel = np.where(np.abs(away) < WIDE, math.sqrt(step / math.pi) / cells * np.exp(-(away**2)), 0).astype(np.float32)
     return np.asarray(kernel @ (kernel.T @ values @ kernel) @ kernel.T)
-
-
-def within_cones(scene: Scene, rule: RasterSearch) -> Candidates:
-    """Distinct poses from starts within the cones of the points, of which there must be some."""
-    starts = drawn_in_cones(scene, rule.draws.starts)
-    raster = raster_of(scene, replace(rule.raster, cells=scene.settings.cones.aim_cells), rule.narrowing.first_scale)
-    points = scene.seen_points(rule.screens.points[0])
-    score, shift = np.empty(len(starts), np.float32), np.empty((len(starts), 2), np.float32)
-
-    def aim(i: int, j: int) -> None:
-        for k in range(i, j, AT_ONCE):
-            part = slice(k, min(k + AT_ONCE, j))
-            score[part], shift[part] = best_shifts(starts[part], raster, points)
-
-    done = in_time(aim, len(starts), scene.deadline, scene.settings.lookups_a_check)
-    best = np.argsort(-score[:done], kind="stable")[: rule.screens.kept[0]]
-    return narrowed(scene, shifted(starts[best], shift[best]), rule)
-
-
-def drawn_in_cones(scene: Scene, count: int) -> Candidates:
-    """Poses that see a point each within its cone, from about the weak-perspective distance, rolled by any angle, the
-    middle of the points in the direction (0, 0, 1)."""
-    rng, middle = scene.rng, scene.bulk3d.mean(0).astype(np.float64)
-    j = rng.integers(len(scene.points3d), size=count)
-    axis, cosine = scene.seen.cones[j, :3].astype(np.float64), rng.uniform(np.maximum(scene.seen.cones[j, 3], -1), 1)
-    towards = cosine[:, None] * axis + np.sqrt(1 - cosine**2)[:, None] * _across(axis, rng)
-    covariance = np.cov(scene.bulk3d.T, bias=True)
-    along = np.einsum("si,ij,sj->s", towards, covariance, towards)
-    extent = np.sqrt(np.maximum(np.trace(covariance) - along, 0))
-    depth = extent / scene.spread * np.exp(scene.settings.cones.log_depth * rng.uniform(-1, 1, count))
-    centre = scene.points3d[j] + depth[:, None] * towards
-    forward = middle - centre
-    forward /= np.maximum(np.linalg.norm(forward, axis=-1, keepdims=True), 1e-12)
-    right = _across(forward, rng)
-    rotation = np.stack([right, np.cross(forward, right), forward], 1).astype(np.float32)
-    translation = -np.einsum("sij,sj->si", rotation, centre)
-    return Candidates.unscored(rotation, translation.astype(np.float32), hits=1)
-
-
-def best_shifts(poses: Candidates, raster: Raster, points: WeightedPoints) -> tuple[Array, Array]:
-    """The largest score (s,) of each pose over all shifts of its points by up to half of the raster, and that shift
-    (s, 2), whole cells."""
-    count = LANES * math.ceil(len(raster.values) / LANES)
-    half = np.float32(raster.half + count / 2 / raster.per_cell)
-    padded = Raster(np.pad(raster.values, ((0, 0), (count, count))), half, raster.per_cell)
-    scores, weight = np.zeros((len(poses), count, count), np.float32), np.empty_like(points.b)
-    add_shifted(scores, padded, points, poses.rotation, poses.translation, weight)
-    flat = scores.reshape(len(poses), -1)
-    best = flat.argmax(1)
-    shift = (np.stack([best % count, best // count], -1) - count // 2) / raster.per_cell
-    return flat[np.arange(len(poses)), best], shift.astype(np.float32)
-
-
-def shifted(poses: Candidates, shift: Array) -> Candidates:
-    """Poses turned about their centres so that what is seen at (0, 0, 1) is seen at `shift` (s, 2) of the raster."""
-    length = np.linalg.norm(shift, axis=-1)
-    angle = 2 * np.arctan(length / 2) / np.maximum(length, 1e-12)
-    vectors = angle[:, None] * np.stack([-shift[:, 1], shift[:, 0], np.zeros(len(shift))], -1)
-    turn = Rotation.from_rotvec(vectors).as_matrix().astype(np.float32)
-    translation = np.einsum("sij,sj->si", turn, poses.translation)
-    return replace(poses, rotation=turn @ poses.rotation, translation=translation)
-
-
-def _across(axis: NDArray[np.float64], rng: np.random.Generator) -> NDArray[np.float64]:
-    """Unit vectors (s, 3) at right angles to others, each in a random direction."""
-    drawn = rng.standard_normal(axis.shape)
-    drawn -= (drawn * axis).sum(-1, keepdims=True) * axis
-    return np.asarray(drawn / np.linalg.norm(drawn, axis=-1, keepdims=True))

@@ -3,9 +3,9 @@
 | the best pose so far            | turn after turn                                                            |
 |---------------------------------|----------------------------------------------------------------------------|
 | near a rough prior              | raster search, a batch of starts from anywhere                             |
-| does not exceed chance          | in turns: a batch of starts from anywhere, and raster searches within the  |
-|                                 | cones of the points or of all rotations; once around a network's           |
-|                                 | proposals; after each, raster searches around its likeliest poses          |
+| does not exceed chance          | in turns: a batch of starts from anywhere, and a raster search of all      |
+|                                 | rotations; once a network's proposals; after each, raster searches around  |
+|                                 | its likeliest poses                                                        |
 | exceeds chance, and is not sure | batches and raster searches around it, in turns                            |
 
 Every turn draws starts, screens them, anneals the best, and gives distinct poses, which the pool merges.
@@ -28,7 +28,6 @@ from bpnp.search.raster_search import (
     search_beside,
     search_everywhere,
     search_near,
-    within_cones,
 )
 from bpnp.search.starts import PosePrior, Prior
 
@@ -65,7 +64,6 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
 def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
     scene, settings = pool.scene, pool.scene.settings
     batches = _batches(pool, known)
-    rules = settings.cones.searches if pool.sets.cones3d is not None else ()
     yield next(batches)
     for number in count():
         if pool.alarms < 0:
@@ -73,10 +71,7 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
             continue
         yield from _with_surroundings(pool, next(batches))
         if pool.alarms > 0:
-            drawn = (
-                within_cones(scene, rules[number % len(rules)]) if rules else search_everywhere(scene, number, known)
-            )
-            yield from _with_surroundings(pool, drawn)
+            yield from _with_surroundings(pool, search_everywhere(scene, number, known))
         if pool.alarms > 0 and proposals is not None and number >= settings.schedule.unaided:
             yield from _with_surroundings(pool, proposed(pool, proposals))
             proposals = None

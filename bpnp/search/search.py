@@ -21,7 +21,7 @@ from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
-from bpnp.search.raster_search import around_each, best_shifts, looked_up, raster_of
+from bpnp.search.raster_search import around_each, looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Proposals, only_proposed, turns
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -222,4 +222,3 @@ def warm_up() -> None:
     run_batch(scene, start)
     looks = DEFAULT.beside.raster, DEFAULT.beside.narrowing.first_scale
     looked_up(scene, start, *looks, WARMING, 1)
-    best_shifts(start, raster_of(scene, *looks), scene.seen_points(WARMING))

@@ -90,8 +90,7 @@ class Narrowing:
     first_scale, last_scale: of the smoothed bearings, in spreads of the bearings; from 0.12 on chance fills the view,
         at 0.03 the gaps between the starts are wider than the basins. steps: from one to the other, with factors above
         0.7, below which the narrower optimum is lost more often; 0 for the first scale alone.
-    copies: of a pose at each step. points: 3D points that are looked up there. halved: half of the poses go on each
-        time, the best copy of each, so that those of some do not crowd out the others.
+    copies: of a pose at each step. points: 3D points that are looked up there.
     """
 
     first_scale: float = 0.06
@@ -99,7 +98,6 @@ class Narrowing:
     steps: int = 5
     copies: int = 16
     points: int = 1500
-    halved: bool = False
 
 
 @dataclass(frozen=True)
@@ -124,22 +122,6 @@ class RasterSearch:
     narrowing: Narrowing = Narrowing()
     raster: RasterShape = RasterShape()
     annealed: int = 40
-
-
-@dataclass(frozen=True)
-class Cones:
-    """Raster searches within the cones of the points (`bpnp.search.raster_search`), one a turn.
-
-    log_depth: starts are exp(u) times the weak-perspective distance away, u uniform in [-log_depth, log_depth].
-    aim_cells: of the raster, a scale, in which a start is aimed; with 1 no more poses are found, in twice the time.
-    """
-
-    searches: tuple[RasterSearch, ...] = (
-        *3 * (RasterSearch(Draws(2**13), Screens((300,), (2**12,)), Narrowing(copies=32, halved=True)),),
-        RasterSearch(Draws(2**14), Screens((300,), (2**12,)), Narrowing(0.09, steps=6, copies=32, halved=True)),
-    )
-    log_depth: float = 0.7
-    aim_cells: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -240,7 +222,6 @@ class SearchSettings:
     everywhere: RasterSearch = RasterSearch(
         Draws(2**15), Screens((50, 300), (2**12, 2**9)), Narrowing(0.08, 0.015, points=600), annealed=12
     )
-    cones: Cones = Cones()
     facing: Facing = Facing()
     evidence: Evidence = Evidence()
     most_volumes: float = 100.0

@@ -99,6 +99,6 @@ def test_after_warming_up_nothing_is_compiled_whatever_the_arrays_of_a_problem()
     done = subprocess.run([sys.executable, "-c", SIGNATURES], capture_output=True, text=True, check=True)
     warm, used = done.stdout.splitlines()
     versions = dict(entry.split(":") for entry in warm.split())
-    assert {"explore", "descend", "descend_sparse", "add_shifted", "add_up"} <= set(versions)
+    assert {"explore", "descend", "descend_sparse", "add_up"} <= set(versions)
     assert set(versions.values()) == {"1"}
     assert used == warm

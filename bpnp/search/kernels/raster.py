@@ -1,5 +1,4 @@
-"""Poses scored by looking up where each point falls in a raster of the view: one addition a point; or for all shifts
-of the points at once, one row of the raster a point and row.
+"""Poses scored by looking up where each point falls in a raster of the view: one addition a point.
 
 Arrays are float32 and coordinate-major. A direction u has the coordinates 2 (u_x, u_y) / (1 + u_z) in the raster, the
 stereographic projection around (0, 0, 1), which keeps small shapes and covers every field of view.
@@ -56,24 +55,3 @@ def add_up(raster: Any, points: Any, rotation: Any, translation: Any, score: Any
         for j in range(len(cell)):
             total += weight[j] * values[np.uintp(cell[j])]
         score[k] = total
-
-
-@compiled
-def add_shifted(scores: Any, padded: Any, points: Any, rotation: Any, translation: Any, weight: Any) -> None:
-    """scores (S, k, k): to [s, r, c] what `add_up` gives pose s if its points move by r - k/2 rows, c - k/2 columns.
-
-    padded: the `Raster` with k columns of 0 on each side, (g, g + 2 k), and the half of k more cells.
-    """
-    shifts, rows, across = scores.shape[1], len(padded.values), padded.values.shape[1]
-    values, last, half, per_cell = padded.values.reshape(-1), F(rows + shifts), padded.half, padded.per_cell
-    for s in range(len(rotation)):
-        visible_weights(points, rotation[s], translation[s], weight)
-        sums = scores[s].reshape(-1)
-        for j in range(len(weight)):
-            column, row = place(half, per_cell, points.p, j, rotation[s], translation[s])
-            if column >= 0 and row >= 0 and column < last and row < last:
-                b, above = weight[j], int(row) - shifts
-                for r in range(max(0, -above), min(shifts, rows - above)):
-                    first, value = np.uintp(r * shifts), np.uintp((above + r) * across + int(column))
-                    for c in range(np.uintp(shifts)):
-                        sums[first + c] += b * values[value + c]
