@@ -3,10 +3,10 @@
 | the best pose so far            | turn after turn                                                            |
 |---------------------------------|----------------------------------------------------------------------------|
 | near a rough prior              | raster search, a batch of starts from anywhere                             |
-| does not exceed chance          | in turns: a batch of starts from anywhere, and a raster search of all      |
-|                                 | rotations; once a network's proposals; after each, raster searches around  |
-|                                 | its likeliest poses                                                        |
-| exceeds chance, and is not sure | batches and raster searches around it, in turns                            |
+| does not exceed chance          | in turns: a batch of starts from anywhere, and raster searches of all      |
+|                                 | rotations for as much time; once a network's proposals; after each, raster |
+|                                 | searches around its likeliest poses                                        |
+| exceeds chance, and is not sure | batches and searches of all rotations, and raster searches around it       |
 
 Every turn draws starts, screens them, anneals the best, and gives distinct poses, which the pool merges.
 """
@@ -62,29 +62,26 @@ def _near(pool: Pool, known: PosePrior, proposals: Proposals | None) -> Iterator
 
 
 def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> Iterator[Candidates]:
-    scene, settings = pool.scene, pool.scene.settings
-    batches = _batches(pool, known)
-    yield next(batches)
+    drawn = _drawn(pool, known)
+    yield next(drawn)
     for number in count():
         if pool.alarms < 0:
-            yield from _sure(pool, batches)
+            yield from _sure(pool, drawn)
             continue
-        yield from _with_surroundings(pool, next(batches))
-        if pool.alarms > 0:
-            yield from _with_surroundings(pool, search_everywhere(scene, number, known))
-        if pool.alarms > 0 and proposals is not None and number >= settings.schedule.unaided:
+        yield from _with_surroundings(pool, next(drawn))
+        if pool.alarms > 0 and proposals is not None and number >= pool.scene.settings.schedule.unaided:
             yield from _with_surroundings(pool, proposed(pool, proposals))
             proposals = None
 
 
-def _sure(pool: Pool, batches: Iterator[Candidates]) -> Iterator[Candidates]:
-    """What excludes the likelier case: a raster search around the best pose, or another batch of starts."""
+def _sure(pool: Pool, drawn: Iterator[Candidates]) -> Iterator[Candidates]:
+    """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
     leaders, settings = pool.leaders(), pool.scene.settings
     hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
     if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far_missed(hits, rule):
         yield _look(pool)
     else:
-        yield next(batches)
+        yield next(drawn)
 
 
 def _look(pool: Pool) -> Candidates:
@@ -94,10 +91,14 @@ def _look(pool: Pool) -> Candidates:
     return search_beside(pool.scene, leader, pool.scene.settings.beside)
 
 
-def _batches(pool: Pool, known: Prior | None) -> Iterator[Candidates]:
-    """Batches of starts; every third does not know the prior, which may be wrong."""
+def _drawn(pool: Pool, known: Prior | None) -> Iterator[Candidates]:
+    """Poses from anywhere: of batches of starts, and of raster searches of all rotations in about as much time; every
+    third batch does not know the prior, which may be wrong."""
+    scene, searches = pool.scene, count()
     for number in count():
-        yield multistart(pool.scene, number, None if number % 3 == 2 else known)
+        yield multistart(scene, number, None if number % 3 == 2 else known)
+        for _ in range(scene.settings.batch(number) // scene.settings.schedule.starts_a_search):
+            yield search_everywhere(scene, next(searches), known)
 
 
 def _with_surroundings(pool: Pool, found: Candidates) -> Iterator[Candidates]:

@@ -131,7 +131,8 @@ class Schedule:
     turns: at most. enumerated: of points few enough to be enumerated, where that leaves a doubt; clusters hide nothing
         of them, so that more turns end where these did. around: from a guess of the pose, before all others. near: with
         a rough prior before it may be wrong.
-    unaided: rounds of batches and raster searches before proposals are asked for. around_each: poses of a source that
+    unaided: batches and raster searches before proposals are asked for. starts_a_search: of a batch, that take as long
+        as a raster search of all rotations. around_each: poses of a source that
         raster searches are made around, no two turned by less than `apart_deg`, until `in_vain` of them better nothing.
         looks: in vain around a pose that exceeds chance, at most. claimed: batches from anywhere beside a pose that
         comes from elsewhere.
@@ -141,7 +142,8 @@ class Schedule:
     enumerated: int = 12
     around: int = 4
     near: int = 12
-    unaided: int = 4
+    unaided: int = 10
+    starts_a_search: int = 96
     around_each: int = 6
     apart_deg: float = 10.0
     in_vain: int = 3

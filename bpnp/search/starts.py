@@ -106,17 +106,17 @@ def draw_poses(
 
 
 def aim_of(number: int) -> NDArray[np.float64]:
-    """Where in the view, (2,) in spreads from its middle, a search aims: on a spiral that covers the view evenly, begun
-    anew after 1, 4, 16, 64, 64 ... places.
+    """Where in the view, (2,) in spreads from its middle, a search aims: every other one at the middle, the others on a
+    spiral that covers the view evenly, begun anew after 4, 16, 64, 64 ... places.
 
     >>> aim_of(0), aim_of(1)
-    (array([0., 0.]), array([0., 0.]))
+    (array([0., 0.]), array([0.16, 0.  ]))
     """
-    turn = 1
-    while number >= turn:
-        number, turn = number - turn, min(4 * turn, 64)
-    angle = number * math.pi * (3 - math.sqrt(5))
-    return AIM_STEP * math.sqrt(number) * np.array([math.cos(angle), math.sin(angle)])
+    place, places = number // 2, 4
+    while place >= places:
+        place, places = place - places, min(4 * places, 64)
+    place, angle = (place + 1) * (number % 2), place * math.pi * (3 - math.sqrt(5))
+    return AIM_STEP * math.sqrt(place) * np.array([math.cos(angle), math.sin(angle)])
 
 
 def turned_to(axis: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -121,7 +121,7 @@ def test_a_search_in_doubt_asks_and_a_sure_one_does_not(
     rng = np.random.default_rng(0)
     noise2d, noise3d = rng.uniform(-0.5, 0.5, (150, 2)), rng.normal(size=(150, 3))
     problem = problem_from(noise2d, noise3d, None, prior=prior)
-    brief = replace(DEFAULT, schedule=replace(DEFAULT.schedule, turns=24, unaided=1))
+    brief = replace(DEFAULT, schedule=replace(DEFAULT.schedule, turns=24, unaided=4))
     alone, helped = (
         solutions_of({0: problem}, Options(asks=asks, seed=3, settings=brief))[0] for asks in (False, True)
     )
