@@ -219,7 +219,7 @@ def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others
     ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.
     """
     if not is_store(output):
-        if output.exists():
+        if output.exists() and not is_store(output):  # unless another process has just made it
             raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
         claim = output.with_name(f".{output.name}.unfinished")
         with claimed(claim, wait=wait_for_others):

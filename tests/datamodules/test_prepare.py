@@ -280,3 +280,14 @@ def test_two_processes_may_make_one_cache_at_once(meshes: Path, tmp_path: Path) 
         child.join()
     assert [child.exitcode for child in children] == [0, 0]
     assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
+def test_a_cache_that_another_process_has_just_made_is_taken(
+    meshes: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module(meshes, tmp_path / "cache")
+    (made,) = (tmp_path / "cache").iterdir()
+    first, looks = made.stat().st_ino, iter([False])
+    monkeypatch.setattr("bpnp.datamodules.store.is_store", lambda folder: next(looks, True))
+    module(meshes, tmp_path / "cache")
+    assert made.stat().st_ino == first
