@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 from bpnp.search.settings import Recipe
 
 Array = NDArray[np.float32]
-FORWARD = np.array([0.0, 0.0, 1.0])
 AIM_STEP = 0.16  # spreads of the bearings; a spiral of places with radii of so much times sqrt(k) leaves no gaps
 
 
@@ -96,7 +95,7 @@ def draw_poses(
     seen = middle + recipe.off_centre * rng.random((count, 1)) * (
         points3d[rng.integers(len(points3d), size=count)] - middle
     )
-    towards = np.zeros((count, 3)) + FORWARD
+    towards = np.tile((0.0, 0.0, 1.0), (count, 1))
     if aim is not None:
         angle, away = 2 * math.pi * rng.random(count), AIM_STEP * np.sqrt(rng.random(count))
         towards[:, :2] = spread * (aim + (away * np.stack([np.cos(angle), np.sin(angle)])).T)
