@@ -143,7 +143,8 @@ def judged(
                 f"{chance}, but focal length and distance cannot be told apart: both may be {100 * share:.0f} % off"
             )
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
-        known = f"; its rotation is known to {off:.1g} deg, but for one case in a thousand"
+        bound = f"{off:.1g}" if off < 9.5 else f"{off:.0f}"
+        known = f"; its rotation is known to {bound} deg, but for one case in a thousand"
         against += [misfit(linear, count, rule), contesting(seen, rule)]
     doubts = [one for one in against if one is not None and one.decades < rule.lead]
     if certain and not doubts:

@@ -77,12 +77,12 @@ class Solution:
     covariance: (6, 6) of (w, v), by which the true pose is off: R' = exp([w]x) R, t' = t + v, w in radians in the axes
         of the camera, v in scene units, the first order of
 
-            C = max(H^-1, H^-1 (sum_i g_i g_i^T) H^-1),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
+            C = max(H^-1, sum_i d_i d_i^T),  H = -d2 log p(image points | pose) / d(w, v)^2 + prior,
 
-        with the gradients g_i of each image point's log-likelihood, its partner unknown (Louis 1982, White 1982;
-        docs/verdict.md). NaN if the verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at
-        infinity; (7, 7) where the focal length was not known: the last row and column are its error, pixels; or where
-        the scale of a rig's scene was not, for that.
+        with the ways d_i to the optimum without each image point, the partners unknown (docs/verdict.md). NaN if the
+        verdict is "failed", or the points do not fix the pose. (3, 3) of w for points at infinity; (7, 7) where the
+        focal length was not known: the last row and column are its error, pixels; or where the scale of a rig's scene
+        was not, for that.
     scale: 1, or what was found with `scale=True`: rig = scale R p + t, with t in the unit of the rig.
     candidates: the distinct poses that were found, best first; the first is this one.
     verdict: "confident"; "ambiguous", it fits better than chance, but another pose may as well; "failed", no pose fits

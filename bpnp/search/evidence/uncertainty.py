@@ -17,6 +17,7 @@ from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+MANY = 1e9  # degrees of freedom, of a number that does not vary
 EXCEEDED = 1e-3  # probability that a pose is farther off than its bound, and of a test
 ONE_SIGMA = 0.8413447460685429  # probability of a normal variable below one standard deviation
 
@@ -32,6 +33,7 @@ STRAINS = np.array(
     np.float64,
 )
 POSE = 6  # numbers that are fitted with every pose
+FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix a pose
 
 
 def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
@@ -69,14 +71,22 @@ def share_bound(covariance: Array, free: float) -> float:
 def exceeded_once(covariance: Array, free: float) -> float:
     """Length that a vector of this covariance (3, 3) exceeds once in a thousand.
 
-    The square of its length is about that of d independent axes of equal variance (Satterthwaite 1946), d =
-    (tr C)^2 / tr C^2, one for a single loose axis and three for equal ones: tr C times the quantile of F with d and
-    `free` degrees of freedom, those that the estimate of the residuals' scale had.
+    The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3, as a + (b / d) x has, x chi-squared with d =
+    (tr C^2)^3 / (tr C^3)^2 degrees of freedom, one for a single loose axis and three for equal ones, b^2 = d tr C^2 and
+    a = tr C - b (Buckley and Eagleson 1988). The estimate of the residuals' scale had `free` degrees of freedom, and the
+    square is at most a and b times the quantiles of F with them.
+
+    Source: M. J. Buckley, G. K. Eagleson, An approximation to the distribution of quadratic forms in normal random
+    variables, Australian J. Statistics 1988.
     """
     if free <= 0:
         return math.inf
-    total, squared = float(np.trace(covariance)), float((covariance**2).sum())
-    return math.sqrt(total * float(fdtri(total**2 / squared, free, 1 - EXCEEDED)))
+    total = float(np.trace(covariance))
+    squared, cubed = (float(np.trace(np.linalg.matrix_power(covariance / total, k))) for k in (2, 3))
+    d = squared * (squared / cubed) ** 2
+    b = math.sqrt(d * squared)
+    quantiles = fdtri(np.array([MANY, d]), free, 1 - EXCEEDED)
+    return math.sqrt(total * float(max(1 - b, 0.0) * quantiles[0] + b * quantiles[1]))
 
 
 def pose_covariance(sets: PointSets, linear: "Linearised | None", count: float, origin: Array) -> Array | None:
@@ -121,13 +131,18 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
         H = sum_ij p_ij (J_ij^T J_ij / s^2 - g_ij g_ij^T) + sum_i g_i g_i^T + that of the prior:
 
     where scene points lie as close as the residuals, what their partners leave open is subtracted. What a prior knows
-    of the pose counts as a measurement beside the points. The sandwich H^-1 (sum_i g_i g_i^T) H^-1 (White 1982) allows
-    for residuals that are not as the model says. With H^-1 = L L^T, the larger of both counts along each of the common
-    axes, the eigenvectors of L^T (sum_i g_i g_i^T) L. Where H is not positive definite, since points that lie between
-    two partners outweigh the others, that of half the variance s^2 counts, at which fewer have two, times two.
+    of the pose counts as a measurement beside the points. The jackknife
+
+        sum_i d_i d_i^T,  d_i = (H - H_i)^-1 g_i,  H_i the share of image point i in H,
+
+    allows for residuals that are not as the model says, and for an image point with a false partner: d_i is the way to
+    the optimum without it. With H^-1 = L L^T, the larger of both counts along each of the common axes, the eigenvectors
+    of L^-1 (sum_i d_i d_i^T) L^-T. Where H is not positive definite, since points that lie between two partners
+    outweigh the others, that of half the variance s^2 counts, at which fewer have two, times two.
 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
-    H. White, Maximum likelihood estimation of misspecified models, Econometrica 1982.
+    J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
+    sample properties, J. Econometrics 1985.
     """
     if linear is None:
         return None
@@ -143,21 +158,27 @@ def _of_louis(linear: "Linearised") -> Array | None:
     """See `local_covariance`; None where the information is not positive definite."""
     sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
-    rows = (np.sqrt(probability)[:, None, None] * linear.jacobian).reshape(-1, linear.jacobian.shape[-1])
-    complete = rows.T @ rows
-    expected = np.zeros((len(chosen), len(complete)))
+    size = score.shape[1]
+    expected, own = np.zeros((len(chosen), size)), np.zeros((len(chosen), size, size))
     np.add.at(expected, linear.image, probability[:, None] * score)
-    between = expected.T @ expected
+    each = np.einsum("kab,kac->kbc", linear.jacobian, linear.jacobian) - score[:, :, None] * score[:, None]
+    np.add.at(own, linear.image, probability[:, None, None] * each)
+    own += expected[:, :, None] * expected[:, None]
     share = len(sets.bearings) / len(chosen)
     known = _known(linear)
-    observed = share * (complete - (probability[:, None] * score).T @ score + between) + known
+    observed = share * own.sum(0) + known
+    complete = np.einsum("k,kab,kab->b", probability, linear.jacobian, linear.jacobian)
     # In units in which the complete information is one, so that its rank can be told.
-    unit = 1 / np.sqrt(np.maximum(np.diag(share * complete + known), 1e-300))
+    unit = 1 / np.sqrt(np.maximum(share * complete + np.diag(known), 1e-300))
     values, vectors = np.linalg.eigh(observed * np.outer(unit, unit))
-    if values[0] <= 1e-9:
+    if values[0] <= FIXED:
         return None
     root = unit[:, None] * vectors / np.sqrt(values)
-    ratio, axes = np.linalg.eigh(root.T @ (share * between + known) @ root)
+    steps = expected @ root
+    without = np.eye(size) - root.T @ own @ root
+    fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
+    steps[fixed] = np.linalg.solve(without[fixed], steps[fixed, :, None])[..., 0]
+    ratio, axes = np.linalg.eigh(share * steps.T @ steps + root.T @ known @ root)
     along = root @ axes
     return np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
 
