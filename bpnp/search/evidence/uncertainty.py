@@ -73,8 +73,8 @@ def exceeded_once(covariance: Array, free: float) -> float:
 
     The square of its length has the cumulants tr C, 2 tr C^2 and 8 tr C^3, as a + (b / d) x has, x chi-squared with d =
     (tr C^2)^3 / (tr C^3)^2 degrees of freedom, one for a single loose axis and three for equal ones, b^2 = d tr C^2 and
-    a = tr C - b (Buckley and Eagleson 1988). The estimate of the residuals' scale had `free` degrees of freedom, and the
-    square is at most a and b times the quantiles of F with them.
+    a = tr C - b (Buckley and Eagleson 1988). The scale of the residuals was estimated with `free` degrees of freedom:
+    the square is at most a and b times the quantiles of F with them.
 
     Source: M. J. Buckley, G. K. Eagleson, An approximation to the distribution of quadratic forms in normal random
     variables, Australian J. Statistics 1988.
