@@ -185,7 +185,6 @@ def main() -> None:
     options.add_argument("--check", action="store_true", help="compare, write nothing")
     options.add_argument("--file", type=Path, default=FILE, help="(default: benchmarks/results.json)")
     chosen = options.parse_args()
-    torch.set_num_threads(1)
     kept = json.loads(chosen.file.read_text()) if chosen.file.is_file() else {}
     part = "quick" if chosen.quick else "full"
     known: dict[str, Any] = kept.get(part, {})

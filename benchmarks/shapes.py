@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from record import TIME_LIMIT, Array, Problem, spread
+from record import Array, Problem, spread
 from scipy.spatial.transform import Rotation
 from view_problems import REPORTED
 
@@ -58,9 +58,9 @@ def of_data(name: str, ratio: float, limit: int, seed: int, data: Path) -> Itera
 
 
 def problems(
-    chosen: str, ratio: float, limit: int, seed: int, data: Path, time_limit: float = TIME_LIMIT
+    chosen: str, ratio: float, limit: int, seed: int, data: Path, time_limit: float | None = None
 ) -> Iterator[Problem]:
-    """At most `limit` of a set."""
+    """At most `limit` of a set; `time_limit` as for `solve`."""
     if chosen == "shapes":
         drawn = shapes(ratio, limit, seed)
     else:

@@ -154,8 +154,8 @@ def photos(
     half = len(drawn) // 2 if apart else 0
     for photo, shown in islice(zip(drawn, drawn[half:] + drawn[:half], strict=True), limit):
         pixels, camera = shown.pixels
-        search = partial(solve, pixels, photo.points3d, camera)
+        search = partial(solve, pixels, photo.points3d, camera, seed=seed)
         if in_map:
-            search = partial(photo.scene.localize, pixels, camera, views=photo.view and [photo.view])
-        search = partial(search, seed=seed, time_limit=TIME_LIMIT)
+            known: dict[str, Any] = {"views": photo.view and [photo.view], "seed": seed, "time_limit": TIME_LIMIT}
+            search = partial(photo.scene.localize, pixels, camera, **known)
         yield Problem(photo.name, search, [photo.pose], photo.points3d, photo.distance)

@@ -30,6 +30,7 @@ from bpnp.search.raster_search import (
     search_near,
 )
 from bpnp.search.starts import PosePrior, Prior
+from bpnp.search.verdict import starts_met
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
@@ -77,7 +78,8 @@ def _anywhere(pool: Pool, known: Prior | None, proposals: Proposals | None) -> I
 def _sure(pool: Pool, drawn: Iterator[Candidates]) -> Iterator[Candidates]:
     """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
     leaders, settings = pool.leaders(), pool.scene.settings
-    hits, looks, rule = int(leaders.hits[0]), pool.looks(leaders), settings.evidence
+    looks, rule = pool.looks(leaders), settings.evidence
+    hits = starts_met(leaders, pool.sets, rule)
     if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far_missed(hits, rule):
         yield _look(pool)
     else:

@@ -98,7 +98,13 @@ def missed(candidates: Candidates, sets: PointSets, looks: int, rule: Evidence, 
     if alarms > 0:
         return 0.0
     decades = -alarms / max(match_count(candidates, sets), 1.0) if independent else 0.0
-    return log10_missed(int(candidates.hits[0]), decades, looks, rule)
+    return log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
+
+
+def starts_met(candidates: Candidates, sets: PointSets, rule: Evidence) -> int:
+    """How many independent starts ended at the first candidate, or at another one that is no different pose."""
+    poses = candidates.rotation, candidates.translation
+    return int(candidates.hits[sets.same_pose(*poses, rule.other_deg, rule.other_shift)].sum())
 
 
 def judged(
