@@ -88,9 +88,9 @@ def read_vertices(path: Path) -> NDArray[np.float64]:
     Reads the files of `read_mesh`. Raises MeshError that names the file: truncated, foreign or empty.
     """
     with _opened(path) as (content, suffix):
-        if suffix == ".off":
-            return _different(_parse_off(content).vertices)
-        vertices = _different(np.asarray(_load(content, suffix).vertices, np.float64))
+        mesh = _parse_off(content) if suffix == ".off" else _load(content, suffix)
+        vertices = np.asarray(mesh.vertices, np.float64)
+        vertices = vertices[np.sort(np.unique(vertices, axis=0, return_index=True)[1])]
         if not len(vertices):  # as a mesh, a cloud of points is empty
             vertices = np.asarray(getattr(_load(content, suffix, force=None), "vertices", ()), np.float64)
             vertices, declared = vertices.reshape(-1, 3), re.search(rb"^element vertex (\d+)", content, re.MULTILINE)
@@ -137,11 +137,6 @@ def _triangles(rows: Sequence[str]) -> NDArray[np.int64]:
         middle, last = polygons[:, 1:-1], polygons[:, 2:]
         fans.append(np.stack([np.broadcast_to(polygons[:, :1], middle.shape), middle, last], -1).reshape(-1, 3))
     return np.concatenate(fans)
-
-
-def _different(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
-    _, first = np.unique(vertices, axis=0, return_index=True)
-    return vertices[np.sort(first)]
 
 
 def _load(content: bytes, suffix: str, *, force: Literal["mesh"] | None = "mesh") -> Any:

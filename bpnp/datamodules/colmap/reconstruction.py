@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bpnp.cameras import Camera, Lens, camera_from, colmap_camera
-from bpnp.datamodules.colmap.model_files import CameraRecord, ColmapError, ImageRecord, read_records
+from bpnp.datamodules.colmap.model_files import ColmapError, ImageRecord, read_records
 from bpnp.files import written_whole
 
 NEAR = 1e-4  # of the median depth; float32 cannot tell in front from behind much below
@@ -90,7 +90,12 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
             continue
         if record.camera_id not in cameras:
             where = f"camera {record.camera_id} of image {record.name!r} in {path}"
-            cameras[record.camera_id] = _camera_of(records.cameras.get(record.camera_id), where)
+            if record.camera_id not in records.cameras:
+                raise ColmapError(f"expected {where}, got no such camera; try another model")
+            try:
+                cameras[record.camera_id] = colmap_camera(*records.cameras[record.camera_id])
+            except ValueError as error:
+                raise ColmapError(f"{where}: {error}; try another model") from error
         images.append(_image_points(record, cameras[record.camera_id], ids, points3d, lost, keypoints=keypoints))
     if not images:
         raise ColmapError(f"expected at least one image with a pose in {path}, got none; try another model")
@@ -98,16 +103,6 @@ def read_reconstruction(folder: str | Path, *, name: str | None = None, keypoint
     if reconstruction.notable:
         logger.warning("not used in %s: %s", path, reconstruction.notable)
     return reconstruction
-
-
-def _camera_of(record: CameraRecord | None, where: str) -> Camera:
-    """The camera of a record; `where` names it in the error for one that is missing or not usable."""
-    if record is None:
-        raise ColmapError(f"expected {where}, got no such camera; try another model")
-    try:
-        return colmap_camera(*record)
-    except ValueError as error:
-        raise ColmapError(f"{where}: {error}; try another model") from error
 
 
 def _image_points(

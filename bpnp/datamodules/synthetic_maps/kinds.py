@@ -234,7 +234,7 @@ def facades(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, V
         ground_points(yard - reach, yard + reach, on_ground, rng),
         horizon_points(np.array([*first, 0.0]), 60.0, far, rng),
     ]
-    return assembled(surfaces, rng, walls=walls), view
+    return assembled(surfaces, walls, rng), view
 
 
 def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
@@ -272,7 +272,7 @@ def street(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
         ground_points(np.array([0.0, -across]), np.array([length, across]), on_ground, rng),
         horizon_points(np.zeros(3), 80.0, far, rng),
     ]
-    return assembled(surfaces, rng, walls=walls), view
+    return assembled(surfaces, walls, rng), view
 
 
 def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Viewpoint]:
@@ -299,7 +299,7 @@ def statue(count: int, half: float, rng: np.random.Generator) -> tuple[Scene, Vi
         horizon_points(np.zeros(3), 8 * tall, far, rng),
         wall_points(walls, on_walls, rng),
     ]
-    scene = assembled(surfaces, rng, walls=walls, blobs=blobs)
+    scene = assembled(surfaces, walls, rng, blobs)
     target = np.array([0.0, 0.0, foot + tall * rng.uniform(0.2, 0.7)])
     # Anywhere around, up to 25 degrees above or below; it fills 0.3 to 1.2 of the image.
     rising = math.radians(rng.uniform(-25, 25))

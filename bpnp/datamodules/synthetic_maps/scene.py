@@ -11,7 +11,6 @@ Array = NDArray[np.float64]
 MIN_DEPTH = 0.1  # metres; nothing nearer to the camera is seen
 GRAZING = 0.35  # cosine between a normal and the direction to the camera, below which detections get rarer
 ONE_PHOTO = 0.5  # probability of a keypoint at a visible point that no other photo has a keypoint of
-NEAREST_LIMIT = 1.0  # of the distance to the target: how near the finest details can be told at least
 REACHED = 0.985  # share of the way to a point; a blob that the ray enters later is the surface of the point itself
 
 
@@ -79,12 +78,9 @@ class Surface(NamedTuple):
 
 
 NO_BLOBS = Blobs(np.zeros((0, 3)), np.zeros((0, 3, 3)))
-NO_WALLS = Walls(*(np.zeros((0, 2)) for _ in range(3)), *(np.zeros(0) for _ in range(5)))
 
 
-def assembled(
-    surfaces: Sequence[Surface], rng: np.random.Generator, *, walls: Walls = NO_WALLS, blobs: Blobs = NO_BLOBS
-) -> Scene:
+def assembled(surfaces: Sequence[Surface], walls: Walls, rng: np.random.Generator, blobs: Blobs = NO_BLOBS) -> Scene:
     """A scene of several surfaces; the repeatability of points that are found again is drawn from Beta(3, 2).
 
     Their share varies in waves over the scene, up to four of them: some parts are hardly ever in a map.
@@ -210,7 +206,8 @@ def look(scene: Scene, camera: Camera, reach: Array, rng: np.random.Generator, *
 def details(scene: Scene, view: Viewpoint, half: float, rng: np.random.Generator) -> Array:
     """Metres (n,) from which a camera of unit `half` can still tell the details at each point.
 
-    Sizes follow a power law, so that the number of points that can be told falls with the square of the distance.
+    Sizes follow a power law, so that the number of points that can be told falls with the square of the distance; all
+    can be told from the distance to the target.
     """
     distance = half * float(np.linalg.norm(view.centre - view.target))
-    return NEAREST_LIMIT * distance / np.sqrt(rng.random(len(scene.points)))
+    return distance / np.sqrt(rng.random(len(scene.points)))
