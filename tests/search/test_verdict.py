@@ -81,6 +81,20 @@ def test_matches_that_say_little_ask_for_starts_that_end_alike(hits: int, looks:
     assert ("missed" in found.reason) == (verdict == "ambiguous")
 
 
+@pytest.mark.parametrize(("degrees", "verdict"), [(1.0, "confident"), (4.0, "ambiguous")])
+def test_starts_that_end_beside_a_pose_met_it(degrees: float, verdict: str) -> None:
+    """As above; all ten starts ended at another optimum, which is the same pose up to two degrees."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-1, 1, (400, 3))
+    rays = directions(directions(points + SHIFT) + 5e-3 * rng.standard_normal((400, 3)))
+    rotations = Rotation.from_rotvec([[0, 0, 0], [0, 0, np.radians(degrees)]]).as_matrix()
+    poses = Candidates.unscored(rotations, np.stack([SHIFT, SHIFT]), hits=0)
+    poses = replace(poses, matched=np.array([0.8, 0.5]), scale=np.array([5e-3, 5e-3]), hits=np.array([0, 10]))
+    found = judged(poses, PointSets(rays, points), batches=1, looks=1)
+    assert found.verdict == verdict
+    assert ("missed" in found.reason) == (verdict == "ambiguous")
+
+
 @pytest.mark.parametrize(("others", "verdict"), [(16, "ambiguous"), (2, "confident")])
 def test_two_poses_that_explain_points_of_their_own_leave_a_doubt(others: int, verdict: str) -> None:
     """20 image points of one pose and as many others of a different one: only if the signs are 20 to 2, chance is
