@@ -30,32 +30,30 @@ SPREAD = (0.15, 1.5)  # of a cluster on the unit sphere, lowest and highest
 PLAIN = (0.2, 0.9)  # share of an ellipsoid's points that are spread evenly, lowest and highest
 
 
-def box_walls(
-    centre: Array,
-    half: Array,
-    yaw: Array,
+def alike_walls(
+    start: Array,
+    along: Array,
+    width: Array,
     height: Array,
     *,
     cell: float = FACADE_CELL,
     relief: float = RELIEF,
     weight: float = 1.0,
 ) -> Walls:
-    """Four walls of each of b boxes: centre (b, 2), half widths (b, 2), yaw (b,), height (b,); metres, radians."""
-    side = (yaw[:, None] + np.pi / 2 * np.arange(4)).ravel()  # headings of the walls, counter-clockwise
-    along = directions(side)
+    """Walls that differ in place and size only; their outside is on the right of `along`. See `Walls`."""
+    alike = (np.full(len(width), value) for value in (weight, cell, relief))
+    return Walls(start, along, right_of(along), width, height, *alike)
+
+
+def box_walls(centre: Array, half: Array, yaw: Array, height: Array, **alike: float) -> Walls:
+    """Four walls of each of b boxes: centre (b, 2), half widths (b, 2), yaw (b,), height (b,); metres, radians.
+
+    alike: options of `alike_walls`.
+    """
+    along = directions((yaw[:, None] + np.pi / 2 * np.arange(4)).ravel())  # counter-clockwise
     ahead, right = half[:, [0, 1, 0, 1]].ravel(), half[:, [1, 0, 1, 0]].ravel()
-    outwards = right_of(along)
-    k = len(side)
-    return Walls(
-        start=np.repeat(centre, 4, 0) + right[:, None] * outwards - ahead[:, None] * along,
-        along=along,
-        normal=outwards,
-        width=2 * ahead,
-        height=np.repeat(height, 4),
-        weight=np.full(k, weight),
-        cell=np.full(k, cell),
-        relief=np.full(k, relief),
-    )
+    start = np.repeat(centre, 4, 0) + right[:, None] * right_of(along) - ahead[:, None] * along
+    return alike_walls(start, along, 2 * ahead, np.repeat(height, 4), **alike)
 
 
 def wall_points(walls: Walls, count: int, rng: np.random.Generator) -> Surface:
@@ -328,13 +326,6 @@ def _corner_walls(count: int, rng: np.random.Generator) -> Walls:
     turn = np.where(chance[0] < 0.65, 1, -1) * np.where(chance[1] < 0.2, 0.6 + 1.4 * chance[2], np.pi / 2)
     along = directions(np.cumsum(turn) - turn[0])
     width = rng.uniform(8, 30, count)
-    return Walls(
-        start=np.cumsum(width[:, None] * along, 0) - width[:, None] * along,
-        along=along,
-        normal=right_of(along),
-        width=width,
-        height=rng.uniform(6, 25) * rng.uniform(0.7, 1.1, count),
-        weight=np.full(count, MAIN_WEIGHT),
-        cell=np.full(count, FACADE_CELL),
-        relief=np.full(count, RELIEF),
-    )
+    start = np.cumsum(width[:, None] * along, 0) - width[:, None] * along
+    height = rng.uniform(6, 25) * rng.uniform(0.7, 1.1, count)
+    return alike_walls(start, along, width, height, weight=MAIN_WEIGHT)
