@@ -190,8 +190,9 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
     Source: C. G. E. Boender, A. H. G. Rinnooy Kan, Bayesian stopping rules for multistart global optimization methods,
     Math. Programming 1987.
 
-    hits: independent starts that ended at the best pose. decades_a_match: of its evidence, 0 where its matches are no
-    evidence of each other, as in repeated structures. looks: how often its surroundings were searched in vain.
+    hits: independent starts that ended at the best pose, or at a neighbour that is no different pose. decades_a_match:
+    of its evidence, 0 where its matches are no evidence of each other, as in repeated structures. looks: how often its
+    surroundings were searched in vain.
 
     >>> rule = Evidence()
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
