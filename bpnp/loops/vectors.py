@@ -23,6 +23,15 @@ def sum_of(values: Any) -> Any:
 
 
 @part
+def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
+    """Element by element: numba compiles an assignment of arrays for 3 s, most of it the message of a wrong shape."""
+    for r in range(3):
+        for c in range(3):
+            to_rotation[r, c] = rotation[r, c]
+        to_translation[r] = translation[r]
+
+
+@part
 def cross(x: Any, y: Any, z: Any, a: Any, b: Any, c: Any) -> Any:
     """(x, y, z) x (a, b, c)."""
     return y * c - z * b, z * a - x * c, x * b - y * a

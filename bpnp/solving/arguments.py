@@ -240,12 +240,6 @@ def unit_bearings(rays: Array) -> Array:
     return rays / length
 
 
-def normalised(points2d: Array, camera: Camera | None) -> Array:
-    """Points (m, 2) on the normalised image plane, undistorted."""
-    check_unit(points2d, camera)
-    return points2d if camera is None else camera.normalise(points2d)
-
-
 def check_unit(points2d: Array, camera: Camera | None) -> None:
     """Raise ValueError for pixels without a camera, or the reverse."""
     largest = np.abs(points2d).max()

@@ -8,7 +8,7 @@ the focal length to be known (`Evidence.focal`), and what the other focal length
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -62,7 +62,7 @@ class FocalSettings:
     same: float = 5e-4
 
 
-DEFAULT = FocalSettings()
+RULE = FocalSettings()
 
 
 class UnknownCamera(NamedTuple):
@@ -101,11 +101,7 @@ class UnknownCamera(NamedTuple):
 
 
 def unknown_camera(
-    camera: Any,
-    image_size: Any,
-    focal_error: float | int | None,
-    distortion: bool = False,
-    rule: FocalSettings = DEFAULT,
+    camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
 ) -> UnknownCamera:
     """The camera of images of a size in pixels, or one with about the focal length of `camera`.
 
@@ -125,49 +121,43 @@ def unknown_camera(
         side = max(width, height)
         model, radial = ("SIMPLE_RADIAL", (0.0,)) if distortion else ("SIMPLE_PINHOLE", ())
         reference = camera_from((model, width, height, (side, width / 2, height / 2, *radial)))
-        return UnknownCamera(reference, rule.smallest, rule.largest, rule.usual, radial=distortion)
+        return UnknownCamera(reference, RULE.smallest, RULE.largest, RULE.usual, radial=distortion)
     if camera is None:
         raise ValueError("expected a `camera` whose focal length has the `focal_error`, got none; try image_size")
     if focal_error is None or not 0 < focal_error < 1:
         raise ValueError(f"expected `focal_error` above 0 and below 1, a share of the focal length, got {focal_error}")
-    widest = math.exp(rule.sigmas * focal_error)
+    widest = math.exp(RULE.sigmas * focal_error)
     return UnknownCamera(camera_from(camera), 1 / widest, widest, 1.0, focal_error)
 
 
 @one_blas_thread
 def solved_with_focal_length(
-    problem_at: Callable[[Camera, UnknownFocal], Problem],
-    unknown: UnknownCamera,
-    options: Options,
-    rule: FocalSettings = DEFAULT,
+    problem_at: Callable[[Camera, UnknownFocal], Problem], unknown: UnknownCamera, options: Options
 ) -> Solution:
     """The solution with the fewest false alarms, pose and focal length, of what `problem_at` makes of a camera."""
-    search = _Ladder(problem_at, unknown, options, rule)
+    search = _Ladder(problem_at, unknown, options)
     problem = search.problem(unknown.reference)
     if problem.degenerate is not None:
         return solutions_of({0: problem}, options)[0]
     few, most = is_enumerable(problem.sets), options.settings.schedule.turns
-    for camera in (ladder := unknown.ladder(rule.step_few if few else rule.step)):
-        search.climb(camera, min(rule.turns, most), len(ladder))
+    for camera in (ladder := unknown.ladder(RULE.step_few if few else RULE.step)):
+        search.climb(camera, min(RULE.turns, most), len(ladder))
         if search.best.verdict == "confident" and not few:
             break
-    if search.best.verdict != "confident" and not few and most > rule.turns and search.best.camera is not None:
+    if search.best.verdict != "confident" and not few and most > RULE.turns and search.best.camera is not None:
         search.climb(search.best.camera, most, 1)
     return replace(search.contested(), seconds=Clock.now() - search.begun)
 
 
+@dataclass
 class _Ladder:
     """Searches with several focal lengths, and the solutions `ends` that each of them led to."""
 
-    def __init__(
-        self,
-        problem_at: Callable[[Camera, UnknownFocal], Problem],
-        unknown: UnknownCamera,
-        options: Options,
-        rule: FocalSettings,
-    ) -> None:
-        self.problem_at, self.unknown, self.options, self.rule = problem_at, unknown, options, rule
-        self.begun, self.ends = Clock.now(), list[Solution]()
+    problem_at: Callable[[Camera, UnknownFocal], Problem]
+    unknown: UnknownCamera
+    options: Options
+    begun: float = field(default_factory=Clock.now)
+    ends: list[Solution] = field(default_factory=list)
 
     def problem(self, camera: Camera) -> Problem:
         return self.problem_at(camera, self.unknown.focal(camera))
@@ -179,7 +169,7 @@ class _Ladder:
     def climb(self, camera: Camera, turns: int, rungs: int) -> None:
         """Search with a camera, and with those that fit the poses better that are found."""
         found = self._search(camera, turns, rungs)
-        for _ in range(self.rule.alternations):
+        for _ in range(RULE.alternations):
             if found.verdict == "failed":
                 break
             better, settled = self._refined(found, camera)
@@ -201,13 +191,13 @@ class _Ladder:
 
     def _refined(self, solution: Solution, camera: Camera) -> tuple[Camera, bool]:
         """The camera that fits best near a pose, and whether it is the one that was given."""
-        given, rule, moved = camera.focal, self.rule, False
+        given, moved = camera.focal, False
         rotation, translation, scale = solution.rotation, solution.translation, solution.stats.residual
         problem = self.problem(camera)
-        for _ in range(rule.rounds):
+        for _ in range(RULE.rounds):
             middle = rotation @ (problem.sets.middle + problem.origin) + translation
             fitted = with_focal_length(problem.sets, rotation, middle, scale)
-            if fitted is None or not 1 / rule.step < camera.focal * fitted.zoom / given < rule.step:
+            if fitted is None or not 1 / RULE.step < camera.focal * fitted.zoom / given < RULE.step:
                 break
             camera = zoomed_camera(camera, fitted.zoom)
             problem = self.problem(camera)
@@ -219,9 +209,9 @@ class _Ladder:
             end = weighed(polished(scene, start[0][None], start[1][None], scale), problem.sets)
             rotation, translation, scale = end.rotation[0], end.translation[0], min(scale, float(end.scale[0]))
             translation = translation - rotation @ problem.origin
-            if abs(math.log(fitted.zoom)) < rule.same:
+            if abs(math.log(fitted.zoom)) < RULE.same:
                 break
-        return camera, not moved and abs(math.log(camera.focal / given)) < rule.same
+        return camera, not moved and abs(math.log(camera.focal / given)) < RULE.same
 
     def contested(self) -> Solution:
         """The best solution, ambiguous where another focal length led to a different pose that fits about as well."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 from functools import partial
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import maximum_bipartite_matching, min_weight_full_bipartite_matching
@@ -17,12 +17,11 @@ from scipy.spatial.transform import Rotation
 from bpnp.geometry import MIN_POINTS
 from bpnp.search.evidence.uncertainty import linearised, pose_covariance
 from bpnp.search.verdict import SearchResult
+from bpnp.solving.arguments import Array, Labels
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Candidate, Solution, SolutionStats, with_pose
 
-Array = npt.NDArray[np.float64]
-Labels = npt.NDArray[np.int64]
-Allowed = Callable[[Labels, Labels], npt.NDArray[np.bool_]]
+Allowed = Callable[[Labels, Labels], NDArray[np.bool_]]
 DENSE = 4096  # possible matches up to which all of them are compared
 NEIGHBOURS = 8  # of a point that can be its match; more only where the radius is far too large
 SCALES = 3.0  # of the residuals: the threshold of an inlier, if none is given
@@ -119,17 +118,12 @@ def _fitted(problem: Problem, rotation: Array, translation: Array, threshold: fl
     return rotation, translation
 
 
-def anyone(i: Labels, j: Labels) -> npt.NDArray[np.bool_]:
-    """Every image point may be matched to every scene point."""
-    return np.ones(np.shape(i), np.bool_)
-
-
-def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Labels:
+def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
     """As many matches (i, j) with |image_i - projected_j| <= radius as there can be with no point in two of them (paper
     Eq. 1), and of such sets one with the least sum of squared distances: (k, 2), ordered by i; NaN is no one's match.
 
-    allowed: which places i and j may be matched. A minimum-weight matching, in which leaving an image point out costs
-    more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
+    allowed: which places i and j may be matched, None for all. A minimum-weight matching, in which leaving an image
+    point out costs more than all distances together; of many points on the graph of each one's `NEIGHBOURS` nearest.
     """
     matches, distance = _near(image, projected, radius, allowed)
     alone = np.logical_and(*(np.bincount(side)[side] == 1 for side in matches.T)) if len(matches) else np.ones(0, bool)
@@ -149,7 +143,7 @@ def one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed =
     return np.asarray(chosen[np.argsort(chosen[:, 0])])
 
 
-def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> int:
+def count_one_to_one(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> int:
     """How many matches `one_to_one` has: a maximum matching, faster than one of least cost."""
     matches, _ = _near(image, projected, radius, allowed)
     if all(np.bincount(side).max(initial=0) <= 1 for side in matches.T):
@@ -158,7 +152,7 @@ def count_one_to_one(image: Array, projected: Array, radius: float, allowed: All
     return int((maximum_bipartite_matching(graph, perm_type="column") >= 0).sum())
 
 
-def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed = anyone) -> Labels:
+def mutual_nearest(image: Array, projected: Array, radius: float, allowed: Allowed | None = None) -> Labels:
     """Matches within `radius` in which each is the other's nearest: fewer than `one_to_one`, and fewer wrong ones."""
     matches, distance = _near(image, projected, radius, allowed)
     nearest = np.ones(len(matches), np.bool_)
@@ -189,7 +183,7 @@ def fit_pose(
     return pose(found.x)
 
 
-def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tuple[Labels, Array]:
+def _near(image: Array, projected: Array, radius: float, allowed: Allowed | None) -> tuple[Labels, Array]:
     """Allowed matches (e, 2) within `radius`, ordered, and their distances; among the nearest of many points."""
     seen = np.flatnonzero(np.isfinite(projected).all(-1))
     if len(image) * len(seen) <= DENSE:
@@ -202,7 +196,7 @@ def _near(image: Array, projected: Array, radius: float, allowed: Allowed) -> tu
         # One number a match: unique rows would be sorted as records, ten times as long.
         matches = np.stack(np.divmod(np.unique(both[:, 0] * len(seen) + both[:, 1]), len(seen)), -1)
     matches[:, 1] = seen[matches[:, 1]]
-    matches = matches[allowed(*matches.T)]
+    matches = matches if allowed is None else matches[allowed(*matches.T)]
     return matches, np.linalg.norm(image[matches[:, 0]] - projected[matches[:, 1]], axis=-1)
 
 

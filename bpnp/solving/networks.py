@@ -1,7 +1,7 @@
 """What a trained network says of a problem: its poses, or poses to start a search from."""
 
 import copy
-from functools import cache, partial
+from functools import cache
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -74,10 +74,11 @@ def predicted(net: nn.Module, members: list[Problem], deadline: Deadline) -> lis
 def proposals_for(problem: Problem, seed: int) -> Proposals | None:
     """Whom a search in doubt asks for poses: the packaged matcher for views around a known pose, and without a prior
     that for scenes in any axes, unless the points are too many for it."""
-    if isinstance(problem.prior, PosePrior):
-        return partial(_of_packaged, VIEW_MATCHER, problem, seed)
+    weights = VIEW_MATCHER if isinstance(problem.prior, PosePrior) else SCENE_MATCHER
     too_many = len(problem.image) * len(problem.points3d) > MOST_CELLS
-    return None if too_many or problem.prior is not None else partial(_of_packaged, SCENE_MATCHER, problem, seed)
+    if weights == SCENE_MATCHER and (too_many or problem.prior is not None):
+        return None
+    return lambda: proposed(_packaged(weights), problem, seed)
 
 
 def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]:
@@ -97,10 +98,6 @@ def proposed(net: "Matcher", problem: Problem, seed: int) -> tuple[Array, Array]
     poses = _host(drawn[0])
     poses = poses[np.isfinite(poses).all((-2, -1))]
     return view.before(poses[:, :, :3], poses[:, :, 3])
-
-
-def _of_packaged(weights: str, problem: Problem, seed: int) -> tuple[Array, Array]:
-    return proposed(_packaged(weights), problem, seed)
 
 
 @cache

@@ -16,11 +16,11 @@ from bpnp.solving.arguments import (
     Labels,
     Prior,
     check_points,
+    check_unit,
     checked_labels,
     checked_normals,
     checked_scores,
     image_points,
-    normalised,
     scene_points,
     unit_bearings,
 )
@@ -169,7 +169,8 @@ def bearings_of(image: Array, camera: Camera | None) -> tuple[Array, Array]:
     if image.shape[1] == 3:
         bearings = unit_bearings(image)
         return bearings, in_front(bearings)[:, :2]
-    plane = normalised(image, camera)
+    check_unit(image, camera)
+    plane = image if camera is None else camera.normalise(image)
     rays = np.column_stack([plane, np.ones(len(plane))])
     return rays / np.linalg.norm(rays, axis=-1, keepdims=True), plane
 

@@ -225,10 +225,8 @@ class Solution:
     def to_json(self) -> str:
         """All fields as strict JSON: null for NaN, every digit kept. `bpnp view` draws such a file."""
         pose = {name: getattr(self, name) if self.found else None for name in ("rotation", "translation", "centre")}
-        content = {"format": FORMAT} | vars(self) | pose
-        content |= {"rotation_std_deg": self.rotation_std_deg, "centre_std": self.centre_std}
-        content |= {"focal_length": self.focal_length, "focal_length_std": self.focal_length_std}
-        content |= {"scale_std": self.scale_std}
+        derived = "rotation_std_deg", "centre_std", "focal_length", "focal_length_std", "scale_std"
+        content = {"format": FORMAT} | vars(self) | pose | {name: getattr(self, name) for name in derived}
         content |= {"candidates": [vars(candidate) for candidate in self.candidates], "stats": vars(self.stats)}
         return json.dumps(_plain(content), allow_nan=False)
 

@@ -3,7 +3,7 @@
 import math
 from typing import Any, NamedTuple
 
-from bpnp.loops.vectors import rotated
+from bpnp.loops.vectors import copy_pose, rotated
 from bpnp.robust.minimal_solvers import Triangles, chords_between, compiled, part, solve_p2p, solve_p3p
 from bpnp.search.enumeration.matching import Matches, cell_of, evidence, fits, match, nearest, sight, step
 from bpnp.search.enumeration.points import Array, Places
@@ -162,12 +162,6 @@ def copy(values: Any, to: Any) -> None:
 
 
 @part
-def copy_pose(pose: Any, to: Any) -> None:
-    for r in range(4):
-        copy(pose[r], to[r])
-
-
-@part
 def consider(pose: Any, reach: float, problem: Any, kept: Any, work: Any) -> None:
     """Refine a pose that matches about as many points as any hypothesis did at this reach."""
     count, _, expected = match(pose, reach, problem.scene, problem.image.grid, work.matches)
@@ -246,7 +240,7 @@ def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
     if values[place] >= value:
         return
     values[place], kept.counts[place] = value, count
-    copy_pose(pose, kept.poses[place])
+    copy_pose(pose, pose[3], kept.poses[place], kept.poses[place, 3])
     copy(matches.point, kept.point[place])
     copy(matches.distance2, kept.distance2[place])
     for c in range(len(values)):

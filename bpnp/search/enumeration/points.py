@@ -93,7 +93,7 @@ class Heading(NamedTuple):
 class SceneSide:
     """The scene of one problem, or of many: a device is seen in frame after frame. size: the extent that is the unit.
 
-    nearest: (n, k) each point's nearest.
+    nearest: (n, k) each point's nearest. tables: of (size, near), the triangles that are there already.
     """
 
     def __init__(self, points3d: Array, normals3d: Array | None, labels3d: Places | None) -> None:
@@ -104,21 +104,17 @@ class SceneSide:
         labels = np.full(len(local), -1) if labels3d is None else np.array(labels3d, np.int64)
         self.arrays = ScenePoints(np.ascontiguousarray(local / self.size), normals, labels)
         self.nearest = nearest_of(self.arrays.points, normals)
-        self._triangles: dict[tuple[int, int], Triangles] = {}
+        self.tables: dict[tuple[int, int], Triangles] = {}
 
     def triangles(self, size: int, near: int) -> Triangles:
         """Of a point and two, or one (`pairs`), of its `near` nearest; those of fewer are the first rows."""
         near = min(near, self.nearest.shape[1])
-        if (size, near) not in self._triangles:
+        if (size, near) not in self.tables:
             sets = sets_within(self.nearest, near, size)
-            self._triangles[size, near] = (
+            self.tables[size, near] = (
                 visible_triangles(self.arrays.points, self.arrays.normals, sets) if size == 3 else pairs(sets)
             )
-        return self._triangles[size, near]
-
-    def has_triangles(self, size: int, near: int) -> bool:
-        """Whether they are there already."""
-        return (size, min(near, self.nearest.shape[1])) in self._triangles
+        return self.tables[size, near]
 
 
 class ImageSide:

@@ -50,7 +50,7 @@ class EnumeratedPoses(NamedTuple):
 
     rotation: (c, 3, 3). translation: (c, 3). evidence: (c,) nats beyond chance, before the number of tests counts.
     match: (c, m) the scene point that each image point is, -1 for none. residual: (c, m) its angle, radians, infinite
-    where there is none. fixing, tests, solved: of `Enumeration`. ended: why; "exhausted" where every hypothesis was
+    where there is none. fixing, tests: of `Enumeration`. ended: why; "exhausted" where every hypothesis was
     tried, "safe" where `is_safe` said so, "interrupted" by the deadline, "most" after as many as are allowed.
     """
 
@@ -61,7 +61,6 @@ class EnumeratedPoses(NamedTuple):
     residual: Array
     fixing: int
     tests: float
-    solved: int
     ended: Ended
 
 
@@ -112,7 +111,7 @@ class Enumeration:
             len(side) * min(near, side.shape[1]) ** (stage.matches - 1) / 2
             for side, near in ((self.image.nearest, stage.near2d), (self.scene.nearest, stage.near3d))
         )
-        if self.scene.has_triangles(stage.matches, stage.near3d):
+        if (stage.matches, min(stage.near3d, self.scene.nearest.shape[1])) in self.scene.tables:
             scene = 0
         return BUILT * image + (BUILT_FACING if len(self.scene.arrays.normals) else BUILT) * scene
 
@@ -147,12 +146,6 @@ class Enumeration:
         self.solved += solved
         if solved >= most:
             self._pace = (Clock.now() - start) / solved
-
-    def vary_best(self) -> None:
-        """Refine the best pose again on wider matches."""
-        if math.isfinite(self.best):
-            for reach in (0.5 * self.reach, self.reach):
-                self.refine(self.kept.poses[int(self.kept.evidence.argmax())], reach)
 
     def refine(self, pose: Array, reach: float) -> None:
         """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
@@ -202,7 +195,6 @@ def enumerate_poses(
     def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
         if run.best < run.tests:
             return None
-        run.vary_best()
         poses = _poses(run, "safe")
         if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
             is_safe is None or is_safe(poses)
@@ -219,7 +211,6 @@ def enumerate_poses(
         if stage.matches < run.fixing:
             continue
         if run.seconds_to_begin(stage) > deadline - Clock.now():
-            run.vary_best()
             return _poses(run, "interrupted")
         run.begin(stage)
         while not run.ended:
@@ -228,12 +219,10 @@ def enumerate_poses(
                 return poses
             late = deadline - Clock.now() < SHORTEST
             if late or run.solved > settings.most:
-                run.vary_best()
                 return _poses(run, "interrupted" if late else "most")
         complete = stage.near2d >= len(sets.bearings) - 1 and stage.near3d >= len(sets.points3d) - 1
         if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
             break
-    run.vary_best()
     return _poses(run, "exhausted" if complete else "most")
 
 
@@ -249,15 +238,17 @@ def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: Enumerati
 
 
 def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
-    """The kept poses, likeliest first."""
+    """The kept poses, likeliest first, after the best one was refined again on wider matches."""
     kept = run.kept
+    for reach in (0.5 * run.reach, run.reach) if math.isfinite(run.best) else ():
+        run.refine(kept.poses[int(kept.evidence.argmax())], reach)
     order = np.argsort(-kept.evidence, kind="stable")
     order = order[np.isfinite(kept.evidence[order])]
     rotation, translation = run.leave(kept.poses[order])
     match, radii = kept.point[order], np.sqrt(kept.distance2[order])
     residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
     evidence = kept.evidence[order]
-    return EnumeratedPoses(rotation, translation, evidence, match, residual, run.fixing, run.tests, run.solved, ended)
+    return EnumeratedPoses(rotation, translation, evidence, match, residual, run.fixing, run.tests, ended)
 
 
 def margin(poses: EnumeratedPoses, settings: EnumerationSettings = DEFAULT) -> float:

@@ -39,12 +39,11 @@ STEPS = 5  # scales s, each half of the one before, from the largest noise that 
 
 class Background(NamedTuple):
     """What chance is measured against, for one problem: scales s (S,) in pixels, logarithm of the number of rotations
-    (S,) and c_i (m, S); bearings (m, 3) and the angle of a pixel (m,)."""
+    (S,) and c_i (m, S); the angle of a pixel (m,)."""
 
     scales: Array
     log_tests: Array
     together: Array
-    bearings: Array
     pixel: Array
 
 
@@ -54,13 +53,12 @@ def background_of(bearings: Array, pixel: Array, count: int, noise: float, zooms
     m, scales = len(bearings), np.asarray(noise * 0.5 ** np.arange(STEPS), np.float64)
     spread = float(np.sqrt(((bearings - bearings.mean(0)) ** 2).sum(-1).mean()))
     cells = 8 * math.pi**2 * spread / (scales * np.median(pixel)) ** 3
-    cells = cells * np.maximum(
-        zooms * spread / (scales * np.median(pixel)), 1.0
-    )  # focal lengths that can be told apart
+    focal_lengths = np.maximum(zooms * spread / (scales * np.median(pixel)), 1.0)  # that can be told apart
+    cells = cells * focal_lengths
     tests = np.log(np.maximum(np.minimum(cells, m * (m - 1) / 2 * count * (count - 1)), 1.0))
     axes = np.linalg.svd(bearings - bearings.mean(0), full_matrices=False)[2][:2].T
     together = sums_near(bearings, bearings, axes, 2 * scales[::-1] * np.median(pixel), np.zeros(STEPS))
-    return Background(scales, tests, together[:, ::-1], bearings, pixel)
+    return Background(scales, tests, together[:, ::-1], pixel)
 
 
 def log10_false_alarms(squared: Array, density: Array, known: Background) -> tuple[float, Array]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from bpnp.loops.vectors import F, compiled, cross, part, rotated, turn
-from bpnp.search.kernels.neighbours import HashedPoints, entry, hashed
+from bpnp.search.kernels.neighbours import HashedPoints, entry
 
 Array = NDArray[np.float64]
 LOG_HALF = math.log(0.5)  # of a point that the true rotation explains
@@ -44,11 +44,6 @@ class Catalogue(NamedTuple):
     directions: Array
     density: Array
     neighbours: Neighbours
-
-    def sky(self, reach: float) -> Sky:
-        """The directions in cells, to be looked up within a chord of `reach`."""
-        # A copy may be written to, as the points that are looked up elsewhere: the loops are compiled once.
-        return Sky(hashed(self.directions.copy(), reach), self.density)
 
 
 def catalogue_of(directions: Array) -> Catalogue:
@@ -89,10 +84,6 @@ class Rays(NamedTuple):
     high: NDArray[np.float32]
     azimuth: NDArray[np.int32]
     nats: NDArray[np.float32]
-
-    def nearest(self, count: int) -> "Rays":
-        """The first ones."""
-        return Rays(self.low[:count], self.high[:count], self.azimuth[:count], self.nats[:count])
 
 
 class Image(NamedTuple):

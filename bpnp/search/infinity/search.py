@@ -42,6 +42,7 @@ from bpnp.search.infinity.kernels import (
     fit,
     vote,
 )
+from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import Verdict
 
@@ -180,9 +181,19 @@ def search_rotation(
         if turns and deadline.passed():
             break
         reach = settings.reach * scale
-        sky = catalogue.sky(settings.cell * reach * float(np.median(image.pixel)))
+        # A copy may be written to, as the points that are looked up elsewhere: the loops are compiled once.
+        table = hashed(directions.copy(), settings.cell * reach * float(np.median(image.pixel)))
         background = background_of(image.bearings, image.pixel, len(directions), 2 * scale, zooms)
-        sight = Sight(image, catalogue, sky, background, reach, density, sample[: settings.sample], settings)
+        sight = Sight(
+            image,
+            catalogue,
+            Sky(table, catalogue.density),
+            background,
+            reach,
+            density,
+            sample[: settings.sample],
+            settings,
+        )
         new = _search(sight, scores, seed, deadline)
         turns += new.turns
         if new.log10_false_alarms <= result.log10_false_alarms:
@@ -255,7 +266,15 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
     places, bin_of = np.arange(len(neighbours.chord)), np.empty(0, np.int64)
     for used, most in ((settings.first, settings.promising), (len(around), settings.refined)):
         value, bin_of = np.empty(len(places), np.float32), np.empty(len(places), np.int64)
-        vote(neighbours, places, rays.nearest(used), shift, np.empty(bins, np.float32), value, bin_of)
+        vote(
+            neighbours,
+            places,
+            Rays._make(values[:used] for values in rays),
+            shift,
+            np.empty(bins, np.float32),
+            value,
+            bin_of,
+        )
         best = np.argpartition(-value, most)[:most] if len(places) > most else np.arange(len(places))
         best = best[np.argsort(-value[best], kind="stable")]
         places, bin_of = places[best], bin_of[best]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bpnp.loops.vectors import F, compiled, part, sum_of
+from bpnp.loops.vectors import F, compiled, copy_pose, part, sum_of
 from bpnp.search.kernels.dense import move, see
 from bpnp.search.kernels.sides import Array, WeightedBearings, visible_weights
 
@@ -281,15 +281,6 @@ def is_finite(rotation: Any, translation: Any) -> bool:
     for r in range(3):
         total += rotation[r, 0] + rotation[r, 1] + rotation[r, 2] + translation[r]
     return math.isfinite(total)
-
-
-@part
-def copy_pose(rotation: Any, translation: Any, to_rotation: Any, to_translation: Any) -> None:
-    """Element by element: numba compiles an assignment of arrays for 3 s, most of it the message of a wrong shape."""
-    for r in range(3):
-        for c in range(3):
-            to_rotation[r, c] = rotation[r, c]
-        to_translation[r] = translation[r]
 
 
 @compiled

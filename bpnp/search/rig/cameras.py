@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.false_alarms import directions_of, log10_tests, log_evidence_of
-from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance, share_bound
+from bpnp.search.evidence.uncertainty import Linearised, linearised, local_covariance
 from bpnp.search.point_sets import PointSets
 from bpnp.search.scene import Scene
 
@@ -135,11 +135,6 @@ class Rig:
                 information += turn.T @ np.linalg.solve(own, turn)
         is_fixed = np.linalg.matrix_rank(information) == self.unknowns
         return np.asarray(np.linalg.inv(information), np.float64) if is_fixed else None
-
-    def scale_bound(self, rotation: Array, translation: Array, scale: float, matches: float) -> float:
-        """Share by which the scale of a pose's scene may be wrong, exceeded once in a thousand."""
-        covariance = self.covariance(rotation, translation, scale)
-        return math.inf if covariance is None else share_bound(covariance[6:, 6:], 2 * matches - 7)
 
     def candidates(self, rotations: Array, translations: Array) -> Candidates:
         """Poses refined on all cameras to the scale at which their false alarms are fewest; `matched` is an expected

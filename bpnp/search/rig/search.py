@@ -19,6 +19,7 @@ from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.evidence.uncertainty import share_bound
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import search_beside
@@ -183,14 +184,14 @@ class Together:
         result = self._judged()
         if result.verdict == "confident":
             strongest, seen = self._strongest()
-            best = seen.rotation[0], seen.translation[0]
-            (turns, shifts), _ = repeated_poses(self.rig.sets[strongest], *best, float(seen.scale[0]), self.rule)
+            known = seen.rotation[0], seen.translation[0], float(seen.scale[0])
+            (turns, shifts), _ = repeated_poses(self.rig.sets[strongest], *known, self.rule)
             self._add(self.rig.candidates(*self.rig.rig_of(strongest, turns, shifts, self.best.translation[0, 3])))
             result = self._judged()
         if result.verdict == "confident" and self.rig.unknowns == 7:
-            first = self.best[:1]
-            known = first.rotation[0], first.translation[0], float(first.scale[0]), float(first.matched[0])
-            if self.rig.scale_bound(*known) > self.rule.focal:
+            best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
+            covariance, free = self.rig.covariance(*best), 2 * float(self.best.matched[0]) - 7
+            if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.focal:
                 off = f"it may be more than {100 * self.rule.focal:.0f} % off"
                 reason = f"the scale of the scene cannot be told: {off}"
                 result = replace(result, verdict="ambiguous", reason=reason)
