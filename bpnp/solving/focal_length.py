@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -27,13 +26,12 @@ from bpnp.search.point_sets import UnknownFocal
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import weighed
-from bpnp.solving.arguments import checked_size
+from bpnp.solving.arguments import Array, checked_size
 from bpnp.solving.matches import SCALES, mutual_nearest
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
-Array = NDArray[np.float64]
 LEAST_BEND = 1e-3  # change of the coefficient that makes another camera
 FEWEST_BENT = 30  # matches from which a radial coefficient is looked for
 SIGNIFICANT_BEND = 10.8  # chi-squared with one degree of freedom, one in a thousand

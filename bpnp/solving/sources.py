@@ -10,7 +10,7 @@ from typing import NamedTuple
 import torch
 from torch import nn
 
-from bpnp.loops.parallel import Deadline, in_processes
+from bpnp.loops.parallel import Clock, Deadline, in_processes
 from bpnp.search.enumeration.search import exceeds_enumeration
 from bpnp.search.search import search_poses, search_proposed
 from bpnp.search.settings import DEFAULT, SearchSettings
@@ -47,7 +47,7 @@ class Options(NamedTuple):
 
     def deadline(self, problem: Problem) -> Deadline:
         """When to leave off searching, so that all ends in time; of a problem that is begun now."""
-        begun = Deadline.after(0.0).at
+        begun = Clock.now()
         end = min(self.until.at, Deadline.after(self.time_limit).at)
         ending = ENDING + ENDING_A_POINT * (len(problem.image) + len(problem.points3d))
         return Deadline(max(end - ending, (begun + end) / 2))

@@ -169,14 +169,15 @@ class Enumeration:
 def enumerate_poses(
     sets: PointSets,
     *,
-    radius: float,
+    radius: float | None = None,
     deadline: float = math.inf,
     is_safe: Callable[[EnumeratedPoses], bool] | None = None,
     settings: EnumerationSettings = DEFAULT,
 ) -> EnumeratedPoses:
     """Poses under which image points see scene points, one-to-one within `radius`.
 
-    radius: radians, the largest residual of a match, a few standard deviations of the noise. deadline: of `Clock`.
+    radius: radians, the largest residual of a match, a few standard deviations of the noise; None for that of the
+        settings. deadline: of `Clock`.
     is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
     gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
     first.
@@ -190,7 +191,8 @@ def enumerate_poses(
     >>> np.allclose(found.rotation[0], np.eye(3)), found.match[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
-    run = Enumeration(sets, radius, settings)
+    known = settings.radius if sets.floor is None else settings.floors * sets.floor
+    run = Enumeration(sets, known if radius is None else radius, settings)
 
     def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
         if run.best < run.tests:
@@ -295,8 +297,7 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
         return certain is not None
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        radius = rule.radius_at(sets.floor)
-        poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
+        poses = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, settings=rule)
         return poses, _candidates(poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None

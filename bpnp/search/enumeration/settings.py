@@ -93,10 +93,6 @@ class EnumerationSettings:
     sigmas: float = 4.0
     prior_weight: float = 0.1
 
-    def radius_at(self, floor: float | None) -> float:
-        """Radius of a match, radians, where the smallest believable scale of the residuals is `floor`, if known."""
-        return self.radius if floor is None else self.floors * floor
-
 
 RULES = Rules()
 DEFAULT = EnumerationSettings()

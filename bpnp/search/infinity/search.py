@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import betaln
 
@@ -22,7 +21,9 @@ from bpnp.loops.parallel import NEVER, Deadline
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.infinity.evidence import (
     FIXING,
+    Array,
     Background,
+    Labels,
     background_of,
     how_well_known,
     log10_false_alarms,
@@ -46,8 +47,6 @@ from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.settings import DEFAULT as SEARCH
 from bpnp.search.verdict import Verdict
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
 BINS = (6, 7)  # log2 of the fewest and most bins of azimuths
 
 

@@ -14,24 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bpnp.geometry import distinct
-from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
+from bpnp.loops.parallel import NEVER, Clock, Deadline, one_blas_thread
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame
 from bpnp.search.enumeration.search import enumerate_poses, is_enumerable
 from bpnp.search.enumeration.settings import DEFAULT as ENUMERATION
 from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.evidence.uncertainty import share_bound
-from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
 from bpnp.search.raster_search import search_beside
-from bpnp.search.rig.cameras import WIDE, Pose, Rig
+from bpnp.search.rig.cameras import WIDE, Array, Pose, Rig
 from bpnp.search.scene import Scene
 from bpnp.search.schedule import turns
 from bpnp.search.search import lacks_partners
 from bpnp.search.settings import DEFAULT
 from bpnp.search.verdict import SearchResult, judged, missed, no_pose
 
-Array = NDArray[np.float64]
-PROPOSED, REFINED = 4000, 16  # poses of few points that a camera proposes, and of all that are refined
+PROPOSING = replace(ENUMERATION, kept=4000)  # poses of few points that a camera proposes
+REFINED = 16  # poses of all cameras
 A_TURN = 2  # poses that a turn of a camera finds and that are refined
 COMPARED = 64  # proposals of which it is asked how much evidence they have
 SAME = (1.0, 0.02)  # degrees and distances of the scene within which a pose is not refined twice
@@ -47,9 +46,10 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
     together, searches, few = Together(rig), dict[int, Iterator[Candidates]](), dict[int, Candidates]()
     for k, sets in enumerate(rig.sets):
         if is_enumerable(sets):
-            until = Deadline((Deadline.after(0.0).at * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k))
-            few[k], is_exhausted = _enumerated(sets, until)
-            together.exhaustive &= is_exhausted
+            until = (Clock.now() * (len(rig.sets) - k - 1) + deadline.at) / (len(rig.sets) - k)
+            found = enumerate_poses(sets, deadline=until, is_safe=lambda _: False, settings=PROPOSING)
+            few[k] = Candidates.unscored(found.rotation, found.translation)
+            together.exhaustive &= found.ended == "exhausted"
             continue
         together.exhaustive = False
         scene = Scene(sets, seed + k, settings, deadline)
@@ -60,26 +60,19 @@ def search_rig(rig: Rig, *, clutter: float | None = None, seed: int = 0, deadlin
     together.take(few, REFINED)
     while searches and together.turns < settings.schedule.turns and not deadline.passed():
         for k in list(searches):
-            found = next(searches[k], None)
-            if found is None or deadline.passed():
+            new = next(searches[k], None)
+            if new is None or deadline.passed():
                 del searches[k]
                 continue
             together.pools[k].turns += 1
-            together.pools[k].merge(found)
-            together.take({k: found}, A_TURN)
+            together.pools[k].merge(new)
+            together.take({k: new}, A_TURN)
             if together.may_be_certain():
                 result = together.result()
                 if result.verdict == "confident" or result.settled:
                     return result
         together.look_around()
     return together.result()
-
-
-def _enumerated(sets: PointSets, deadline: Deadline) -> tuple[Candidates, bool]:
-    """Poses of few points, and whether every hypothesis was tried."""
-    radius, chosen = ENUMERATION.radius_at(sets.floor), replace(ENUMERATION, kept=PROPOSED)
-    poses = enumerate_poses(sets, radius=radius, deadline=deadline.at, is_safe=lambda _: False, settings=chosen)
-    return Candidates.unscored(poses.rotation, poses.translation), poses.ended == "exhausted"
 
 
 class Together:
