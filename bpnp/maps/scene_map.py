@@ -181,7 +181,7 @@ class SceneMap:
         scores = self._scores(cameras[0], keypoints, known_focal=isinstance(lens, Camera))
         order = list(places_first(self.views, scores, len(self.points3d)))
         turns = [(place + RUNG * rung, rung, k) for rung in range(len(cameras)) for place, k in enumerate(order)]
-        tried = [lens.near(one)._replace(alone=True) if isinstance(lens, UnknownCamera) else lens for one in cameras]
+        tried = [lens.near(one) if isinstance(lens, UnknownCamera) else lens for one in cameras]
         return [
             Place(view, view.points, tried[rung])
             for _, rung, k in sorted(turns)
@@ -387,5 +387,5 @@ def _near(lens: Camera | UnknownCamera, solution: Solution) -> Camera | UnknownC
     """The camera for a longer search about a solution: an unknown one has the focal length found, if that is more than
     chance, else all of them are tried."""
     if isinstance(lens, UnknownCamera) and solution.log10_false_alarms < 0:
-        return lens.near(camera_from(solution.camera))._replace(alone=True)
+        return lens.near(camera_from(solution.camera))
     return lens

@@ -91,11 +91,10 @@ class UnknownCamera(NamedTuple):
         return [zoomed_camera(self.reference, self.usual * step**k) for k in steps]
 
     def near(self, camera: Camera) -> "UnknownCamera":
-        """The same with one of these cameras as the usual one."""
-        return self._replace(
-            reference=zoomed_camera(camera, self.reference.focal / camera.focal),
-            usual=camera.focal / self.reference.focal,
-        )
+        """The same with one of these cameras as the usual one, to begin with alone."""
+        zoom = camera.focal / self.reference.focal
+        reference = zoomed_camera(camera, self.reference.focal / camera.focal)
+        return self._replace(reference=reference, usual=zoom, alone=True)
 
 
 def unknown_camera(

@@ -155,16 +155,6 @@ class Enumeration:
     def _explored(self, *where: int | float) -> tuple[int, int, int]:
         return explore(*where, self._block, self.problem, self.kept, self.work)
 
-    def enter(self, rotation: Array, translation: Array) -> Array:
-        """A pose of the given points as (4, 3) in these frames."""
-        middle = self.image.turn @ (rotation @ self.scene.centre + translation)
-        return np.vstack([self.image.turn @ rotation, middle / self.scene.size])
-
-    def leave(self, poses: Array) -> tuple[Array, Array]:
-        """Poses (c, 4, 3) of these frames as rotations (c, 3, 3) and translations (c, 3) of the given points."""
-        rotation = self.image.turn.T @ poses[:, :3]
-        return rotation, self.scene.size * poses[:, 3] @ self.image.turn - rotation @ self.scene.centre
-
 
 def enumerate_poses(
     sets: PointSets,
@@ -206,7 +196,8 @@ def enumerate_poses(
 
     complete = False
     if (predicted := predicted_pose(sets.prior)) is not None:
-        run.refine(run.enter(*predicted), run.reach)
+        turn, middle = run.image.turn, predicted[0] @ run.scene.centre + predicted[1]
+        run.refine(np.vstack([turn @ predicted[0], turn @ middle / run.scene.size]), run.reach)
         if (poses := enough(0.0)) is not None:
             return poses
     for stage in settings.stages:
@@ -246,7 +237,8 @@ def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
         run.refine(kept.poses[int(kept.evidence.argmax())], reach)
     order = np.argsort(-kept.evidence, kind="stable")
     order = order[np.isfinite(kept.evidence[order])]
-    rotation, translation = run.leave(kept.poses[order])
+    rotation = run.image.turn.T @ kept.poses[order, :3]
+    translation = run.scene.size * kept.poses[order, 3] @ run.image.turn - rotation @ run.scene.centre
     match, radii = kept.point[order], np.sqrt(kept.distance2[order])
     residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
     evidence = kept.evidence[order]

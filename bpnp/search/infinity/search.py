@@ -284,14 +284,8 @@ def _agreeing(sight: Sight, i: int, around: Labels, rays: Rays, bins: int) -> It
         if agrees.any(1).sum() >= FIXING:
             k, e = np.nonzero(agrees)
             seen, directions = np.r_[i, around[k]], np.r_[a, neighbours.place[a, e]]
-            rotation = _aligned(sight.image.bearings[seen], sight.catalogue.directions[directions])
-            yield rotation, int(seen[-1])
-
-
-def _aligned(seen: Array, directions: Array) -> Array:
-    """The rotation that takes directions (k, 3) to where they are seen (k, 3) with least squares."""
-    left, _, right = np.linalg.svd(seen.T @ directions)
-    return np.asarray(left * [1, 1, np.linalg.det(left @ right)] @ right)
+            left, _, right = np.linalg.svd(sight.image.bearings[seen].T @ sight.catalogue.directions[directions])
+            yield left * [1, 1, np.linalg.det(left @ right)] @ right, int(seen[-1])  # with least squares
 
 
 def _fitted(

@@ -274,15 +274,6 @@ def assign_sparse(
     return likelihood / total_a, sum_of(scratch.q[3]) / most, True
 
 
-@part
-def is_finite(rotation: Any, translation: Any) -> bool:
-    """Whether a pose has neither NaN nor infinity."""
-    total = F(0)
-    for r in range(3):
-        total += rotation[r, 0] + rotation[r, 1] + rotation[r, 2] + translation[r]
-    return math.isfinite(total)
-
-
 @compiled
 def descend_sparse(
     tiles: Any,
@@ -309,8 +300,10 @@ def descend_sparse(
         result[k, 0], result[k, 1], result[k, 2] = -np.inf, F(0), F(0)
         since = 0
         for step in range(len(scales)):
-            scale = scales[step]
-            if not is_finite(rotation[k], translation[k]):
+            scale, total = scales[step], F(0)
+            for r in range(3):
+                total += rotation[k, r, 0] + rotation[k, r, 1] + rotation[k, r, 2] + translation[k, r]
+            if not math.isfinite(total):
                 break
             visible_weights(points, rotation[k], translation[k], scratch.weight)
             likelihood, matched, enough = assign_sparse(
