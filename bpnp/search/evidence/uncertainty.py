@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import csr_array
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.geometry import turned_by
@@ -32,6 +33,7 @@ STRAINS = np.array(
     ],
     np.float64,
 )
+SLIGHT = 0.01  # share of an image point in the information below which the pose hardly moves by leaving it out
 POSE = 6  # numbers that are fitted with every pose
 FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix a pose
 
@@ -158,12 +160,11 @@ def _of_louis(linear: "Linearised") -> Array | None:
     """See `local_covariance`; None where the information is not positive definite."""
     sets, probability, chosen = linear.sets, linear.probability, linear.sets.image.chosen
     score = np.einsum("kab,ka->kb", linear.jacobian, linear.residual)
-    size = score.shape[1]
-    expected, own = np.zeros((len(chosen), size)), np.zeros((len(chosen), size, size))
-    np.add.at(expected, linear.image, probability[:, None] * score)
-    each = np.einsum("kab,kac->kbc", linear.jacobian, linear.jacobian) - score[:, :, None] * score[:, None]
-    np.add.at(own, linear.image, probability[:, None, None] * each)
-    own += expected[:, :, None] * expected[:, None]
+    count, size = score.shape
+    of_point = csr_array((probability, (linear.image, np.arange(count))), (len(chosen), count))
+    expected = of_point @ score
+    each = linear.jacobian.transpose(0, 2, 1) @ linear.jacobian - score[:, :, None] * score[:, None]
+    own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
     share = len(sets.bearings) / len(chosen)
     known = _known(linear)
     observed = share * own.sum(0) + known
@@ -175,9 +176,10 @@ def _of_louis(linear: "Linearised") -> Array | None:
         return None
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
-    without = np.eye(size) - root.T @ own @ root
+    matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
+    without = np.eye(size) - root.T @ own[matters] @ root
     fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
-    steps[fixed] = np.linalg.solve(without[fixed], steps[fixed, :, None])[..., 0]
+    steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
     ratio, axes = np.linalg.eigh(share * steps.T @ steps + root.T @ known @ root)
     along = root @ axes
     return np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
