@@ -13,6 +13,8 @@ from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
 from lightning.pytorch.loggers import CSVLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
+from torch.optim import Optimizer
 
 import bpnp.datamodules
 from bpnp.commands.parser import OneLineParser, plain
@@ -64,6 +66,15 @@ class BpnpCLI(LightningCLI):
         )
         for name in ("best_checkpoint", "last_checkpoint"):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
+
+    @staticmethod
+    def configure_optimizers(
+        lightning_module: LightningModule, optimizer: Optimizer, lr_scheduler: LRSchedulerTypeUnion | None = None
+    ) -> Any:
+        """Use `--optimizer` and `--lr_scheduler`; without the latter, the schedule of the task."""
+        if lr_scheduler is None and isinstance(lightning_module, BlindPnPTask):
+            return lightning_module.with_schedule(optimizer)
+        return LightningCLI.configure_optimizers(lightning_module, optimizer, lr_scheduler)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
         """A CSV log always, beside what the configuration logs to, all in the run's folder; a progress bar unless it is

@@ -7,8 +7,6 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
-from lightning.pytorch.plugins.precision import Precision
-from lightning.pytorch.utilities.enums import GradClipAlgorithmType
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -27,8 +25,7 @@ from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 DECAYED = 0.02  # of the learning rate, after its fall
-CHECK_EVERY = 50  # steps between two looks at the skipped ones on a GPU
-MOST_SKIPPED = 20  # steps in a row without a finite loss and gradient, which end the run
+MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
 
 class TrainingDivergedError(RuntimeError):
@@ -88,9 +85,10 @@ class BlindPnPTask(LightningModule):
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
-        # Steps left out in all, and in a row: on the device, so that counting them never waits for it.
-        self.skipped: Tensor
-        self.register_buffer("skipped", torch.zeros(2, dtype=torch.long), persistent=False)
+        self.skipped_steps = 0
+        self.consecutive_skipped_steps = 0
+        self.optimizer_names: list[str] | None = None  # classes of the optimizers of this run or of its checkpoint
+        self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
         self.refine_validation = refine_validation
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
         self.tabled: set[str] = set()  # names of the figures that the tables of a test show
@@ -119,7 +117,7 @@ class BlindPnPTask(LightningModule):
             losses = self.losses(prediction, batch)
             figures = self._figures(losses, prediction, batch)
         loss = losses.total.mean()
-        self._log_train(loss=loss, skipped_steps=self.skipped[0].float(), **figures)
+        self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
 
@@ -168,39 +166,81 @@ class BlindPnPTask(LightningModule):
             each.reset()
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
-        """Without a finite gradient the step is left out, by the optimiser itself and on its device."""
+        """Log the gradient norm; without a finite gradient, count the step and drop all gradients.
+
+        Every optimizer of torch leaves a parameter without a gradient, and its state, as they are.
+
+        Raises:
+            TrainingDivergedError: `MOST_SKIPPED` consecutive steps had no finite gradient.
+        """
         norm = torch.nn.utils.get_total_norm([p.grad for p in self.parameters() if p.grad is not None])
-        broken = ~norm.isfinite()
-        optimizer.found_inf = broken.float()  # type: ignore[attr-defined]
-        self.skipped += broken
-        self.skipped[1] *= broken
         self._log_train(gradient_norm=norm)
-        look = self.device.type == "cpu" or self.global_step % CHECK_EVERY == 0
-        if look and int(self.skipped[1]) >= MOST_SKIPPED:
+        if norm.isfinite():
+            self.consecutive_skipped_steps = 0
+            return
+        for parameter in self.parameters():
+            parameter.grad = None
+        self.skipped_steps += 1
+        self.consecutive_skipped_steps += 1
+        if self.consecutive_skipped_steps >= MOST_SKIPPED:
             raise TrainingDivergedError(
-                f"expected finite losses and gradients, got {int(self.skipped[1])} steps in a row without, at step "
-                f"{self.global_step}; try a lower model.learning_rate or trainer.gradient_clip_val"
+                f"The loss or its gradient was not finite in {self.consecutive_skipped_steps} consecutive steps up to "
+                f"step {self.global_step}. Use a lower model.learning_rate or set trainer.gradient_clip_val."
             )
 
-    def configure_gradient_clipping(
-        self, optimizer: Optimizer, gradient_clip_val: float | None = None, gradient_clip_algorithm: str | None = None
-    ) -> None:
-        """With bfloat16 as without: Lightning refuses a fused optimiser there, as if the gradients were scaled."""
-        if self.trainer.precision == "bf16-mixed":
-            kind = GradClipAlgorithmType(gradient_clip_algorithm or "norm")
-            Precision.clip_gradients(self.trainer.precision_plugin, optimizer, gradient_clip_val or 0.0, kind)
-        else:
-            self.clip_gradients(optimizer, gradient_clip_val, gradient_clip_algorithm)
-
     def configure_optimizers(self) -> OptimizerLRScheduler:
+        """Return Adam with the learning-rate schedule of this task."""
         trained = (p for p in self.parameters() if p.requires_grad)
-        adam = Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        # A fused optimizer unscales the gradients of mixed precision itself, after they have been clipped.
+        fused = "mixed" not in self.trainer.precision
+        return self.with_schedule(Adam(trained, lr=self.learning_rate, weight_decay=self.weight_decay, fused=fused))
+
+    def with_schedule(self, optimizer: Optimizer) -> OptimizerLRScheduler:
+        """Return an optimizer with the warm-up and the decay of this task, or alone if it has neither."""
         if not self.warmup_steps and self.decay_start is None:
-            return adam
-        # By the step alone: a resumed run goes on where it was, or on another schedule. `SequentialLR` would take its
+            return optimizer
+        # A function of the step alone: a resumed run may have another schedule. `SequentialLR` would take its
         # milestones and its rate from the checkpoint.
-        schedule = LambdaLR(adam, lambda _: self.rate_factor(self.trainer.global_step))
-        return {"optimizer": adam, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+        schedule = LambdaLR(optimizer, lambda _: self.rate_factor(self.trainer.global_step))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+    def on_fit_start(self) -> None:
+        """Record the configured optimizers before a checkpoint replaces their settings.
+
+        Raises:
+            ValueError: the checkpoint was trained with other optimizers.
+        """
+        optimizers = self.trainer.optimizers
+        names = [type(optimizer).__name__ for optimizer in optimizers]
+        if self.optimizer_names is not None and self.optimizer_names != names:
+            raise ValueError(
+                f"The checkpoint was trained with {', '.join(self.optimizer_names)}, and this run uses "
+                f"{', '.join(names)}. Use the same optimizer, or start a new training with --model.weights."
+            )
+        self.optimizer_names = names
+        self.optimizer_settings = [
+            [{key: value for key, value in group.items() if key != "params"} for group in optimizer.param_groups]
+            for optimizer in optimizers
+        ]
+
+    def on_train_start(self) -> None:
+        """Apply the configured optimizer settings to the state that came from a checkpoint.
+
+        A scheduled learning rate keeps its ratio to the initial one.
+        """
+        schedulers = [config.scheduler for config in self.trainer.lr_scheduler_configs]
+        scheduled = {id(scheduler.optimizer) for scheduler in schedulers}
+        for optimizer, configured in zip(self.trainer.optimizers, self.optimizer_settings, strict=False):
+            for group, settings in zip(optimizer.param_groups, configured, strict=True):
+                rate = settings["lr"]
+                if id(optimizer) in scheduled and group.get("initial_lr"):
+                    rate = group["lr"] * settings.get("initial_lr", rate) / group["initial_lr"]
+                elif id(optimizer) in scheduled and "initial_lr" not in settings:
+                    rate = group["lr"]  # `ReduceLROnPlateau` has no initial rate
+                group.update(settings, lr=rate)
+        for scheduler in schedulers:
+            if hasattr(scheduler, "base_lrs"):
+                scheduler.base_lrs = [group["initial_lr"] for group in scheduler.optimizer.param_groups]
 
     def rate_factor(self, step: int) -> float:
         """Factor on the learning rate: a linear rise, one, and a half cosine down to `DECAYED`."""
@@ -213,13 +253,13 @@ class BlindPnPTask(LightningModule):
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
         checkpoint["solver"] = described(self.solver)
-        checkpoint["skipped_steps"] = self.skipped.tolist()
+        checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
+        checkpoint["optimizer_names"] = self.optimizer_names
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         fitting_state(checkpoint, self.solver)  # one clear error before any state is loaded
-        for schedule in checkpoint.get("lr_schedulers", ()):
-            schedule["base_lrs"] = [self.learning_rate]  # as it is now, in a run that goes on at another one
-        self.skipped.copy_(torch.tensor(checkpoint.get("skipped_steps", (0, 0))))
+        self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
+        self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val")
