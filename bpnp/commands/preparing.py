@@ -33,8 +33,8 @@ def prepare_modelnet40(
         normalisation: of each mesh.
         processes: worker processes.
     """
+    from bpnp.datamodules.clouds import open_shapes
     from bpnp.datamodules.meshes import surfaces_recipe
-    from bpnp.datamodules.shapes import open_shapes
     from bpnp.datamodules.store import prepare
 
     at_least(4, points=points)

@@ -1,4 +1,4 @@
-"""Meshes seen by virtual cameras: ModelNet40, any folder in its layout, or procedural shapes."""
+"""Shapes seen by virtual cameras: ModelNet40, any meshes or point clouds in its layout, or procedural shapes."""
 
 import math
 import warnings
@@ -16,10 +16,11 @@ from torch import Tensor
 
 from bpnp.checks import check_positive, check_within
 from bpnp.datamodules.augment import picked
+from bpnp.datamodules.clouds import open_shapes
 from bpnp.datamodules.keyed_random import Purpose, normal, permutations, rotations, row_keys, stream, uniform
 from bpnp.datamodules.loader import STAGES, ProblemDataModule, hold_out
 from bpnp.datamodules.problem import Counts
-from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, open_shapes, procedural_shapes
+from bpnp.datamodules.shapes import MeshError, Normalisation, Sampler, Shapes, normalise, procedural_shapes
 from bpnp.datamodules.store import Made, Recipe, Row, Store, StoreError, cached, is_store, open_store
 from bpnp.geometry import MIN_POINTS, project, transform
 from bpnp.types import Batch
@@ -118,8 +119,7 @@ class MeshSource:
         views = [divmod(i, len(self.rows)) for i in index.tolist()]
         rows = [int(self.rows[mesh]) for _, mesh in views]
         ids = tuple(f"{self.store.name(row)}#{view}" for row, (view, _) in zip(rows, views, strict=True))
-        samples = torch.from_numpy(np.stack([self.store.row(row)[POINTS][: self.pool_size] for row in rows]))
-        points3d = picked(samples, permutations(stream(keys, Purpose.SUBSET), samples.shape[1])[:, :count])
+        points3d = self._drawn_points(rows, stream(keys, Purpose.SUBSET))
         rotation, translation = self.cameras.poses(stream(keys, Purpose.POSE))
         camera = transform(rotation, translation, points3d.double())
         seen = camera[..., 2] > MIN_DEPTH
@@ -145,6 +145,17 @@ class MeshSource:
             origin=torch.zeros(size, 3, dtype=torch.float64),
         )
 
+    def _drawn_points(self, rows: Sequence[int], keys: Int[Tensor, " b"]) -> Float[Tensor, "b n 3"]:
+        """Draw `num_points` of the first `pool_size` points of each shape; shapes may have different numbers."""
+        pools = [self.store.row(row)[POINTS][: self.pool_size] for row in rows]
+        points = keys.new_empty((len(rows), self.num_points, 3), dtype=torch.float32)
+        sizes = np.array([len(pool) for pool in pools])
+        for size in np.unique(sizes).tolist():
+            same = torch.from_numpy(np.flatnonzero(sizes == size))
+            order = permutations(keys[same], size)[:, : self.num_points]
+            points[same] = picked(torch.from_numpy(np.stack([pools[i] for i in same.tolist()])), order)
+        return points
+
 
 class MeshDataModule(ProblemDataModule):
     """Virtual cameras around meshes, by default as in Campbell et al. (ECCV 2020), or around procedural shapes.
@@ -154,8 +165,9 @@ class MeshDataModule(ProblemDataModule):
     loaders.
 
     Args:
-        root: folder that `bpnp prepare modelnet40` made, or folder of meshes in ModelNet40's layout,
-            <class>/{train,test}/*.{glb,obj,off,ply,stl}; none for procedural shapes.
+        root: folder that `bpnp prepare modelnet40` made, or folder of meshes or point clouds in ModelNet40's layout,
+            <class>/{train,test}/*.{glb,obj,off,ply,stl,npy,txt,xyz}, or ModelNet40's HDF5 or `normal_resampled`
+            archive, unpacked; none for procedural shapes.
         train_problems: training problems; problem i shows training mesh i modulo their number.
         fresh_views: draw new cameras, points and noise every epoch; false for the fixed problems of the paper.
         val_fraction: share of the training meshes that is held out for validation.
@@ -164,7 +176,8 @@ class MeshDataModule(ProblemDataModule):
             further views.
         num_points: 3D points of a problem.
         pool_size: surface samples kept of each mesh, at least num_points; every problem draws its own num_points of
-            them (pool_size equal to num_points: all problems of a mesh have the same points, as in the paper).
+            them (pool_size equal to num_points: all problems of a mesh have the same points, as in the paper). A point
+            cloud with fewer points is used whole.
         normalisation: of each mesh. unit_sphere: mean of its surface samples at the origin, farthest at distance 1;
             unit_cube: bounding box centred, longest side 1; none: units of the file.
         rotation: euler for R = Rz Ry Rx with angles from euler_range, so3 for uniform rotations.
@@ -238,17 +251,23 @@ class MeshDataModule(ProblemDataModule):
         )
 
     def _rows(self, store: Store, split: str, root: Path) -> NDArray[np.int64]:
-        """The meshes of a split. StoreError if there are none, or fewer samples of each than `pool_size`."""
+        """Return the shapes of a split. StoreError if there are none, or one has too few points."""
         folder = "test" if split == "test" else "train"
         rows = np.array([row for row in range(len(store)) if store.name(row).split("/")[-2] == folder])
         if not len(rows):
             raise StoreError(
                 f"expected meshes <class>/{{train,test}}/* in {root}, got none for {folder!r}; try another `root`"
             )
-        if self.pool_size > (most := int(store.counts(POINTS)[0])):
+        if self.pool_size > (most := int(store.parameters["points"])):
             raise StoreError(
                 f"expected `pool_size` of at most {most}, the samples in {store.folder}, got {self.pool_size}; try "
                 f"that, or preparing again with --points {self.pool_size}"
+            )
+        fewest = int(rows[store.counts(POINTS)[rows].argmin()])
+        if self.num_points > (count := int(store.counts(POINTS)[fewest])):
+            raise StoreError(
+                f"{store.name(fewest)} in {root} has {count} points, fewer than `num_points` {self.num_points}; set "
+                f"data.num_points to {count} or less, or leave the shape out"
             )
         if split == "test":
             return rows

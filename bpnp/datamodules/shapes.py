@@ -16,14 +16,13 @@ import trimesh
 from numpy.typing import NDArray
 
 from bpnp.checks import check_within
-from bpnp.files import files_as_they_are, fingerprint
+from bpnp.files import fingerprint
 from bpnp.geometry import random_rotations
 
 SUFFIXES = (".glb", ".obj", ".off", ".ply", ".stl")
 Normalisation = Literal["unit_sphere", "unit_cube", "none"]
 VERSION = 1  # of procedural shapes, raised whenever the same seed makes another one
 PARTS = ("train", "val", "test")
-LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in SUFFIXES)}}}"
 Sampler = Callable[[int], NDArray[np.float64]]
 
 
@@ -186,9 +185,13 @@ def normalise(points: NDArray[np.float64], mode: Normalisation) -> NDArray[np.fl
 
 @dataclass(frozen=True)
 class Shapes:
-    """By the name of each shape a function that gives so many samples (k, 3) of its surface, or raises MeshError.
+    """Shapes to sample.
 
-    The samples are a function of the shape and its name. identity: another one if any shape is another.
+    Attributes:
+        samplers: by the name of each shape, a function from a number to so many points (k, 3) of its surface; fewer if
+            the shape is a point cloud of fewer points. The points depend on the shape and its name only. It raises
+            MeshError for a file that cannot be used.
+        identity: fingerprint that changes with any shape.
     """
 
     samplers: Mapping[str, Sampler]
@@ -257,25 +260,19 @@ def primitives() -> tuple[Mesh, ...]:
     return tuple(Mesh(np.asarray(s.vertices, np.float64), np.asarray(s.faces, np.int64)) for s in solids)
 
 
-def open_shapes(source: Path) -> Shapes:
-    """The meshes of `source`: the folder of ModelNet40, or any in its layout, or their parent.
+def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:
+    """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first."""
+    named = {
+        f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}": path
+        for path in folder.glob("*/[!.]*/[!.]*")
+        if path.suffix.lower() in suffixes and path.parent.name.lower() in ("train", "test") and path.is_file()
+    }
+    return {name: named[name] for name in sorted(named, key=lambda name: ("/test/" in name, name))}
 
-    Their names are ``<class>/<split>/<stem>``; the training meshes come first. Raises ValueError that names the folder:
-    missing, or without a mesh.
-    """
-    if not source.is_dir():
-        raise ValueError(f"expected a folder with {LAYOUT}, got {source}, which is none; try unpacking its archive")
-    for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
-        named = {
-            f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}": path
-            for path in folder.glob("*/[!.]*/[!.]*")
-            if path.suffix.lower() in SUFFIXES and path.parent.name.lower() in ("train", "test") and path.is_file()
-        }
-        if named:
-            meshes = {name: named[name] for name in sorted(named, key=lambda name: ("/test/" in name, name))}
-            samplers = {name: partial(_mesh_samples, name, path) for name, path in meshes.items()}
-            return Shapes(samplers, fingerprint([list(meshes), files_as_they_are(meshes.values())]))
-    raise ValueError(f"expected a folder with {LAYOUT}, got {source} without; try its parent")
+
+def mesh_shapes(files: Mapping[str, Path]) -> dict[str, Sampler]:
+    """Return the sampler of each mesh file, by its name; the samples depend on the mesh and the name only."""
+    return {name: partial(_mesh_samples, name, path) for name, path in files.items()}
 
 
 def _mesh_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:

@@ -10,13 +10,17 @@ from bpnp import BPnPNet
 from bpnp.cli import main
 
 CONFIGS = Path(bpnp.__file__).parents[1] / "configs"
-RECIPES = sorted(path.name for path in CONFIGS.glob("*.yaml"))
+RECIPES = sorted(
+    path.relative_to(CONFIGS).with_suffix("").as_posix()
+    for folder in (".", "paper")
+    for path in CONFIGS.glob(f"{folder}/*.yaml")
+)
 
 
 def data_for(recipe: str, folder: Path) -> list[str]:
     """Where the recipe's data are, in small."""
     small = ["--data.batch_size=2"]
-    if recipe.startswith(("colmap", "megadepth")):
+    if recipe.startswith(("colmap", "megadepth", "paper/megadepth", "paper/finetune")):
         for i in range(5):
             plant_model(folder / "scenes" / f"scene{i}" / "sparse" / "0", seed=i)
         return [*small, f"--data.root={folder / 'scenes'}"]
@@ -33,8 +37,8 @@ def data_for(recipe: str, folder: Path) -> list[str]:
 def test_every_recipe_trains_and_tests(recipe: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     monkeypatch.chdir(tmp_path)
-    arguments = [f"--config={Path(recipe).stem}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
-    matcher = "bpnp.models.Matcher" in (CONFIGS / recipe).read_text()
+    arguments = [f"--config={recipe}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
+    matcher = "bpnp.models.Matcher" in (CONFIGS / f"{recipe}.yaml").read_text()
     arguments += ["--model.solver.channels=16", "--model.solver.depth=2"] if matcher else SMALL_NET[1:]
     main(["fit", *arguments, "--trainer.fast_dev_run=true"])
     main(["test", *arguments, "--trainer.fast_dev_run=true"])

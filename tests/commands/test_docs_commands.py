@@ -43,7 +43,8 @@ def authors(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("heading", "plant"), [("ModelNet40", modelnet40), ("MegaDepth", megadepth), ("The authors' files", authors)]
+    ("heading", "plant"),
+    [("ModelNet10 and ModelNet40", modelnet40), ("MegaDepth", megadepth), ("The authors' files", authors)],
 )
 def test_the_commands_run_as_written(
     heading: str, plant: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,9 +18,10 @@ from small_data import check_pairs
 
 from bpnp.cli import main
 from bpnp.datamodules import ColmapDataModule, MeshDataModule, Outliers
+from bpnp.datamodules.clouds import open_shapes
 from bpnp.datamodules.colmap.module import colmap_recipe
 from bpnp.datamodules.meshes import POINTS, SURFACES, surfaces_recipe
-from bpnp.datamodules.shapes import normalise, open_shapes, read_mesh, sample_surface
+from bpnp.datamodules.shapes import normalise, read_mesh, sample_surface
 from bpnp.datamodules.store import Made, Recipe, Store, StoreError, is_store, open_store, prepare
 
 BAD = {

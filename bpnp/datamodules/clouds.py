@@ -1,0 +1,158 @@
+"""Shapes that are published as point clouds: one file a shape, or ModelNet40's HDF5 and `normal_resampled` archives."""
+
+import zlib
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from bpnp.datamodules.shapes import SUFFIXES, MeshError, Sampler, Shapes, mesh_shapes, shape_files
+from bpnp.files import files_as_they_are, fingerprint
+
+TEXTS = (".txt", ".xyz")
+CLOUD_SUFFIXES = (".npy", *TEXTS)
+LAYOUT = f"<class>/{{train,test}}/*.{{{','.join(suffix[1:] for suffix in (*SUFFIXES, *CLOUD_SUFFIXES))}}}"
+SPLITS = ("train", "test")
+
+
+def read_cloud(path: Path) -> NDArray[np.float64]:
+    """Read the points (k, 3) of a point cloud file.
+
+    Args:
+        path: .ply without faces; .npy with an array (k, 3) or wider; .xyz or .txt with numbers separated by spaces,
+            tabs or commas. Columns after the third (normals, colours) are ignored, `#` starts a comment.
+
+    Raises:
+        MeshError: The file is empty, truncated or holds something else. The message names the file.
+    """
+    try:
+        if path.suffix.lower() == ".npy":
+            values = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() in TEXTS:
+            text = path.read_text(encoding="utf-8-sig")
+            values = np.loadtxt(text.replace(",", " ").splitlines(), np.float64, ndmin=2)
+        else:
+            values = np.asarray(getattr(trimesh.load(path, process=False), "vertices", ()), np.float64).reshape(-1, 3)
+    except Exception as error:
+        raise MeshError(f"{path}: not a point cloud ({' '.join(str(error).split())})") from error
+    return _checked(values, path)
+
+
+def _checked(values: NDArray[Any], source: object) -> NDArray[np.float64]:
+    if values.ndim != 2 or values.shape[1] < 3 or not len(values) or values.dtype.kind not in "fiu":
+        raise MeshError(f"{source}: rows of x, y, z are needed, the file has {values.dtype} of shape {values.shape}")
+    points = values[:, :3].astype(np.float64)
+    if not np.isfinite(points).all():
+        raise MeshError(f"{source}: a coordinate is NaN or infinite")
+    return points
+
+
+def is_cloud(path: Path) -> bool:
+    """Return True for a file of `read_cloud`: by its suffix, or a .ply whose header declares no faces."""
+    suffix = path.suffix.lower()
+    if suffix != ".ply":
+        return suffix in CLOUD_SUFFIXES
+    with path.open("rb") as file:
+        header = file.read(65536).partition(b"end_header")[0]
+    return not any(
+        line.split()[:2] in ([b"element", b"face"], [b"element", b"tristrips"]) and line.split()[2:3] != [b"0"]
+        for line in header.splitlines()
+    )
+
+
+def draw_points(points: NDArray[np.float64], count: int, name: str) -> NDArray[np.float64]:
+    """Return `count` points of a cloud in a random order that depends on its name only; all if it has fewer."""
+    order = np.random.default_rng(zlib.crc32(name.encode())).permutation(len(points))
+    return points[order[:count]]
+
+
+def open_shapes(source: Path) -> Shapes:
+    """Find the shapes of a folder.
+
+    Args:
+        source: folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or its parent; or one
+            of the two archives in which ModelNet40's point clouds are spread: `modelnet40_ply_hdf5_2048` (HDF5) and
+            `modelnet40_normal_resampled` (text).
+
+    Returns:
+        The shapes, named ``<class>/<split>/<stem>``, training shapes first.
+
+    Raises:
+        ValueError: The folder is missing or has no shape. The message names it.
+        ImportError: The folder has HDF5 files and h5py is not installed.
+    """
+    if not source.is_dir():
+        raise ValueError(f"{source} is not a folder; a folder with {LAYOUT} is needed (unpack the archive first)")
+    for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
+        if found := _hdf5_shapes(folder) or _listed_shapes(folder):
+            return found
+        if files := shape_files(folder, (*SUFFIXES, *CLOUD_SUFFIXES)):
+            meshes = {name: path for name, path in files.items() if not is_cloud(path)}
+            clouds = {name: partial(_cloud_samples, name, files[name]) for name in files.keys() - meshes.keys()}
+            samplers = mesh_shapes(meshes) | clouds
+            return Shapes({name: samplers[name] for name in files}, _identity(files))
+    raise ValueError(f"{source} has no shapes; a folder with {LAYOUT} is needed")
+
+
+def _identity(files: Mapping[str, Path]) -> str:
+    return fingerprint([list(files), files_as_they_are(files.values())])
+
+
+def _cloud_samples(name: str, path: Path, count: int) -> NDArray[np.float64]:
+    return draw_points(read_cloud(path), count, name)
+
+
+def _listed_shapes(folder: Path) -> Shapes | None:
+    """The shapes of `modelnet40_normal_resampled`: <class>/<name>.txt and lists of the names in each split."""
+    samplers: dict[str, Sampler] = {}
+    files: dict[str, Path] = {}
+    for split in SPLITS:
+        lists = [folder / f"modelnet{size}_{split}.txt" for size in (40, 10)]
+        names = next((path.read_text(encoding="utf-8").split() for path in lists if path.is_file()), [])
+        for stem in sorted(names):
+            label = stem.rpartition("_")[0]
+            name, path = f"{label}/{split}/{stem}", folder / label / f"{stem}.txt"
+            if path.is_file():
+                files[name], samplers[name] = path, partial(_cloud_samples, name, path)
+    return Shapes(samplers, _identity(files)) if samplers else None
+
+
+def _hdf5_shapes(folder: Path) -> Shapes | None:
+    """The shapes of `modelnet40_ply_hdf5_2048`: arrays `data` (shapes, 2048, 3) and `label` (shapes, 1) a file."""
+    files = {split: sorted(folder.glob(f"*{split}*.h5")) for split in SPLITS}
+    if not any(files.values()):
+        return None
+    h5py = _h5py(folder)
+    listed = folder / "shape_names.txt"
+    classes = listed.read_text(encoding="utf-8").split() if listed.is_file() else []
+    samplers: dict[str, Sampler] = {}
+    for split, paths in files.items():
+        for path in paths:
+            try:
+                with h5py.File(path, "r") as file:
+                    labels = np.asarray(file["label"]).reshape(-1).tolist()
+            except (OSError, KeyError) as error:
+                raise ValueError(f"{path} is not a file of ModelNet40's HDF5 archive ({error})") from error
+            for row, label in enumerate(labels):
+                title = classes[label] if label < len(classes) else f"class{label:02d}"
+                name = f"{title}/{split}/{path.stem}_{row:04d}"
+                samplers[name] = partial(_hdf5_samples, name, path, row)
+    every = {str(path): path for paths in files.values() for path in paths}
+    return Shapes(samplers, _identity(every))
+
+
+def _hdf5_samples(name: str, path: Path, row: int, count: int) -> NDArray[np.float64]:
+    with _h5py(path).File(path, "r") as file:
+        return draw_points(_checked(np.asarray(file["data"][row]), f"{path}, shape {row}"), count, name)
+
+
+def _h5py(needed_for: Path) -> Any:
+    try:
+        import h5py
+    except ImportError as error:
+        raise ImportError(f"h5py is needed to read {needed_for}; install it with `pip install bpnp[hdf5]`") from error
+    return h5py
