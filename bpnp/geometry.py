@@ -111,7 +111,7 @@ def chords(
 
 
 def rotation_angle(a: Float[Tensor, "*b 3 3"], b: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
-    """Angle of a^T b in radians, in [0, pi] (paper Eq. 11), by atan2 of twice its sine and twice its cosine.
+    """Angle of a^T b in radians, in [0, pi] (paper Eq. 13), by atan2 of twice its sine and twice its cosine.
 
     The gradient is undefined at 0 and pi; zero is returned there.
     """

@@ -34,7 +34,7 @@ class PoseErrors:
 
 
 def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, "b 3 3"]) -> Float[Tensor, " b"]:
-    """Angle of R^T R_gt in degrees, in [0, 180] (paper Eq. 11), by atan2; 180 where R is not finite.
+    """Angle of R^T R_gt in degrees, in [0, 180] (paper Eq. 13), by atan2; 180 where R is not finite.
 
     >>> quarter_turn = torch.tensor([[[0.0, -1, 0], [1, 0, 0], [0, 0, 1]]])
     >>> float(rotation_error(quarter_turn, torch.eye(3)[None]))
@@ -45,7 +45,7 @@ def rotation_error(rotation: Float[Tensor, "b 3 3"], rotation_gt: Float[Tensor, 
 
 
 def translation_error(translation: Float[Tensor, "b 3"], translation_gt: Float[Tensor, "b 3"]) -> Float[Tensor, " b"]:
-    """|t - t_gt| in scene units (paper Eq. 12); infinite where t is not finite.
+    """|t - t_gt| in scene units (paper Eq. 14); infinite where t is not finite.
 
     >>> float(translation_error(torch.tensor([[3.0, 4.0, 1.0]]), torch.tensor([[0.0, 0.0, 1.0]])))
     5.0

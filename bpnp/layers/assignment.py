@@ -1,4 +1,4 @@
-"""Entropic optimal transport from a cost matrix to a joint probability (paper Eqs. 4 and 8), to convergence.
+"""Entropic optimal transport from a cost matrix to a joint probability (paper Eqs. 9 and 10), to convergence.
 
 `layers.transport` finds the optimum, `layers.laplacian` its gradient, by the theorem in `layers.implicit`.
 """
@@ -32,7 +32,7 @@ def sinkhorn(
     max_iterations: int = 1000,
     backward_stats: BackwardStats | None = None,
 ) -> tuple[Float[Tensor, "b m n"], SolveStats]:
-    """Joint probability P of every match: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 8).
+    """Joint probability P of every match: argmin <P, M> + mu sum P (log P - 1) with P 1 = r, P^T 1 = c (paper Eq. 9).
 
     cost: M, infinite for a match that cannot be.
     mu: entropy weight > 0, a number or a scalar tensor (which receives a gradient).

@@ -1,4 +1,4 @@
-"""The weighted blind PnP layer (paper Eq. 7): from a start to the pose that best explains a soft assignment.
+"""The weighted blind PnP layer (paper Eq. 8): from a start to the pose that best explains a soft assignment.
 
 f(R, t) = sum_ij P_ij (1 - f_i . g(R p_j + t)),  g(y) = y / |y|.
 It is linear in the bearings: with q_j = sum_i P_ij f_i, f = sum P - sum_j q_j . g(R p_j + t). After one product the
@@ -6,7 +6,9 @@ cost of an evaluation is O(n), not O(m n). A step (w, s) acts on the left: y = e
 The q_j and p_j are the columns of (b, 3, n) tensors: torch adds up three rows of n numbers faster than n rows of three.
 """
 
-from typing import Any, NamedTuple
+import math
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -15,6 +17,7 @@ from torch import Tensor, nn
 from bpnp.checks import checked_shapes
 from bpnp.geometry import choose, hat, is_finite, retract
 from bpnp.layers.implicit import first_derivative, refuse_second_derivative
+from bpnp.layers.lbfgs import lbfgs
 from bpnp.precision import full_precision
 from bpnp.types import SolveStats
 
@@ -26,23 +29,59 @@ FARTHEST = 1e4  # scene radii; beyond this distance all bearings coincide: the s
 WELL_POSED = 1e-9  # smallest Hessian eigenvalue, as a part of the trace, at which the pose has a derivative
 
 
+Solver = Literal["newton", "lbfgs"]
+
+
+@dataclass
+class ClippedColumns:
+    """Number of columns of the pose's derivative in backward passes, and of those that were clipped.
+
+    Column ij is the derivative of the pose (angle-axis, translation) with respect to P_ij.
+    """
+
+    columns: int = 0
+    clipped: int = 0
+
+    def reset(self) -> None:
+        self.columns = self.clipped = 0
+
+
 class _Aggregate(torch.autograd.Function):
     """F^T P (b, 3, n): q_j = sum_i P_ij f_i, the mean bearing of each 3D point, its length the point's weight.
 
-    Its gradients are exact products too.
+    Its gradients are exact products too. grams: with `limit`, (b, n, 3, 3) such that f_i^T grams_j f_i is the squared
+    norm of column ij; the gradient of P_ij is that of the column scaled down to norm `limit`.
     """
 
     @staticmethod
-    def forward(ctx: Any, assignment: Tensor, bearings: Tensor) -> Tensor:
-        ctx.save_for_backward(assignment, bearings)
+    def forward(
+        ctx: Any,
+        assignment: Tensor,
+        bearings: Tensor,
+        grams: Tensor | None = None,
+        limit: float = math.inf,
+        count: ClippedColumns | None = None,
+    ) -> Tensor:
+        ctx.save_for_backward(assignment, bearings, grams)
+        ctx.limit, ctx.count = limit, count
         return bearings.mT @ assignment
 
     @staticmethod
     @first_derivative
-    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        assignment, bearings = ctx.saved_tensors
-        to_assignment, to_bearings = ctx.needs_input_grad
-        return bearings @ gradient if to_assignment else None, assignment @ gradient.mT if to_bearings else None
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        assignment, bearings, grams = ctx.saved_tensors
+        to_assignment, to_bearings = ctx.needs_input_grad[:2]
+        of_assignment = bearings @ gradient if to_assignment else None
+        if of_assignment is not None and grams is not None:
+            outer = (bearings.unsqueeze(-1) * bearings.unsqueeze(-2)).flatten(-2)
+            norms = (outer.to(grams) @ grams.flatten(-2).mT).clamp_min(0).sqrt()
+            if ctx.count is not None:
+                real = assignment > 0
+                ctx.count.columns += int(real.sum())
+                ctx.count.clipped += int((real & (norms > ctx.limit)).sum())
+            of_assignment = of_assignment * (ctx.limit / norms).clamp_max(1).to(of_assignment)
+        of_bearings = assignment @ gradient.mT if to_bearings else None
+        return of_assignment, of_bearings, None, None, None
 
 
 class Derivatives(NamedTuple):
@@ -142,6 +181,9 @@ def newton(
     return rotation, translation, iterations
 
 
+SOLVERS = {"newton": newton, "lbfgs": lbfgs}
+
+
 @checked_shapes
 @full_precision
 def weighted_pnp(
@@ -151,25 +193,42 @@ def weighted_pnp(
     rotation: Float[Tensor, "b 3 3"],
     translation: Float[Tensor, "b 3"],
     *,
+    solver: Solver = "newton",
     tolerance: float = 1e-9,
     max_iterations: int = 50,
+    clip_columns: float | None = None,
+    clipped: ClippedColumns | None = None,
 ) -> tuple[Float[Tensor, "b 3 3"], Float[Tensor, "b 3"], SolveStats]:
-    """argmin over (R, t) of sum_ij P_ij (1 - f_i . g(R p_j + t)), g(y) = y / |y|, near a start (paper Eq. 7).
+    """Minimise sum_ij P_ij (1 - f_i . g(R p_j + t)), g(y) = y / |y|, over (R, t) near a start (paper Eq. 8).
 
-    assignment: P, zero at padded points; its total does not matter.
-    bearings: unit vectors f_i (`bpnp.geometry.bearings` of image points).
-    points3d: p_j in scene units.
-    rotation, translation: the start, camera = R p + t; no gradient flows to it. A sample whose start is
-        NaN has no pose.
-    tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii.
-    max_iterations: of damped Newton steps, O(n) each, for each sample. The paper has L-BFGS, for the same optimum.
+    Gradients flow to assignment, bearings and points3d by the implicit function theorem with the true Hessian (paper
+    Lemma 1). There is no second derivative. The solver runs in float64.
 
-    Returns rotation, translation and stats per sample (residual: the norm that is compared with the tolerance). The
-    solver runs in float64; the results have the dtype of the assignment. Gradients flow to assignment, bearings and
-    points3d by the implicit function theorem with the true Hessian (Lemma 1). `converged` is False, and the gradient
-    zero, where the start is missing, the tolerance was not met, the camera is farther than 10^4 scene radii or the
-    Hessian is not positive definite: leave such samples out of a loss. There is no second derivative.
-    Raises ValueError for shapes that do not fit, an empty axis or integers.
+    Args:
+        assignment: P, zero at padded points; its total does not matter.
+        bearings: unit vectors f_i (`bpnp.geometry.bearings` of image points).
+        points3d: p_j in scene units.
+        rotation: of the start, camera = R p + t; no gradient flows to it. A sample whose start is NaN has no pose.
+        translation: of the start, scene units.
+        solver: "newton" (damped Newton steps for the whole batch) or "lbfgs" (L-BFGS with a strong Wolfe line search,
+            as in the paper; sample by sample). Both find the same optimum.
+        tolerance: largest norm of the objective's gradient per unit of weight, in radians and scene radii. L-BFGS does
+            not get below some 1e-10.
+        max_iterations: of the solver, O(n) each, for each sample.
+        clip_columns: largest norm of a column of the pose's derivative, d(r, t) / dP_ij with the angle-axis vector r
+            in radians and t in scene units, for P that sums to one; longer columns are scaled down. The paper has 100.
+            None for the exact derivative. It applies to the gradient of the assignment alone.
+        clipped: counts the columns of backward passes, and those that were clipped.
+
+    Returns:
+        Rotation (b, 3, 3) and translation (b, 3) in the dtype of the assignment, and stats per sample. `residual` is
+        the norm that is compared with the tolerance. `converged` is False, and the gradient zero, where the start is
+        missing, the tolerance was not met, the camera is farther than 10^4 scene radii or the Hessian is not positive
+        definite: leave such samples out of a loss.
+
+    Raises:
+        ValueError: Shapes do not fit, an axis is empty, values are integers, the solver is unknown or `clip_columns`
+            is not positive.
 
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
     >>> bearings = torch.nn.functional.normalize(points3d + torch.tensor([0.0, 0, 4]), dim=-1)
@@ -180,20 +239,36 @@ def weighted_pnp(
     """
     import roma  # as in `bpnp.geometry.retract`
 
-    q: Columns = _Aggregate.apply(assignment, bearings.to(assignment.dtype)).double()
-    # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
-    q = q / _lengths(q.detach()).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
-    points, centre, scale = _normalised(points3d.double().mT.contiguous(), _lengths(q.detach()))
+    if solver not in SOLVERS:
+        raise ValueError(f"`solver` is {solver!r}; it is one of {', '.join(SOLVERS)}")
+    if clip_columns is not None and not clip_columns > 0:
+        raise ValueError(f"`clip_columns` is {clip_columns}; it is a norm above 0, or None for no limit")
+    bearings = bearings.to(assignment.dtype)
+    with torch.no_grad():
+        q: Columns = _Aggregate.apply(assignment, bearings).double()
+        # The optimum does not depend on a factor of the weights |q_j|; here they sum to one.
+        total = _lengths(q).sum(-1, keepdim=True).clamp_min(torch.finfo(q.dtype).tiny)
+        q = q / total
+        weight = _lengths(q)
+    points, centre, scale = _normalised(points3d.double().mT.contiguous(), weight)
     with torch.no_grad():
         found = is_finite(rotation, translation)
         # The rotation nearest to a rounded one; any pose for samples that have none.
         r = torch.where(found[:, None, None], rotation.double(), torch.eye(3).to(q))
         r = roma.special_procrustes(r)
         t = (torch.where(found[:, None], translation.double(), 1) + _turned(r, centre)) / scale
-        r, t, iterations = newton(q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
+        r, t, iterations = SOLVERS[solver](q, points, r, t, tolerance=tolerance, max_iterations=max_iterations)
         residual, well_posed, factor = _judge(derivatives(q, points, r, t))
         converged = found & (residual <= tolerance) & well_posed & (t.norm(dim=-1) < FARTHEST)
+        grams = None
+        if clip_columns is not None:
+            to_scene = _scene_step(r, centre, scale)
+            # P as the paper has it sums to one; the weights here do.
+            unit = (assignment.sum((-2, -1)).double() / total[:, 0, 0])[:, None, None]
+            grams = _column_grams(points, r, t, factor, unit * to_scene)
 
+    limit = math.inf if clip_columns is None else clip_columns
+    q = _Aggregate.apply(assignment, bearings, grams, limit, clipped).double() / total
     # One more Newton step y - H^-1 F(y, x), H held fixed, has the derivative -H^-1 dF/dx of the optimum y(x).
     rotated = r @ points
     *_, h = _point_gradient(q, rotated + t.unsqueeze(-1))
@@ -208,6 +283,48 @@ def weighted_pnp(
     moved_r = torch.where(found[:, None, None], moved_r, torch.nan).to(assignment.dtype)
     moved_t = torch.where(found[:, None], moved_t, torch.nan).to(assignment.dtype)
     return moved_r, moved_t, SolveStats(iterations, torch.where(found, residual, torch.inf), converged)
+
+
+def _scene_step(rotation: Rotations, centre: Translations, scale: Float[Tensor, "b 1"]) -> Float[Tensor, "b 6 6"]:
+    """Return the matrix from a step (w, s) in the solver's frame to that of (angle-axis r, t in scene units).
+
+    t = scale t' - R c, so dt = scale s + (R c) x w; dr = J^-1 w with the left Jacobian J of exp at r.
+    """
+    import roma  # as in `bpnp.geometry.retract`
+
+    r = roma.rotmat_to_rotvec(rotation)
+    angle = r.norm(dim=-1).clamp_min(1e-6)[:, None, None]
+    turn, eye = hat(r), torch.eye(3).to(rotation)
+    # (1 / a^2 - cot(a / 2) / (2 a)), which tends to 1 / 12
+    bend = 1 / angle**2 - 1 / (2 * angle * torch.tan(angle / 2))
+    inverse = eye - turn / 2 + torch.where(angle > 1e-3, bend, 1 / 12) * (turn @ turn)
+    zero = torch.zeros_like(inverse)
+    top = torch.cat([inverse, zero], -1)
+    bottom = torch.cat([hat(_turned(rotation, centre)), scale[:, :, None] * eye], -1)
+    return torch.cat([top, bottom], -2)
+
+
+def _column_grams(
+    points: Columns,
+    rotation: Rotations,
+    translation: Translations,
+    factor: Float[Tensor, "b 6 6"],
+    to_scene: Float[Tensor, "b 6 6"],
+) -> Float[Tensor, "b n 3 3"]:
+    """Return A_j^T A_j for the columns dy / dP_ij = A_j f_i of the pose's derivative.
+
+    With u = g(y_j) and D = [-[x]x, I], the optimality condition has d/dP_ij = -D^T (I - u u^T) f_i / d, and dy is minus
+    the inverse Hessian, whose Cholesky factor is given, times it.
+    """
+    x = rotation @ points
+    u, inverse, _ = _point_gradient(torch.zeros_like(x), x + translation.unsqueeze(-1))
+    x, u, inverse = x.mT, u.mT, inverse.mT.unsqueeze(-1)
+    project = inverse * (torch.eye(3).to(x) - u.unsqueeze(-1) * u.unsqueeze(-2))
+    rows = torch.cat([hat(x) @ project, project], -2)  # D^T (I - u u^T) / d, D^T = [[x]x; I]
+    b, n = rows.shape[:2]
+    solved = torch.cholesky_solve(rows.permute(0, 2, 1, 3).reshape(b, 6, 3 * n), factor)
+    columns = (to_scene @ solved).reshape(b, 6, n, 3).permute(0, 2, 1, 3)
+    return columns.mT @ columns
 
 
 def _lengths(columns: Columns) -> Float[Tensor, "b 1 n"]:
@@ -246,9 +363,15 @@ def _judge(end: Derivatives) -> tuple[Float[Tensor, " b"], Bool[Tensor, " b"], F
 class WeightedPnP(nn.Module):
     """`weighted_pnp` with its options as a module.
 
+    Its `clipped` counts the columns of the derivative in backward passes, and those that `clip_columns` shortened; call
+    `clipped.reset()` after reading it.
+
     Args:
+        solver: newton, or lbfgs for the paper's L-BFGS with a strong Wolfe line search.
         tolerance: norm of the gradient per unit of weight at which a sample stops, radians and scene radii.
-        max_iterations: Newton steps, at most.
+        max_iterations: of the solver, at most.
+        clip_columns: largest norm of a column of the derivative with respect to the assignment; the paper has 100,
+            null is for no limit.
 
     >>> layer = WeightedPnP(max_iterations=20)
     >>> points3d = torch.tensor([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]])
@@ -258,9 +381,18 @@ class WeightedPnP(nn.Module):
     tensor([True])
     """
 
-    def __init__(self, *, tolerance: float = 1e-9, max_iterations: int = 50) -> None:
+    def __init__(
+        self,
+        *,
+        solver: Solver = "newton",
+        tolerance: float = 1e-9,
+        max_iterations: int = 50,
+        clip_columns: float | None = None,
+    ) -> None:
         super().__init__()
-        self.tolerance, self.max_iterations = tolerance, max_iterations
+        self.solver, self.tolerance, self.max_iterations = solver, tolerance, max_iterations
+        self.clip_columns = clip_columns
+        self.clipped = ClippedColumns()
 
     def forward(
         self, assignment: Tensor, bearings: Tensor, points3d: Tensor, rotation: Tensor, translation: Tensor
@@ -271,6 +403,9 @@ class WeightedPnP(nn.Module):
             points3d,
             rotation,
             translation,
+            solver=self.solver,
             tolerance=self.tolerance,
             max_iterations=self.max_iterations,
+            clip_columns=self.clip_columns,
+            clipped=self.clipped,
         )

@@ -1,7 +1,7 @@
 """The neural networks that give points their features; no result depends on a padded point.
 
 Norms of padded sets, the context norm (Yi et al. 2018) and batch norm; point features with PointNet's input transform
-(paper section 3.3); attention within and between two sets.
+(paper section 3.4); attention within and between two sets.
 """
 
 from itertools import pairwise

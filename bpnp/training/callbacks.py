@@ -37,13 +37,13 @@ RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPT
 
 
 class PoseLossWarmup(Callback):
-    """From the correspondence loss alone to L_c + weight * L_p (paper section 3.4).
+    """From the correspondence loss alone to L_c + weight * L_p (paper section 3.5).
 
     Before `start_epoch` no pose is solved in training. Once switched, a resumed run stays switched.
 
     Args:
         start_epoch: first epoch with the pose loss; the paper has 120.
-        weight: gamma_p of Eq. 13.
+        weight: gamma_p of Eq. 15.
     """
 
     def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:

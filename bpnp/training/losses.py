@@ -1,4 +1,4 @@
-"""What a solver is trained with (paper Eqs. 9 to 13): the true matches of an assignment, and the true pose.
+"""What a solver is trained with (paper Eqs. 11 to 15): the true matches of an assignment, and the true pose.
 
 Every loss is one value per sample; the mean over a batch is the caller's.
 """
@@ -20,7 +20,7 @@ SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
 
 @dataclass(frozen=True)
 class Losses:
-    """The terms of L = L_c + gamma_p L_p (paper Eq. 13) for each sample; zero, without a gradient, where there is none.
+    """The terms of L = L_c + gamma_p L_p (paper Eq. 15) for each sample; zero, without a gradient, where there is none.
 
     matched, posed: the samples that have a matching loss, and a pose loss.
     """
@@ -67,7 +67,7 @@ def own_losses(loss: nn.Module, prediction: Prediction, batch: Batch) -> Losses:
 
 
 def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float | None) -> Float[Tensor, " b"] | None:
-    """L_c per sample (paper Eq. 9); None if there is no assignment, or nothing to compare it with.
+    """L_c per sample (paper Eq. 11); None if there is no assignment, or nothing to compare it with.
 
     angle: None for the true matches; else all points within it of each other, radians, under the true pose: supervision
         by the pose alone, with C_ij = [angle(f_i, R_gt p_j + t_gt) <= angle], of which several may be of one point.
@@ -81,7 +81,7 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
 
 
 def pose_losses(pose: Pose, batch: Batch) -> Float[Tensor, " b"]:
-    """L_p per sample (paper Eq. 10); zero, without a gradient, where the pose did not converge."""
+    """L_p per sample (paper Eq. 12); zero, without a gradient, where the pose did not converge."""
     solved, truth = pose.stats.converged, _true_pose(batch)
     # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
     rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
@@ -96,7 +96,7 @@ def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
 
 
 def correspondence_loss(assignment: Float[Tensor, "b m n"], match3d: Int[Tensor, "b n"]) -> Float[Tensor, " b"]:
-    """L_c = sum_ij P_ij (1 - 2 C_ij) (Eq. 9) with C from indices; in [-1, 1) where P sums to one.
+    """L_c = sum_ij P_ij (1 - 2 C_ij) (paper Eq. 11) with C from indices; in [-1, 1) where P sums to one.
 
     match3d: index of the 2D point that 3D point j was seen as, -1 for none (padding included).
     """
@@ -145,7 +145,7 @@ def within_angle(
     translation: Float[Tensor, "b 3"],
     angle: float,
 ) -> Bool[Tensor, "b m n"]:
-    """[angle(f_i, R p_j + t) <= angle] (Eq. 3), by the chord between unit vectors."""
+    """[angle(f_i, R p_j + t) <= angle] (paper Eq. 3), by the chord between unit vectors."""
     return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
@@ -155,5 +155,5 @@ def pose_loss(
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
 ) -> Float[Tensor, " b"]:
-    """L_p = angle(R, R_gt) + ||t - t_gt|| (Eqs. 10 to 12), in radians and scene units."""
+    """L_p = angle(R, R_gt) + ||t - t_gt|| (paper Eqs. 12 to 14), in radians and scene units."""
     return rotation_angle(rotation_gt, rotation) + torch.linalg.vector_norm(translation - translation_gt, dim=-1)

@@ -15,6 +15,7 @@ from torchmetrics import MetricCollection
 
 from bpnp.checks import check_within
 from bpnp.layers.implicit import BackwardStats
+from bpnp.layers.pnp import WeightedPnP
 from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
@@ -33,7 +34,7 @@ class TrainingDivergedError(RuntimeError):
 
 
 class BlindPnPTask(LightningModule):
-    """Any solver, trained with L = L_c + pose_weight * L_p (paper Eqs. 9 to 13) and Adam.
+    """Any solver, trained with L = L_c + pose_weight * L_p (paper Eqs. 11 to 15) and Adam.
 
     Args:
         solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses, the first of
@@ -46,9 +47,9 @@ class BlindPnPTask(LightningModule):
         warmup_steps: optimiser steps in which the learning rate rises from zero.
         decay_start: step at which it begins to fall, by a half cosine to a fiftieth; none for never.
         decay_steps: steps of the fall.
-        pose_weight: gamma_p of Eq. 13, for the pose "pnp". While it is 0 no pose is solved in training;
+        pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is solved in training;
             `PoseLossWarmup` raises it.
-        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 9); likelihood for the
+        matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the
             negative log likelihood of each point's partner (`matching_likelihood_loss`).
         correspondence_angle: with L_c, supervise by the pose alone: points within this angle (radians) count as
             correspondences; null for the true ones.
@@ -155,7 +156,8 @@ class BlindPnPTask(LightningModule):
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
     def on_train_epoch_end(self) -> None:
-        """The share of the epoch's samples whose gradient a layer could not solve for."""
+        """Log the fraction of the epoch's samples whose gradient a layer could not solve for, and that of the columns of
+        the pose's derivative that were clipped."""
         stats = [getattr(module, "backward_stats", None) for module in self.solver.modules()]
         counts = [each for each in stats if isinstance(each, BackwardStats)]
         samples = sum(each.samples for each in counts)
@@ -164,6 +166,11 @@ class BlindPnPTask(LightningModule):
             self.log("train/backward_failed", share, on_epoch=True, sync_dist=True)
         for each in counts:
             each.reset()
+        clipped = [module.clipped for module in self.solver.modules() if isinstance(module, WeightedPnP)]
+        if columns := sum(each.columns for each in clipped):
+            self.log("train/clipped_columns", sum(each.clipped for each in clipped) / columns, sync_dist=True)
+        for column_count in clipped:
+            column_count.reset()
 
     def on_before_optimizer_step(self, optimizer: Optimizer) -> None:
         """Log the gradient norm; without a finite gradient, count the step and drop all gradients.
