@@ -156,8 +156,7 @@ class BlindPnPTask(LightningModule):
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
 
     def on_train_epoch_end(self) -> None:
-        """Log the fraction of the epoch's samples whose gradient a layer could not solve for, and that of the columns of
-        the pose's derivative that were clipped."""
+        """Log the fractions of samples without a solved gradient and of clipped columns of the derivative."""
         stats = [getattr(module, "backward_stats", None) for module in self.solver.modules()]
         counts = [each for each in stats if isinstance(each, BackwardStats)]
         samples = sum(each.samples for each in counts)
