@@ -19,6 +19,7 @@ Labels = NDArray[np.int64]
 TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two matches fix a pose
 SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
 LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
+PAIRS_A_POINT = 32  # pairs of one label, for each point, up to which each pair is computed
 IMAGE = ImagePoints()
 
 
@@ -131,6 +132,24 @@ class PointSets:
         return ImageStatistics(self.bearings, self.floor)
 
     @cached_property
+    def labelled_pairs(self) -> tuple[Labels, Labels] | None:
+        """Every pair of points whose labels agree.
+
+        Returns:
+            Indices (k,) among `image.chosen` and (k,) of scene points. None where the labels leave so many pairs that
+            sums over neighbours are faster, or where class probabilities or no labels are given.
+        """
+        if self.labels2d is None or self.labels3d is None or self.odds2d is not None:
+            return None
+        chosen, n = self.image.chosen, len(self.points3d)
+        groups = label_groups(chosen, self.labels2d, self.labels3d, n)
+        if sum(len(rows) * len(columns) for rows, columns in groups) > PAIRS_A_POINT * (len(chosen) + n):
+            return None
+        i = [np.repeat(rows, len(columns)) for rows, columns in groups]
+        j = [np.tile(columns, len(rows)) for rows, columns in groups]
+        return np.concatenate(i), np.concatenate(j)
+
+    @cached_property
     def middle(self) -> Array:
         """The median of the scene points (3,)."""
         return np.median(self.points3d, 0)
@@ -196,8 +215,13 @@ def label_groups(
     """Places in `chosen` and in the scene that can be partners, a group for each label in the image."""
     if labels2d is None or labels3d is None:
         return [(np.arange(len(chosen)), np.arange(n))]
-    own = labels2d[chosen]
-    return [
-        (np.flatnonzero(own == label), np.flatnonzero((labels3d == label) | (labels3d == -1) | (label == -1)))
-        for label in np.unique(own).tolist()
-    ]
+    order, any_label = np.argsort(labels3d, kind="stable"), np.flatnonzero(labels3d == -1)
+    values, rows = np.unique(labels2d[chosen], return_inverse=True)
+    groups = np.split(np.argsort(rows, kind="stable"), np.cumsum(np.bincount(rows, minlength=len(values)))[:-1])
+    first, last = (np.searchsorted(labels3d[order], values, side) for side in ("left", "right"))
+    columns = [order[i:j] for i, j in zip(first.tolist(), last.tolist(), strict=True)]
+    if len(any_label):
+        columns = [np.sort(np.r_[one, any_label]) for one in columns]
+    if len(values) and values[0] == -1:
+        columns[0] = np.arange(n)
+    return list(zip(groups, columns, strict=True))

@@ -134,8 +134,7 @@ class Schedule:
     unaided: batches and raster searches before proposals are asked for. starts_a_search: of a batch, that take as long
         as a raster search of all rotations. around_each: poses of a source that
         raster searches are made around, no two turned by less than `apart_deg`, until `in_vain` of them better nothing.
-        looks: in vain around a pose that exceeds chance, at most. claimed: batches from anywhere beside a pose that
-        comes from elsewhere.
+        looks: in vain around a pose that exceeds chance, at most.
     """
 
     turns: int = 400
@@ -148,7 +147,6 @@ class Schedule:
     apart_deg: float = 10.0
     in_vain: int = 3
     looks: int = 3
-    claimed: int = 3
 
 
 @dataclass(frozen=True)

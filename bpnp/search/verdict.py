@@ -18,11 +18,12 @@ from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
 from bpnp.search.evidence.settings import Evidence
-from bpnp.search.evidence.uncertainty import focal_bound, linearised, rotation_bound
+from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
+HALF_TURN = 180.0  # degrees; a bound that is larger says nothing of a rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,8 +142,8 @@ def judged(
         count = match_count(candidates, sets)
         linear = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(sets, linear, count))
-        if not math.isfinite(off):
-            reason = f"{chance}, but its {count:.0f} matches do not fix its rotation"
+        if off >= HALF_TURN or not is_redundant(sets, count):
+            reason = f"{chance}, but its {count:.0f} matches do not fix the rotation"
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:
             reason = (

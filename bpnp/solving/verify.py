@@ -1,4 +1,4 @@
-"""A pose from elsewhere: is it right, and how well is it known? `verify`."""
+"""Verify a pose from elsewhere: `verify`."""
 
 import math
 import time
@@ -40,30 +40,33 @@ def verify(
     seed: int = 0,
     time_limit: float | int | None = None,
 ) -> Solution:
-    """Whether a pose that comes from elsewhere is right, and how well it is known.
+    """Verify a pose that comes from elsewhere, and compute how well it is known.
 
-    The verdict is that of `solve`, with one difference: this pose alone was tried, not all that the points allow, so
-    that chance is excluded by far fewer points: by about one match beyond the three that fix a pose.
+    One pose is tested. It is "confident" if it is significant (one pose was tried, not the many of a search, so that
+    about one match beyond the three that fix a pose excludes chance) and if no competing pose is about as likely. The
+    competing poses are the optimum beside the pose, its mirror image before a flat scene, repetitions of the scene, and
+    other focal lengths. No search is made: use `solve` where a better pose may exist far away.
 
-    **What is promised.** Against the pose speak the poses within some 10 degrees and a tenth of the distance, which are
-    searched; the mirror image of a flat scene; repetitions in the scene; another focal length; and of few points, that
-    `solve` would enumerate, every other pose. Of many points a few hundred starts are drawn from anywhere, which is
-    *no search*: "confident" means that the points do not agree by chance and that nothing that was met fits as well.
-    Ask `solve` where a scene may look the same from somewhere far away.
+    Args:
+        points2d, points3d, camera, normals3d, labels2d, labels3d, scores2d, scores3d: As for `solve`.
+        rotation: (3, 3) of the pose, camera = R p + t.
+        translation: (3,) of the pose, in the unit of the scene.
+        matches: (k, 2) indices of matched points in points2d and points3d, each point in one match. The pose is judged
+            on these alone; some of them may be wrong. None: the matches are unknown.
+        refine: Return and judge the optimum beside the pose. It is the same pose: turned by at most 2 degrees and the
+            middle of the scene moved by at most a twentieth of its distance, or within what the points leave open.
+            False: the pose stays as it is. It is "ambiguous" where the optimum beside it fits significantly better, and
+            `covariance` is that of the optimum plus the step to it.
+        inlier_threshold: Largest reprojection error of a match, as for `solve`.
+        seed: Of the copies of the pose from which the optimum is refined.
+        time_limit: Seconds, 10 by default; math.inf for no limit.
 
-    rotation, translation: (3, 3), (3,), camera = R p + t, in the scene's unit. points2d, points3d, camera, normals3d,
-        labels, scores, inlier_threshold, seed: as for `solve`.
-    matches: (k, 2) places in points2d and points3d that belong together: the pose is judged on these alone, some of
-        which may be wrong; no point in two of them.
-    refine: the pose of the solution is the optimum beside the given one, and the verdict is on it. It stays the same
-        pose: turned by at most 2 degrees and the middle of the scene moved by at most a twentieth of its distance, or
-        within what the points leave open. False: the pose as it is, "ambiguous" where the optimum beside it fits
-        significantly better; `covariance` is that of the optimum and the way to it.
-    time_limit: seconds, 10 by default, math.inf for no limit.
+    Returns:
+        The solution of this pose, with its competitors in `candidates`. It is "failed" if the pose is no better than
+        chance, or if a competing pose is likelier by three decades; there may be no matches then.
 
-    "failed": no better than chance, or another pose that was met is likelier by three decades and without alternative;
-    there may be no matches then. `candidates`: the pose, and the other ones.
-    Raises ValueError as `solve`, and for what is no rotation.
+    Raises:
+        ValueError: As `solve`, and for a matrix that is no rotation.
 
     >>> import bpnp
     >>> rng = np.random.default_rng(0)
@@ -76,7 +79,8 @@ def verify(
     'failed'
     """
     begun = time.perf_counter()
-    deadline = Deadline.after(positive("time_limit", SECONDS if time_limit is None else time_limit))
+    limit = positive("time_limit", SECONDS if time_limit is None else time_limit)
+    deadline = Deadline.after(limit)
     threshold = positive("inlier_threshold", inlier_threshold, finite=True)
     rotation, translation = checked_pose("", rotation, translation)
     problem = problem_from(
@@ -95,6 +99,9 @@ def verify(
         return without_pose(judged, judged.degenerate, threshold)
     moved = translation + rotation @ judged.origin
     result, optimum = judge_claim(judged.sets, rotation, moved, refine=refine, seed=seed, deadline=deadline)
+    if result.verdict == "confident" and deadline.passed():
+        reason = f"not decided in {limit:.3g} s: its competitors were not tested"
+        result = replace(result, verdict="ambiguous", reason=reason)
     solution = finished(judged, result, time.perf_counter() - begun, threshold)
     if not refine and solution.verdict != "failed" and len(optimum):
         solution = replace(solution, covariance=_of_unrefined(judged, optimum, rotation, moved))

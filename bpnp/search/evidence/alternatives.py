@@ -158,6 +158,15 @@ def _explained(seen: Seen, k: int, scale: float, near: float) -> tuple[Array, _P
 def _partners(near: float, sets: PointSets, rotation: Array, translation: Array, scale: float) -> _Partners:
     seen, chosen = directions_of(sets, rotation, translation), sets.image.chosen
     chord, points = np.full(len(chosen), np.inf), np.full(len(chosen), -1)
+    if sets.labelled_pairs is not None:
+        i, j = sets.labelled_pairs
+        distance = np.linalg.norm(sets.bearings[chosen[i]] - seen[j], axis=-1)
+        distance = np.where(distance < near * scale, distance, np.inf)  # also where a point is not seen
+        order = np.lexsort((distance, i))
+        rows, first = np.unique(i[order], return_index=True)
+        chord[rows] = distance[order][first]
+        points[rows] = np.where(np.isfinite(chord[rows]), j[order][first], -1)
+        return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
     for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, len(seen)):
         ahead = columns[np.isfinite(seen[columns, 0])]
         if len(ahead):

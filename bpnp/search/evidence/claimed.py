@@ -1,11 +1,10 @@
-"""A pose that somebody claims: how likely it is by chance, what speaks against it, and the optimum beside it.
+"""Verify a given pose: how likely it is by chance, which poses compete with it, and the optimum beside it.
 
-One hypothesis has been tried, not all that triples of points give: the number of tests is one, or that of the poses
-which lie as near to the claimed one as the optimum beside it, if this is judged instead. What speaks against a pose is
-what speaks against one that was found (`bpnp.search.verdict`), as far as it is met: the poses that raster searches
-around the claim meet, and a few batches of starts from anywhere; the mirror image of a flat scene, repetitions, another
-focal length; of points few enough to be enumerated all other poses. That a better pose far away was missed is excluded
-for these alone: many points may have one that few starts meet.
+One pose was tried, so the number of tests is one; or, where the optimum beside the pose is judged instead, the number
+of poses that lie as near to the given one as this optimum. The competing poses are proposed from the pose and from the
+scene, not searched for: the optima that annealing reaches from the pose and from copies beside it, its mirror image
+before a flat scene, the motions that take the scene onto itself, and other focal lengths (`against_rivals`). Whether a
+better pose exists elsewhere is not tested.
 """
 
 import math
@@ -16,9 +15,8 @@ from numpy.typing import NDArray
 
 from bpnp.geometry import turned_by
 from bpnp.loops.parallel import NEVER, Deadline, one_blas_thread
-from bpnp.search.annealing import anneal_on_points, finish, multistart
+from bpnp.search.annealing import anneal_on_points, finish
 from bpnp.search.candidates import Candidates, in_scene_frame, in_user_frame, merged
-from bpnp.search.enumeration.search import is_enumerable, search_by_enumeration
 from bpnp.search.evidence.alternatives import number
 from bpnp.search.evidence.false_alarms import likeliest_scale, log10_tests
 from bpnp.search.evidence.partners import explained
@@ -26,13 +24,14 @@ from bpnp.search.evidence.rivals import against_rivals
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import linearised, local_covariance
 from bpnp.search.point_sets import SIGMAS, PointSets
-from bpnp.search.raster_search import around_each, search_beside
+from bpnp.search.raster_search import around_each
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import PosePrior
 from bpnp.search.verdict import SearchResult, judged, with_false_alarms
 
 Array = NDArray[np.float64]
+ONE_POSE = "only this pose and its competitors were tested, no better one was searched for"
 WITHIN = 22.5  # chi-squared with 6 degrees of freedom, one in a thousand: of a claim and the optimum that it means
 
 
@@ -46,15 +45,25 @@ def judge_claim(
     seed: int = 0,
     deadline: Deadline = NEVER,
 ) -> tuple[SearchResult, Candidates]:
-    """The verdict on a pose (3, 3), (3,), the first of the candidates; with `refine` on the optimum beside it, if that
-    is the same pose: turned and moved by no more than a verdict calls another one, or than the points leave open. And
-    this optimum (1,), the pose beside the given one that the points agree with best, if there is one."""
-    # What is far away is not asked: no starts were drawn from anywhere.
-    rule = replace(DEFAULT.evidence, another=0.0)
+    """Judge a given pose, or the optimum beside it.
+
+    Args:
+        sets: Points of the problem.
+        rotation: (3, 3) of the pose.
+        translation: (3,) of the pose, scene units.
+        refine: Judge the optimum beside the pose. It is the same pose: turned and moved by no more than the verdict
+            takes for one pose, or than the points leave open.
+        seed: Of the copies beside the pose.
+        deadline: When to stop proposing poses.
+
+    Returns:
+        The verdict, with the judged pose as the first candidate; and the optimum (1,) beside the given pose, or (0,)
+        if there is none.
+    """
+    rule = DEFAULT.evidence
     one = replace(sets, log10_tried=0.0)
     claim = _unrefined(one, rotation, translation)
-    others, looks, exhaustive = _met(sets, claim, Scene(sets, seed, DEFAULT, deadline))
-    others = _weighed_anew(others, one)
+    others = _weighed_anew(_proposed(claim, Scene(sets, seed, DEFAULT, deadline)), one)
     others = others[np.argsort(others.log10_false_alarms, kind="stable")]
     same = np.array([_is_same(one, claim, others[k : k + 1], rule) for k in range(len(others))], np.bool_)
     optimum = others[same][:1]
@@ -66,38 +75,32 @@ def judge_claim(
         near = replace(sets, prior=prior).log10_share(optimum.rotation[0], optimum.translation[0])
         one = replace(sets, log10_tried=max(log10_tests(sets) + near, 0.0))
         claim = optimum
-    candidates = _weighed_anew(Candidates.concatenated([claim, others[~same]]), one)
-    result = judged(candidates, one, batches=looks, looks=looks, exhaustive=exhaustive, rule=rule)
+    competing = others[~same & (others.log10_false_alarms <= 0)]  # chance explains the rest
+    candidates = _weighed_anew(Candidates.concatenated([claim, competing]), one)
+    result = judged(candidates, one, batches=0, exhaustive=True, rule=rule)
     scene = Scene(one, seed, DEFAULT, deadline)
-    result = against_rivals(result, one, lambda: scene, rule, looks=looks, exhaustive=exhaustive)
+    result = against_rivals(result, one, lambda: scene, rule, exhaustive=True)
     result = _of_claim(result, candidates[:1])
+    if result.verdict == "confident":
+        result = replace(result, reason=f"{result.reason}; {ONE_POSE}")
     lead = float(claim.log10_false_alarms[0] - optimum.log10_false_alarms[0]) if better else 0.0
     if not refine and result.verdict == "confident" and 2 * math.log(10) * lead > WITHIN:  # likelihoods, Wilks 1938
         off = math.degrees(turned_by(rotation, optimum.rotation[0]))
         reason = f"a pose {off:.2g} deg away, the optimum beside it, fits better ({number(-lead)} times the number)"
         result = replace(result, verdict="ambiguous", reason=f"{_chance(claim)}, but {reason}")
     refined = refine and result.verdict == "confident"
-    return replace(result, batches=max(looks, 1) if refined else 0), optimum  # no last fit to the matches
+    return replace(result, batches=int(refined)), optimum  # no last fit to the matches
 
 
-def _met(sets: PointSets, claim: Candidates, scene: Scene) -> tuple[Candidates, int, bool]:
-    """Distinct poses that annealing reaches from a claim, and others around it and far away; how often was looked
-    around it, and whether all poses of these points were tried."""
-    start, settings, deadline = in_scene_frame(claim, scene), scene.settings, scene.deadline
-    wide = settings.middle[-1].last_scale * scene.spread
+def _proposed(claim: Candidates, scene: Scene) -> Candidates:
+    """Return the distinct poses that annealing reaches from a pose (1,), from copies of it a little beside it, and from
+    its mirror image before a flat scene."""
+    start = in_scene_frame(claim, scene)
+    wide = scene.settings.middle[-1].last_scale * scene.spread
     around = Candidates.concatenated([start, around_each(scene, start), _mirrored(scene, start)])
     parts = [anneal_on_points(scene, start, wide), anneal_on_points(scene, around, wide), finish(scene, start)]
-    exhaustive, looks = False, 0
-    if is_enumerable(sets):
-        found, exhaustive = search_by_enumeration(sets, deadline, settings)
-        parts.append(in_scene_frame(found, scene))
-    while looks < settings.schedule.looks and not exhaustive and not deadline.passed():
-        leader = merged(parts, scene)[:1]
-        parts.append(search_beside(scene, leader if looks % 2 else start, settings.beside))
-        looks += not deadline.passed()
-    parts += [multistart(scene, batch, None) for batch in range(0 if exhaustive else settings.schedule.claimed)]
-    poses = finish(scene, merged(parts, scene), settings.finished)
-    return in_user_frame(poses, scene), looks, exhaustive
+    poses = finish(scene, merged(parts, scene), scene.settings.finished)
+    return in_user_frame(poses, scene)
 
 
 def _weighed_anew(candidates: Candidates, sets: PointSets) -> Candidates:

@@ -108,7 +108,8 @@ def _log10_choices(sets: PointSets, pairs: int) -> float:
     choices = math.prod((m - i) * (n - i) / (i + 1) for i in range(pairs))
     if sets.labels2d is not None and sets.labels3d is not None:
         groups = label_groups(np.arange(m), sets.labels2d, sets.labels3d, n)
-        choices = min(choices, float(math.comb(sum(len(rows) * len(columns) for rows, columns in groups), pairs)))
+        agreeing = sum(len(rows) * len(columns) for rows, columns in groups)
+        choices = min(choices, math.prod((agreeing - i) / (i + 1) for i in range(pairs)))
     return math.log10(2 * max(choices, 1.0))
 
 
@@ -219,21 +220,59 @@ def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *
 
     even: against scene points that are spread evenly over the view instead of as they are seen.
     """
+    image = sets.image
+    predicted, smooth, inside, every = _sums(sets, seen, scales, even)
+    density = (every if even else np.maximum(inside, 1)) / image.solid_angle
+    ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
+    return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
+
+
+def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Array, Array, Array, Array]:
+    """Sum kernels and counts over the possible partners of each chosen image point.
+
+    Args:
+        sets: Points of the problem, with k chosen image points.
+        seen: (n, 3) directions in which the scene points are seen; NaN for those that are not.
+        scales: (S,) standard deviations of the kernels, radians.
+        even: Leave the outline out.
+
+    Returns:
+        Kernels (k, S); density of the outline (k,), 0 if `even`; number of partners in view (k,) and of all (k,).
+    """
     image, count = sets.image, len(sets.image.chosen)
+    in_view, ahead = np.zeros(len(seen), np.bool_), np.flatnonzero(np.isfinite(seen[:, 0]))
+    across = (np.abs((seen[ahead] - image.centre) @ image.axes) <= image.half_widths).all(-1)
+    in_view[ahead] = across & (seen[ahead] @ image.centre > 0)
+    if sets.labelled_pairs is not None:
+        return _sums_of_pairs(sets, *sets.labelled_pairs, seen, in_view, scales, even)
     predicted, smooth, inside, every = np.zeros((count, len(scales))), np.zeros(count), np.zeros(count), np.zeros(count)
     for rows, columns, odds, share in _partners(sets, len(seen)):
         ahead = np.isfinite(seen[columns, 0])
         every[rows] += odds * share.sum()
+        inside[rows] += odds * share[in_view[columns]].sum()
         used, share, bearings = seen[columns][ahead], share[ahead], sets.bearings[image.chosen[rows]]
         near = sums_near(bearings, used, image.axes, FARTHEST * scales, 0.5 / scales**2, share)
         predicted[rows] += odds[:, None] * near
-        among = (np.abs((used - image.centre) @ image.axes) <= image.half_widths).all(-1)
-        inside[rows] += odds * share[among & (used @ image.centre > 0)].sum()
         if not even:
             smooth[rows] += odds * _smoothed(image, bearings, used, share)
-    density = (every if even else np.maximum(inside, 1)) / image.solid_angle
-    ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
-    return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
+    return predicted, smooth, inside, every
+
+
+def _sums_of_pairs(
+    sets: PointSets, i: Labels, j: Labels, seen: Array, in_view: NDArray[np.bool_], scales: Array, even: bool
+) -> tuple[Array, Array, Array, Array]:
+    """Compute `_sums` over given pairs (p,) of a chosen image point and a scene point."""
+    count = len(sets.image.chosen)
+    every, inside = (np.asarray(np.bincount(i, of, count), np.float64) for of in (np.ones(len(i)), in_view[j]))
+    ahead = np.isfinite(seen[j, 0])
+    i, j = i[ahead], j[ahead]
+    squared = ((sets.bearings[sets.image.chosen[i]] - seen[j]) ** 2).sum(-1)
+    kernels = (np.where(squared < (FARTHEST * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
+    predicted = np.stack([np.bincount(i, kernel, count) for kernel in kernels], -1)
+    width2 = (OUTLINE * sets.image.spread) ** 2
+    outline = np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
+    smooth = np.zeros(count) if even else np.asarray(np.bincount(i, outline, count), np.float64)
+    return np.asarray(predicted, np.float64), smooth, inside, every
 
 
 def _partners(sets: PointSets, n: int) -> Iterator[tuple[Labels, Labels, Array, Array]]:

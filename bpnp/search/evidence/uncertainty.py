@@ -57,6 +57,20 @@ def rotation_bound(sets: PointSets, linear: "Linearised | None", count: float) -
     return math.inf if covariance is None else exceeded_once(covariance[:3, :3], 2 * count - sets.fitted)
 
 
+def is_redundant(sets: PointSets, count: float) -> bool:
+    """Return whether a pose stays overdetermined without one of its matches.
+
+    Args:
+        sets: Points of the problem; `sets.fitted` is the number of unknowns.
+        count: Expected number of matches. Each one gives two equations.
+
+    >>> sets = PointSets(np.eye(3), np.eye(3))
+    >>> [is_redundant(sets, count) for count in (4.0, 4.9)]
+    [False, True]
+    """
+    return 2 * (round(count) - 1) > sets.fitted
+
+
 def focal_bound(sets: PointSets, linear: "Linearised | None", count: float) -> float:
     """Share by which the focal length may be wrong, exceeded once in a thousand; see `exceeded_once`."""
     covariance = local_covariance(linear)
@@ -177,6 +191,8 @@ def _of_louis(linear: "Linearised") -> Array | None:
     root = unit[:, None] * vectors / np.sqrt(values)
     steps = expected @ root
     matters = np.flatnonzero(own.reshape(-1, size * size) @ (root @ root.T).ravel() > SLIGHT)
+    if not is_redundant(sets, float(probability.sum()) * share):
+        matters = matters[:0]  # without one of so few matches the others fix several poses, or none
     without = np.eye(size) - root.T @ own[matters] @ root
     fixed = np.linalg.eigvalsh(without)[:, 0] > FIXED  # also without the point
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
