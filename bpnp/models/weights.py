@@ -1,8 +1,9 @@
 """Checkpoint files, read as data and never as code; the weights of this package; and the networks of both.
 
-A module is described by the name of its class and its constructor's arguments, each kept by the module as an attribute
-of the same name; an argument that is a module is described likewise. A description holds dicts, lists, tuples, strings
-and numbers only. Building one imports nothing: the classes are looked up by name among those that the caller knows.
+A description of a module has the name of its class and its constructor's arguments, each kept by the module as an
+attribute of the same name; an argument that is a module is described likewise. A description holds dicts, lists,
+tuples, strings and numbers only. Building one imports nothing: the classes are looked up by name among those that the
+caller names. A checkpoint describes its network under "solver", and nothing else decides which network it belongs to.
 """
 
 import inspect
@@ -20,15 +21,15 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.evaluation import Refinement
 from bpnp.models.nets import ImageFeatures, PointFeatures, SceneFeatures
+from bpnp.models.older_checkpoints import upgrade
 
 PARTS = (ImageFeatures, SceneFeatures, PointFeatures, Sinkhorn, RansacPnP, WeightedPnP, Refinement)
 WEIGHTS = resources.files("bpnp") / "weights"
 LEARNED = "procedural-so3"  # what `solve(prior="learned")` asks
 PLAIN = (bool, int, float, str, type(None))
 PREFIX = "solver."  # of the weights of BlindPnPTask's solver
-RENAMED = {"pairs_factor": "matches_factor"}  # settings in older checkpoints
-# Settings of older checkpoints that had no other value in use.
-REMOVED = {"batch_norm": False, "principal": False, "method": "newton"}
+# Settings that do not change the assignment: a run may have other ones than its checkpoint.
+ADJUSTABLE = {"ransac", "pnp", "refinement", "rounds", "tolerance", "max_iterations"}
 
 Net = TypeVar("Net", bound="TrainedNet")
 
@@ -53,16 +54,16 @@ class TrainedNet(nn.Module):
         Raises FileNotFoundError, or ValueError naming the file if it holds another network or none.
         """
         content = read_checkpoint(path)
-        networks = {class_name(net): net for net in TrainedNet.__subclasses__()}
         saved = content.get("solver")
         found = saved.get("class") if isinstance(saved, Mapping) else None
-        if not issubclass(networks.get(str(found), object), cls):
-            wanted = class_name(cls) if cls in networks.values() else " or ".join(networks)
+        known = {class_name(net): net for net in networks()}
+        if not issubclass(known.get(str(found), object), cls):
+            wanted = " or ".join(known) if cls is TrainedNet else class_name(cls)
             raise ValueError(f"expected a checkpoint of {wanted}, got {found or 'another file'} in {path}")
         try:
-            net = built(saved, (*networks.values(), *PARTS, *parts))
-            net.load_state_dict(solver_state(content))
-        except (ValueError, RuntimeError) as error:
+            net = build_solver(content, parts)
+            net.load_state_dict(fitting_state(content, net)[0])
+        except ValueError as error:
             raise ValueError(f"expected a checkpoint of {found}, got {path}: {error}") from error
         assert isinstance(net, cls)
         return net.eval()
@@ -119,9 +120,7 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
         ) from error
     if not isinstance(content, dict) or "state_dict" not in content:
         raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {file}")
-    if "blocks" in ((content.get("solver") or {}).get("settings") or {}):  # which every net had, now `depth`
-        raise ValueError(f"expected a checkpoint of this version, got one of an older form: {file}; try the older bpnp")
-    return content
+    return upgrade(content)
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
@@ -130,10 +129,41 @@ def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:
     return {key.removeprefix(PREFIX): value for key, value in state.items() if key.startswith(PREFIX)}
 
 
-def fitting_state(content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False) -> dict[str, Tensor]:
-    """`solver_state` of a checkpoint. Raises ValueError, naming what differs, unless class and shapes fit `solver`.
+def build_solver(content: Mapping[str, Any], parts: Iterable[type[nn.Module]] = ()) -> nn.Module:
+    """Build the network that a checkpoint describes, without its weights.
 
-    grown: `solver` may have more weights than the checkpoint, if they are zero: parts that add nothing before training.
+    Args:
+        content: of `read_checkpoint`.
+        parts: classes outside this package that the network may be made of.
+
+    Raises:
+        ValueError: the checkpoint describes no network, or a class that is neither of this package nor in `parts`.
+    """
+    return built(content.get("solver"), (*networks(), *PARTS, *parts))
+
+
+def networks(base: type[nn.Module] = TrainedNet) -> Iterator[type[nn.Module]]:
+    """Every class of networks that is defined, also those that derive from one of this package."""
+    for cls in base.__subclasses__():
+        yield cls
+        yield from networks(cls)
+
+
+def fitting_state(
+    content: Mapping[str, Any], solver: nn.Module, *, grown: bool = False
+) -> tuple[dict[str, Tensor], list[str]]:
+    """Check that a checkpoint is of a solver.
+
+    Args:
+        content: of `read_checkpoint`.
+        solver: what the weights are for.
+        grown: allow weights that the checkpoint lacks if they are zero: parts that add nothing before training.
+
+    Returns:
+        The weights of the solver, and the `ADJUSTABLE` settings that it has different, as `rounds=0 (saved: 8)`.
+
+    Raises:
+        ValueError: the class, another setting or the shape of a weight differs.
     """
     saved, wanted = content.get("solver", {}), described(solver)
     state, weights = solver_state(content), solver.state_dict()
@@ -143,11 +173,36 @@ def fitting_state(content: Mapping[str, Any], solver: nn.Module, *, grown: bool 
         )
     if grown:
         state |= {key: value for key, value in weights.items() if key not in state and not value.any()}
-    shapes, own_shapes = ({key: value.shape for key, value in each.items()} for each in (state, weights))
-    if shapes != own_shapes:
-        told = ", ".join(differences(saved, wanted)) or "other weights"
-        raise ValueError(f"expected a checkpoint of the configured {wanted['class']}, got {told}; try these settings")
-    return state
+    adjusted, wrong = [], []
+    for place, ours, theirs in differences(wanted, _with_defaults(saved, solver)):
+        changed = adjusted if ADJUSTABLE & set(place.split(".")) else wrong
+        changed.append(f"{place}={_shown(ours)} (saved: {_shown(theirs)})")
+    if wrong and not (grown and state.keys() > solver_state(content).keys()):
+        raise ValueError(
+            f"the checkpoint is of another {wanted['class']}: {', '.join(wrong)}. Leave these settings out, or give "
+            "the saved ones"
+        )
+    misfits = [key for key in state.keys() | weights.keys() if _shape(state.get(key)) != _shape(weights.get(key))]
+    if misfits:
+        raise ValueError(f"the checkpoint has no fitting {sorted(misfits)[0]} for this {wanted['class']}")
+    return state, [*adjusted, *wrong]
+
+
+def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping[str, Any]:
+    """The description with the settings that it leaves out, which an older version wrote."""
+    try:
+        with torch.device("meta"):
+            return described(built(description, (*networks(), *PARTS, *{type(part) for part in solver.modules()})))
+    except (ValueError, RuntimeError, NotImplementedError):  # of a module that cannot be built from its description
+        return description
+
+
+def _shape(weight: Tensor | None) -> tuple[int, ...] | None:
+    return None if weight is None else tuple(weight.shape)
+
+
+def _shown(setting: Any) -> Any:
+    return setting["class"] if is_description(setting) else setting
 
 
 @runtime_checkable
@@ -178,7 +233,7 @@ def described(module: nn.Module) -> dict[str, Any]:
         value = getattr(module, name, parameter.empty)
         if isinstance(value, nn.Module):
             value = described(value)
-        elif not _is_plain(value):
+        elif not is_plain(value):
             return {"class": class_name(type(module)), "settings": None}
         settings[name] = value
     return {"class": class_name(type(module)), "settings": settings}
@@ -197,9 +252,6 @@ def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
             f"expected the settings of {name}, got none; try a class that keeps each constructor argument as an "
             "attribute of its name"
         )
-    settings = {
-        RENAMED.get(key, key): value for key, value in settings.items() if key not in REMOVED or value != REMOVED[key]
-    }
     arguments = {key: built(value, classes) if is_description(value) else value for key, value in settings.items()}
     try:
         return known[name](**arguments)
@@ -207,15 +259,19 @@ def built(description: Any, classes: Iterable[type[nn.Module]]) -> nn.Module:
         raise ValueError(f"expected settings of {name}, got {error}") from error
 
 
-def differences(first: Any, second: Any, name: str = "") -> Iterator[str]:
-    """Settings of the first of two descriptions that the second has not, as `features2d.channels=32`."""
+def differences(first: Any, second: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Settings that two descriptions have different: the place, such as `features2d.channels`, and both values.
+
+    A setting that the second leaves out is no difference.
+    """
     if not (is_description(first) and is_description(second)) or first["class"] != second["class"]:
         if first != second:
-            yield f"{name}={first['class'] if is_description(first) else first}"
+            yield name, first, second
         return
     theirs = second["settings"] or {}
     for key, value in (first["settings"] or {}).items():
-        yield from differences(value, theirs.get(key), f"{name}.{key}" if name else key)
+        if key in theirs:
+            yield from differences(value, theirs[key], f"{name}.{key}" if name else key)
 
 
 def class_name(cls: type) -> str:
@@ -224,12 +280,14 @@ def class_name(cls: type) -> str:
 
 
 def is_description(value: Any) -> bool:
+    """Whether a value has the form of a module's description."""
     return isinstance(value, Mapping) and set(value) == {"class", "settings"}
 
 
-def _is_plain(value: Any) -> bool:
+def is_plain(value: Any) -> bool:
+    """Whether a value is made of strings, numbers, lists, tuples and dicts only."""
     if isinstance(value, (list, tuple)):
-        return all(map(_is_plain, value))
+        return all(map(is_plain, value))
     if isinstance(value, dict):
-        return all(isinstance(key, str) and _is_plain(each) for key, each in value.items())
+        return all(isinstance(key, str) and is_plain(each) for key, each in value.items())
     return type(value) in PLAIN

@@ -1,12 +1,16 @@
 """Training and evaluation of a blind PnP solver: losses, metrics and the optimiser around any `Batch -> Prediction`."""
 
+import inspect
 import math
 import time
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -19,12 +23,25 @@ from bpnp.layers.pnp import WeightedPnP
 from bpnp.metrics import MeanOverProblems, PoseQuartiles, PoseRecall, pose_errors
 from bpnp.models.bpnpnet import BPnPNet
 from bpnp.models.evaluation import REFINED, refinement_enabled
-from bpnp.models.weights import AnyModule, TrainedNet, chosen, described, fitting_state, read_checkpoint
+from bpnp.models.older_checkpoints import upgrade
+from bpnp.models.weights import (
+    AnyModule,
+    TrainedNet,
+    build_solver,
+    built,
+    chosen,
+    described,
+    fitting_state,
+    is_description,
+    is_plain,
+    read_checkpoint,
+)
 from bpnp.precision import exact_products
 from bpnp.training.losses import Losses, MatchingLoss, correspondence_losses, matching_losses, own_losses, pose_losses
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
+REBUILT = {"solver", "weights"}  # options that are not kept under "task": the checkpoint has what they made
 DECAYED = 0.02  # of the learning rate, after its fall
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
@@ -75,10 +92,29 @@ class BlindPnPTask(LightningModule):
         refine_validation: bool = False,
     ) -> None:
         super().__init__()
-        self.solver = chosen(solver, BPnPNet)
-        if weights is not None:
-            self.solver.load_state_dict(fitting_state(read_checkpoint(weights), self.solver, grown=True))
+        if weights is None:
+            self.solver = chosen(solver, BPnPNet)
+        else:
+            content = read_checkpoint(weights)
+            self.solver = build_solver(content) if solver is None else chosen(solver, BPnPNet)
+            self._adopt(content, grown=True)
         self.loss = None if loss is None else chosen(loss, nn.Module)
+        self.save_hyperparameters(
+            {
+                "solver": described(self.solver),
+                "weights": weights,
+                "learning_rate": learning_rate,
+                "weight_decay": weight_decay,
+                "warmup_steps": warmup_steps,
+                "decay_start": decay_start,
+                "decay_steps": decay_steps,
+                "pose_weight": pose_weight,
+                "matching_loss": matching_loss,
+                "correspondence_angle": correspondence_angle,
+                "loss": None if self.loss is None else described(self.loss),
+                "refine_validation": refine_validation,
+            }
+        )
         self.learning_rate, self.weight_decay, self.pose_weight = learning_rate, weight_decay, pose_weight
         check_within(0, math.inf, warmup_steps=warmup_steps, decay_start=decay_start or 0)
         check_within(1, math.inf, decay_steps=decay_steps)
@@ -103,6 +139,55 @@ class BlindPnPTask(LightningModule):
         for stage, names in self.estimates.items():
             for name in names:
                 self.metrics[f"{stage}_{name}"] = MetricCollection([PoseQuartiles(), PoseRecall()])
+
+    @classmethod
+    def load_from_checkpoint(  # type: ignore[override]
+        cls,
+        checkpoint_path: str | Path,
+        map_location: Any = "cpu",
+        hparams_file: None = None,
+        strict: bool | None = None,
+        weights_only: Literal[True] | None = None,
+        *,
+        parts: Iterable[type[nn.Module]] = (),
+        **kwargs: Any,
+    ) -> "BlindPnPTask":
+        """Build the task of a checkpoint: the solver that it describes, the weights, the options of its training.
+
+        Args:
+            checkpoint_path: a file, or the name of packaged weights.
+            map_location: device of the weights; the CPU by default.
+            hparams_file: refused; the checkpoint has the hyperparameters.
+            strict: False allows missing and unexpected weights.
+            weights_only: refused if False; a checkpoint is read as data.
+            parts: classes outside this package that the solver or the loss is made of.
+            kwargs: constructor arguments in place of those of the checkpoint.
+
+        Returns:
+            The task, in training mode as Lightning returns it; call `eval()` before you predict without a Trainer.
+
+        Raises:
+            ValueError: the file is no checkpoint of a task, or does not fit a `solver` among `kwargs`.
+
+        >>> BlindPnPTask.load_from_checkpoint("procedural-so3").solver.rounds
+        8
+        """
+        if hparams_file is not None or weights_only is False:
+            raise ValueError("hparams_file and weights_only=False are not accepted: a checkpoint is read as data")
+        content = read_checkpoint(checkpoint_path, map_location=map_location)
+        known = inspect.signature(cls.__init__).parameters
+        options = {key: value for key, value in content.get("task", {}).items() if key in known} | kwargs
+        try:
+            if is_description(options.get("loss")):
+                options["loss"] = built(options["loss"], parts)
+            if options.get("solver") is None:
+                options["solver"] = build_solver(content, parts)
+            task = cls(**options)
+            task.on_load_checkpoint(content)
+            task.load_state_dict(content["state_dict"], strict=strict is not False)
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"{checkpoint_path}: {error}") from error
+        return task
 
     def forward(self, batch: Batch) -> Prediction:
         return self.solver(batch)
@@ -257,15 +342,31 @@ class BlindPnPTask(LightningModule):
         return rise * (DECAYED + (1 - DECAYED) * (1 + math.cos(math.pi * done)) / 2)
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """The solver's class and settings, from which `BPnPNet.from_checkpoint` builds it again."""
+        """Describe the solver, from which it is built again, and the task, under names of their own.
+
+        A LightningCLI overwrites options of the command line by what it finds under Lightning's "hyper_parameters".
+        """
         checkpoint["solver"] = described(self.solver)
+        saved = checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_KEY, {})
+        checkpoint.pop(self.CHECKPOINT_HYPER_PARAMS_NAME, None)
+        checkpoint["task"] = {
+            key: value for key, value in saved.items() if key not in REBUILT and (is_plain(value) or key == "loss")
+        }
         checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
         checkpoint["optimizer_names"] = self.optimizer_names
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        fitting_state(checkpoint, self.solver)  # one clear error before any state is loaded
+        checkpoint |= upgrade(checkpoint)  # of a Trainer without SafeCheckpointIO
+        self._adopt(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
+
+    def _adopt(self, content: Mapping[str, Any], *, grown: bool = False) -> None:
+        """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose."""
+        state, adjusted = fitting_state(content, self.solver, grown=grown)
+        self.solver.load_state_dict(state)
+        if adjusted:
+            rank_zero_info(f"the network is that of the checkpoint with {', '.join(adjusted)}")
 
     def on_validation_epoch_end(self) -> None:
         self._log_metrics("val")

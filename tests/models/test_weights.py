@@ -102,22 +102,27 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
 
 def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     saved, own = small_net(8, 1, normalise=True), small_net(16, 2)
-    told = r"features2d.channels=8, features2d.depth=1, features3d.channels=8, .*features3d.normalise=True; try"
+    told = r"features2d.channels=16 \(saved: 8\), .*features3d.normalise=False \(saved: True\). Leave these settings out"
     with pytest.raises(ValueError, match=told):
         fitting_state(content(saved), own)
-    assert fitting_state(content(own), small_net(normalise=True)).keys() == own.state_dict().keys()
+    # The shapes agree; the assignment would be another one.
+    with pytest.raises(ValueError, match=r"another BPnPNet: features3d.normalise=True \(saved: False\)\."):
+        fitting_state(content(own), small_net(normalise=True))
+    state, adjusted = fitting_state(content(own), small_net(rounds=2))
+    assert state.keys() == own.state_dict().keys()
+    assert adjusted == ["rounds=2 (saved: 0)"]
     with pytest.raises(ValueError, match="expected a checkpoint of BPnPNet, got one of another program"):
         fitting_state({"state_dict": {}}, own)
-    assert list(differences(described(Flat(2)), described(Flat(3)))) == ["coordinates=2"]
+    assert list(differences(described(Flat(2)), described(Flat(3)))) == [("coordinates", 2, 3)]
 
 
-OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "mu": 0.2}}
+OLD_FORM = {"class": "BPnPNet", "settings": {"channels": 16, "blocks": 2, "nonsense": 0.2}}
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ({"solver": OLD_FORM, "state_dict": {}}, r"got one of an older form: .*x\.ckpt; try"),
+        ({"solver": OLD_FORM, "state_dict": {}}, r"x\.ckpt: expected settings of BPnPNet, got .*'nonsense'"),
         ({"solver": {"class": "Hungarian"}, "state_dict": {}}, r"of BPnPNet, got Hungarian in .*x\.ckpt"),
         ({"state_dict": {}}, r"of BPnPNet, got another file in .*x\.ckpt"),
         ([1], r"got a file without a `state_dict`: .*x\.ckpt"),

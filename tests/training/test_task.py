@@ -239,7 +239,7 @@ def test_a_training_starts_from_packaged_weights_or_those_of_a_file(tmp_path: Pa
     view = BlindPnPTask(Matcher(channels=16, depth=1, frame="view"), weights=str(tmp_path / "small.ckpt"))
     batch = Batch.from_arrays(torch.rand(1, 9, 2), torch.rand(1, 12, 3) + 1)
     torch.testing.assert_close(view.solver.match(batch).assignment, small.solver.match(batch).assignment)
-    with pytest.raises(ValueError, match="expected a checkpoint of the configured Matcher, got channels=16, depth=1"):
+    with pytest.raises(ValueError, match=r"another Matcher: channels=128 \(saved: 16\), depth=6 \(saved: 1\)"):
         BlindPnPTask(Matcher(), weights=str(tmp_path / "small.ckpt"))
     with pytest.raises(FileNotFoundError, match="matcher-of-nobody"):
         BlindPnPTask(Matcher(), weights="matcher-of-nobody")

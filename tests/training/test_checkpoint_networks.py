@@ -1,0 +1,214 @@
+"""The network of a checkpoint is the one that the checkpoint describes, whichever way it is loaded."""
+
+import json
+import lzma
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from planted import padded, plant
+from small_data import quiet_trainer, small_meshes, small_net
+from torch import Tensor, nn
+
+from bpnp import Batch, BPnPNet, Matcher
+from bpnp.layers import RansacPnP, Sinkhorn
+from bpnp.models import TrainedNet
+from bpnp.models.nets import ImageFeatures, SceneFeatures
+from bpnp.models.weights import checkpoint_path, pretrained_names, read_checkpoint
+from bpnp.training import BlindPnPTask, PoseLossWarmup
+
+RELEASED = Path(__file__).parents[1] / "released"
+# What the version that wrote each file gave for `asked()`.
+ASSIGNMENTS = json.loads((RELEASED / "assignments.json").read_text())
+
+
+def asked() -> Batch:
+    generator = torch.Generator().manual_seed(5)
+    return Batch.from_arrays(torch.rand(9, 2, generator=generator), torch.rand(12, 3, generator=generator))
+
+
+def assignment(solver: nn.Module) -> Tensor:
+    with torch.no_grad():
+        return solver.eval().match(asked()).assignment  # type: ignore[operator]
+
+
+def save(task: BlindPnPTask, path: Path) -> Path:
+    trainer = quiet_trainer(path.parent, max_epochs=0)
+    trainer.strategy.connect(task)
+    trainer.save_checkpoint(path)
+    return path
+
+
+class Flat(nn.Module):
+    """A user's features: a linear map."""
+
+    def __init__(self, coordinates: int, *, channels: int = 4) -> None:
+        super().__init__()
+        self.coordinates, self.channels = coordinates, channels
+        self.map = nn.Linear(coordinates, channels)
+
+    def forward(self, points: Tensor, mask: Tensor) -> Tensor:
+        return nn.functional.normalize(self.map(points), dim=-1)
+
+
+class Scaled(BPnPNet):
+    """A user's network, derived from one of this package."""
+
+    def __init__(self, factor: float = 1.0) -> None:
+        super().__init__(ImageFeatures(channels=8, depth=1), SceneFeatures(channels=8, depth=1))
+        self.factor = factor
+
+    def cost(self, batch: Batch) -> Tensor:
+        return self.factor * super().cost(batch)
+
+
+class Squares(nn.Module):
+    """A user's loss with an option."""
+
+    def __init__(self, power: float) -> None:
+        super().__init__()
+        self.power = power
+
+
+@pytest.fixture(params=[*ASSIGNMENTS, *pretrained_names()])
+def saved(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Tensor]:
+    """A checkpoint of each version and all packaged weights, with the assignment that it should give."""
+    name = request.param
+    if name not in ASSIGNMENTS:
+        return name, assignment(TrainedNet.from_pretrained(name))
+    file = tmp_path / f"{name}.ckpt"
+    file.write_bytes(lzma.decompress((RELEASED / f"{name}.ckpt.xz").read_bytes()))
+    return str(file), torch.tensor(ASSIGNMENTS[name])[None]
+
+
+def test_every_way_of_loading_gives_the_same_assignment(saved: tuple[str, Tensor], tmp_path: Path) -> None:
+    path, expected = saved
+    task = BlindPnPTask.load_from_checkpoint(path)
+    tested = BlindPnPTask.load_from_checkpoint(path)
+    for parameter in tested.parameters():
+        nn.init.zeros_(parameter)
+    file, run = str(checkpoint_path(path)), quiet_trainer(tmp_path, limit_test_batches=1)
+    run.test(tested, datamodule=small_meshes(tmp_path), ckpt_path=file, verbose=False, weights_only=True)
+    for solver in (
+        task.solver,
+        tested.solver,
+        TrainedNet.from_checkpoint(path),
+        BlindPnPTask(weights=path).solver,
+        BlindPnPTask(TrainedNet.from_checkpoint(path), weights=path).solver,
+    ):
+        torch.testing.assert_close(assignment(solver), expected, rtol=0, atol=1e-6)
+
+
+def test_the_task_of_a_checkpoint_has_its_solver_and_its_options(tmp_path: Path) -> None:
+    """The widths are those of the default network of this size; everything else is not."""
+    net = small_net(centre=True, scale=4.0, normalise=True, threshold=0.004, rounds=2, transport=Sinkhorn(mu=0.2))
+    task = BlindPnPTask(net, learning_rate=3e-4, warmup_steps=7, loss=Squares(3.0))
+    file = save(task, tmp_path / "task.ckpt")
+    assert "hyper_parameters" not in torch.load(file, weights_only=True)
+    again = BlindPnPTask.load_from_checkpoint(file, parts=[Squares], warmup_steps=5)
+    torch.testing.assert_close(assignment(again.solver), assignment(net), rtol=0, atol=1e-6)
+    assert (again.solver.features2d.scale, again.solver.rounds, again.solver.ransac.threshold) == (4.0, 2, 0.004)
+    assert (again.hparams.learning_rate, again.learning_rate, again.warmup_steps) == (3e-4, 3e-4, 5)
+    assert again.loss.power == 3.0
+    with pytest.raises(ValueError, match=r"task.ckpt: .*Squares"):
+        BlindPnPTask.load_from_checkpoint(file)
+
+
+def test_hyperparameters_are_plain_data(tmp_path: Path) -> None:
+    net = BPnPNet(Flat(2), Flat(3), ransac=RansacPnP(threshold=0.02))
+    hparams = dict(BlindPnPTask(net, learning_rate=2e-4).hparams)
+    assert json.loads(json.dumps(hparams)) == hparams
+    assert hparams["learning_rate"] == 2e-4
+    assert hparams["solver"]["settings"]["ransac"]["settings"]["threshold"] == 0.02
+
+
+def test_parts_and_networks_of_a_user_come_back(tmp_path: Path) -> None:
+    for net, parts in ((BPnPNet(Flat(2), Flat(3)), [Flat]), (Scaled(2.0), [])):
+        file = save(BlindPnPTask(net), tmp_path / "own.ckpt")
+        task = BlindPnPTask.load_from_checkpoint(file, parts=parts)
+        assert type(task.solver) is type(net)
+        assert type(TrainedNet.from_checkpoint(file, parts=parts)) is type(net)
+        torch.testing.assert_close(assignment(task.solver), assignment(net), rtol=0, atol=0)
+    save(BlindPnPTask(BPnPNet(Flat(2), Flat(3))), file)
+    with pytest.raises(ValueError, match=r"own.ckpt: .*test_checkpoint_networks.Flat"):
+        BlindPnPTask.load_from_checkpoint(file)
+
+
+@pytest.mark.parametrize(
+    ("changed", "told"),
+    [
+        ({"centre": False}, r"features2d.centre=False \(saved: True\), features3d.centre=False \(saved: True\)"),
+        ({"scale": 1.0}, r"features2d.scale=1.0 \(saved: 4.0\)"),
+        ({"channels": 8}, r"features2d.channels=8 \(saved: 16\)"),
+        ({"transport": Sinkhorn(mu=0.3)}, r"transport.mu=0.3 \(saved: 0.1\)"),
+    ],
+)
+@pytest.mark.parametrize("how", ["ckpt_path", "weights", "load_from_checkpoint"])
+def test_a_network_that_cannot_be_meant_is_refused(how: str, changed: Any, told: str, tmp_path: Path) -> None:
+    own: dict[str, Any] = {"centre": True, "scale": 4.0}
+    file = save(BlindPnPTask(small_net(**own)), tmp_path / "own.ckpt")
+    other = small_net(**own | changed)
+    with pytest.raises(ValueError, match=told):
+        if how == "weights":
+            BlindPnPTask(other, weights=str(file))
+        elif how == "load_from_checkpoint":
+            BlindPnPTask.load_from_checkpoint(file, solver=other)
+        else:
+            quiet_trainer(tmp_path).test(BlindPnPTask(other), datamodule=small_meshes(tmp_path), ckpt_path=str(file))
+
+
+def test_settings_that_an_evaluation_may_change_are_printed(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    file, caplog.handler.level = save(BlindPnPTask(small_net(rounds=2)), tmp_path / "own.ckpt"), 0
+    with caplog.at_level("INFO", logger="lightning.pytorch.utilities.rank_zero"):
+        task = BlindPnPTask.load_from_checkpoint(file, solver=small_net(rounds=0, threshold=0.02))
+    assert task.solver.rounds == 0
+    assert "ransac.threshold=0.02 (saved: 0.01), rounds=0 (saved: 2)" in caplog.text
+
+
+def test_the_names_in_a_checkpoint_stay(tmp_path: Path) -> None:
+    """Renaming any of these makes files of users unreadable."""
+    trainer = quiet_trainer(tmp_path, max_epochs=1, limit_train_batches=1, limit_val_batches=0)
+    trainer.callbacks.append(PoseLossWarmup(start_epoch=0))
+    trainer.fit(BlindPnPTask(BPnPNet(rounds=1)), datamodule=small_meshes(tmp_path))
+    trainer.save_checkpoint(tmp_path / "run.ckpt")
+    content = torch.load(tmp_path / "run.ckpt", weights_only=True)
+    assert {"state_dict", "solver", "task", "skipped_steps"} <= content.keys()
+    assert "PoseLossWarmup" in content["callbacks"]
+    assert content["task"].keys() == {
+        "learning_rate", "weight_decay", "warmup_steps", "decay_start", "decay_steps", "pose_weight", "matching_loss",
+        "correspondence_angle", "loss", "refine_validation",
+    }  # fmt: skip
+    solver = content["solver"]
+    assert solver["class"] == "BPnPNet"
+    kept = {name: (part["class"], set(part["settings"])) for name, part in solver["settings"].items() if name != "rounds"}
+    features = {"channels", "depth", "centre"}
+    assert kept == {
+        "features2d": ("ImageFeatures", features | {"scale"}),
+        "features3d": ("SceneFeatures", features | {"normalise"}),
+        "transport": ("Sinkhorn", {"mu", "learn_mu", "dustbin", "tolerance", "max_iterations"}),
+        "ransac": ("RansacPnP", {"backend", "matches_factor", "threshold", "max_iterations", "seed"}),
+        "pnp": ("WeightedPnP", {"tolerance", "max_iterations"}),
+        "refinement": ("Refinement", {"hypotheses", "enabled"}),
+    }
+    assert read_checkpoint(tmp_path / "run.ckpt")["solver"] == solver
+    names = {re_numbered(key) for key in content["state_dict"]}
+    assert {key for key in names if not key.startswith("solver.features")} == set()
+    assert {key for key in names if "align" not in key} == {
+        f"solver.features{side}d.{name}.{kind}"
+        for side in (2, 3)
+        for name in ("enter", *(f"blocks.N.linear_{letter}" for letter in "abc"))
+        for kind in ("weight", "bias")
+    }
+
+
+def re_numbered(key: str) -> str:
+    return ".".join("N" if part.isdigit() else part for part in key.split("."))
+
+
+def test_a_checkpoint_of_another_network_is_named(tmp_path: Path) -> None:
+    batch = padded([plant(1, 10, seed=10, dtype=torch.float32)])
+    file = save(BlindPnPTask(Matcher(channels=16, depth=1, heads=2)), tmp_path / "matcher.ckpt")
+    with pytest.raises(ValueError, match="expected a checkpoint of BPnPNet, got one of Matcher"):
+        BlindPnPTask(small_net(), weights=str(file))
+    assert BlindPnPTask.load_from_checkpoint(file)(batch).poses
