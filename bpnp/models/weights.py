@@ -171,21 +171,23 @@ def fitting_state(
         raise ValueError(
             f"expected a checkpoint of {wanted['class']}, got one of {saved.get('class', 'another program')}"
         )
-    if grown:
-        state |= {key: value for key, value in weights.items() if key not in state and not value.any()}
-    adjusted, wrong = [], []
+    added = {key: value for key, value in weights.items() if grown and key not in state and not value.any()}
+    misfits = [
+        key for key in state.keys() | weights.keys() if _shape((state | added).get(key)) != _shape(weights.get(key))
+    ]
+    adjusted: list[str] = []
+    wrong: list[str] = []
     for place, ours, theirs in differences(wanted, _with_defaults(saved, solver)):
         changed = adjusted if ADJUSTABLE & set(place.split(".")) else wrong
         changed.append(f"{place}={_shown(ours)} (saved: {_shown(theirs)})")
-    if wrong and not (grown and state.keys() > solver_state(content).keys()):
+    if wrong and (misfits or not added):
         raise ValueError(
             f"the checkpoint is of another {wanted['class']}: {', '.join(wrong)}. Leave these settings out, or give "
             "the saved ones"
         )
-    misfits = [key for key in state.keys() | weights.keys() if _shape(state.get(key)) != _shape(weights.get(key))]
     if misfits:
         raise ValueError(f"the checkpoint has no fitting {sorted(misfits)[0]} for this {wanted['class']}")
-    return state, [*adjusted, *wrong]
+    return state | added, [*adjusted, *wrong]
 
 
 def _with_defaults(description: Mapping[str, Any], solver: nn.Module) -> Mapping[str, Any]:

@@ -147,7 +147,7 @@ class BlindPnPTask(LightningModule):
         map_location: Any = "cpu",
         hparams_file: None = None,
         strict: bool | None = None,
-        weights_only: Literal[True] | None = None,
+        weights_only: bool | None = None,
         *,
         parts: Iterable[type[nn.Module]] = (),
         **kwargs: Any,

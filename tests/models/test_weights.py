@@ -102,7 +102,9 @@ def test_every_part_of_the_package_is_described_by_its_arguments() -> None:
 
 def test_a_checkpoint_of_another_shape_is_refused_with_what_differs() -> None:
     saved, own = small_net(8, 1, normalise=True), small_net(16, 2)
-    told = r"features2d.channels=16 \(saved: 8\), .*features3d.normalise=False \(saved: True\). Leave these settings out"
+    told = (
+        r"features2d.channels=16 \(saved: 8\), .*features3d.normalise=False \(saved: True\). Leave these settings out"
+    )
     with pytest.raises(ValueError, match=told):
         fitting_state(content(saved), own)
     # The shapes agree; the assignment would be another one.
