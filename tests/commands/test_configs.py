@@ -40,8 +40,10 @@ def test_every_recipe_trains_and_tests(recipe: str, tmp_path: Path, monkeypatch:
     arguments = [f"--config={recipe}", *data_for(recipe, tmp_path), f"--trainer.default_root_dir={tmp_path}"]
     matcher = "bpnp.models.Matcher" in (CONFIGS / f"{recipe}.yaml").read_text()
     arguments += ["--model.solver.channels=16", "--model.solver.depth=2"] if matcher else SMALL_NET[1:]
+    arguments += ["--model.weights=null"] if "weights:" in (CONFIGS / f"{recipe}.yaml").read_text() else []
     main(["fit", *arguments, "--trainer.fast_dev_run=true"])
-    main(["test", *arguments, "--trainer.fast_dev_run=true"])
+    tested = ["--data.test_fraction=1"] if "finetune" in recipe else []  # on the scenes that it was tuned to
+    main(["test", *arguments, *tested, "--trainer.fast_dev_run=true"])
 
 
 class Coordinates(nn.Module):
