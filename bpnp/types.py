@@ -82,6 +82,7 @@ class Prediction(Tensors):
     assignment: what the solver's own transport gave. rematched: that of the last round, of a solver that matches again
         under its pose in evaluation.
     unmatched2d, unmatched3d: the probability that a point has no partner, of an assignment with bins for them.
+    seconds: by the name of a pose, the time from the start of the batch until it was found; empty if not measured.
     """
 
     assignment: Float[Tensor, "b m n"] | None = None
@@ -90,6 +91,7 @@ class Prediction(Tensors):
     unmatched2d: Float[Tensor, "b m"] | None = None
     unmatched3d: Float[Tensor, "b n"] | None = None
     rematched: Float[Tensor, "b m n"] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy

@@ -18,7 +18,7 @@ from bpnp.layers.assignment import Sinkhorn
 from bpnp.layers.implicit import first_derivative
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import Backend, RansacPnP
-from bpnp.models.evaluation import Refinement, match_again, pnp_pose, ransac_pose, round_widths
+from bpnp.models.evaluation import Clock, Refinement, match_again, pnp_pose, ransac_pose, round_widths
 from bpnp.models.nets import ImageFeatures, SceneFeatures
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.precision import full_precision
@@ -93,16 +93,19 @@ class BPnPNet(TrainedNet):
         self.widths = round_widths(rounds, self.ransac)
 
     def forward(self, batch: Batch) -> Prediction:
-        """The assignment and the poses "ransac" and "pnp"; in evaluation after its rounds, and with "refined"."""
+        """Return the assignment, "ransac" and "pnp"; in evaluation, "pnp" after the rounds, and "refined"."""
+        clock = Clock()
         cost = self.cost(batch)
         assignment, stats = self.transport(cost, batch.mask2d, batch.mask3d)
         ransac = ransac_pose(self.ransac, assignment, batch)
+        clock.record("ransac")
         pnp = pnp_pose(self.pnp, assignment, batch, ransac)
         prediction = Prediction(assignment, stats, {"ransac": ransac, "pnp": pnp})
         if self.training:
             return prediction
         again = match_again(prediction, cost, batch, transport=self.transport, pnp=self.pnp, widths=self.widths)
-        return self.refinement(again, batch)
+        clock.record("pnp")
+        return clock.timed(self.refinement(again, batch))
 
     def match(self, batch: Batch) -> Prediction:
         """The assignment alone: what a training without the pose loss needs."""

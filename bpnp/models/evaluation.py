@@ -6,6 +6,7 @@ constant.
 """
 
 import math
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -25,6 +26,23 @@ from bpnp.search.search import refine_poses, search_poses
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.verdict import SearchResult
 from bpnp.types import Batch, Pose, Prediction, SolveStats
+
+
+class Clock:
+    """Stopwatch of the estimates of a batch, from its construction on."""
+
+    def __init__(self) -> None:
+        self.start, self.seconds = time.perf_counter(), dict[str, float]()
+
+    def record(self, estimate: str) -> None:
+        """Note that a pose is found."""
+        self.seconds[estimate] = time.perf_counter() - self.start
+
+    def timed(self, prediction: Prediction) -> Prediction:
+        """Return the prediction with its seconds; a pose that was not recorded is found now."""
+        for estimate in prediction.poses.keys() - self.seconds.keys():
+            self.record(estimate)
+        return replace(prediction, seconds={name: self.seconds[name] for name in prediction.poses})
 
 
 class Search(nn.Module):

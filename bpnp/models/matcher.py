@@ -13,7 +13,7 @@ from bpnp.layers.implicit import BackwardStats
 from bpnp.layers.pnp import WeightedPnP
 from bpnp.layers.ransac import RansacPnP
 from bpnp.models.bpnpnet import pairwise_distance
-from bpnp.models.evaluation import Refinement, pnp_pose, ransac_pose
+from bpnp.models.evaluation import Clock, Refinement, pnp_pose, ransac_pose
 from bpnp.models.nets import ExchangeBlock, Neighbourhood, centred
 from bpnp.models.weights import AnyModule, TrainedNet, chosen
 from bpnp.types import Batch, Prediction, SolveStats
@@ -91,13 +91,16 @@ class Matcher(TrainedNet):
         self.refinement = Refinement() if refinement is None else refinement
 
     def forward(self, batch: Batch) -> Prediction:
-        """The assignment, its bins and the poses "ransac" and "pnp"; in evaluation "refined" too."""
+        """Return the assignment, its bins and the poses "ransac" and "pnp"; in evaluation "refined" too."""
+        clock = Clock()
         prediction = self.match(batch)
         assert prediction.assignment is not None
         ransac = ransac_pose(self.ransac, prediction.assignment, batch)
+        clock.record("ransac")
         pnp = pnp_pose(self.pnp, prediction.assignment, batch, ransac)
+        clock.record("pnp")
         prediction = replace(prediction, poses={"ransac": ransac, "pnp": pnp})
-        return prediction if self.training else self.refinement(prediction, batch)
+        return prediction if self.training else clock.timed(self.refinement(prediction, batch))
 
     def match(self, batch: Batch) -> Prediction:
         """The assignment and its bins, without poses."""

@@ -41,7 +41,7 @@ class ProblemRow:
 
     index, id: the problem in its data set. Errors: see `bpnp.metrics`. inliers: see `count_inliers`. m, n: 2D and 3D
     points. matches: 3D points with a known match. iterations, residual, converged: the solver's `SolveStats`. found:
-    whether there is a pose. seconds: share of the time that the problem's batch took.
+    whether there is a pose. seconds: share of the time until the estimates of the problem's batch were found.
     """
 
     index: int
@@ -120,13 +120,19 @@ class Results:
 
 
 def rows_from(prediction: Prediction, batch: Batch, seconds: float) -> list[ProblemRow]:
-    """One row per problem and estimate. `seconds` is the time of the whole batch; each problem has an equal share.
+    """Return one row per problem and estimate.
 
-    Raises ValueError if the batch has no true pose.
+    Args:
+        prediction: of the batch. Where it has the seconds until an estimate was found, these count.
+        batch: problems with their true poses.
+        seconds: time of the whole batch. Each problem has an equal share.
+
+    Raises:
+        ValueError: The batch has no true pose.
     """
     matches = torch.zeros_like(batch.index) if batch.match3d is None else (batch.match3d >= 0).sum(-1)
     sizes = torch.stack([batch.count2d, batch.count3d, matches], -1).tolist()
-    indices, share = batch.index.tolist(), seconds / len(batch)
+    indices = batch.index.tolist()
     rows = []
     for estimate, pose in prediction.poses.items():
         known, stats = pose_errors(pose, batch), pose.stats
@@ -134,6 +140,7 @@ def rows_from(prediction: Prediction, batch: Batch, seconds: float) -> list[Prob
         errors, inliers = torch.stack(columns, -1).tolist(), count_inliers(pose, batch)
         told = (stats.iterations, stats.residual.double(), stats.converged, pose.found)
         states = zip(*(values.tolist() for values in told), strict=True)
+        share = prediction.seconds.get(estimate, seconds) / len(batch)
         for i, state in enumerate(states):
             values: Any = (indices[i], batch.ids[i], estimate, *errors[i], inliers[i], *sizes[i], *state, share)
             rows.append(ProblemRow(*values))

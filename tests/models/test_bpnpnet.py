@@ -8,6 +8,7 @@ from bpnp import Batch, BPnPNet
 from bpnp.layers import sinkhorn
 from bpnp.models import Refinement
 from bpnp.models.nets import PointFeatures
+from bpnp.report.results import rows_from
 from bpnp.search.settings import DEFAULT
 from bpnp.training.losses import correspondence_loss, pose_loss
 
@@ -147,3 +148,15 @@ def test_autocast_reaches_the_nets_and_not_the_layers() -> None:
     expected, _ = sinkhorn(cost.float())
     assert torch.equal(prediction.assignment, expected)
     assert (prediction.assignment.double().sum(-1) - 1 / 30).abs().sum(-1).max() < 2e-6
+
+
+def test_each_estimate_has_the_seconds_until_it_was_found() -> None:
+    """They rise in the order of the pipeline, a test records them, and training does not measure."""
+    net, batch = small_net().eval(), plant(2, 20, dtype=torch.float32).batch()
+    with torch.no_grad():
+        prediction = net(batch)
+    seconds = [prediction.seconds[name] for name in ("ransac", "pnp", "refined")]
+    assert 0 < seconds[0] < seconds[1] < seconds[2]
+    rows = rows_from(prediction, batch, 100.0)
+    assert [row.seconds for row in rows[::2]] == [value / 2 for value in seconds]
+    assert net.train()(batch).seconds == {}

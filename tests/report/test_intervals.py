@@ -1,0 +1,50 @@
+"""Bootstrap intervals against scipy's bootstrap, laws of chance, and pairs whose difference is known."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from bpnp.report.intervals import bootstrap, paired_difference, quantile, share
+
+
+def test_the_interval_of_a_median_is_scipys() -> None:
+    values = np.random.default_rng(1).gamma(2.0, 3.0, 200)
+    expected = stats.bootstrap((values,), np.median, method="percentile", n_resamples=2000, rng=2).confidence_interval
+    found = bootstrap(values)
+    assert found.value == np.median(values)
+    assert (found.low, found.high) == pytest.approx((expected.low, expected.high), abs=0.15)
+
+
+def test_nineteen_of_twenty_intervals_hold_the_true_share() -> None:
+    rng = np.random.default_rng(0)
+    held = 0
+    for seed in range(200):
+        found = bootstrap((rng.random(100) < 0.7).astype(float), share, seed=seed)
+        held += found.low <= 0.7 <= found.high
+    assert 180 <= held <= 199
+
+
+def test_pairs_show_a_difference_that_two_separate_intervals_hide() -> None:
+    rng = np.random.default_rng(0)
+    first = rng.gamma(2.0, 5.0, 300)
+    second = first + 0.3 + 0.01 * rng.normal(size=300)
+    apart = paired_difference(first, second)
+    assert 0 < apart.low < 0.3 < apart.high < 0.4
+    one, other = bootstrap(first), bootstrap(second)
+    assert one.high > other.low
+    same = paired_difference(first, first)
+    assert (same.value, same.low, same.high) == (0, 0, 0)
+
+
+def test_problems_without_a_pose_are_infinite_and_leave_the_rest_alone() -> None:
+    values = np.array([1.0, 2, 3, np.inf, np.inf])
+    assert bootstrap(values).value == 3
+    assert bootstrap(values).high == np.inf
+    assert bootstrap(values, quantile(0.25)).value == 2
+
+
+def test_numbers_that_are_not_there_are_an_error() -> None:
+    with pytest.raises(ValueError, match="got 2 of which 1 are NaN"):
+        bootstrap(np.array([1.0, np.nan]))
+    with pytest.raises(ValueError, match="the same problems, got 2 and 3"):
+        paired_difference(np.ones(2), np.ones(3))
