@@ -154,6 +154,8 @@ OPTIONS = {
     "--model.loss CLASS": "class path of a loss in place of --model.matching_loss",
     "--model.matching_loss KIND": "correspondence (the paper's) or likelihood",
     "--model.learning_rate X": "of Adam",
+    "--optimizer CLASS": "torch.optim.AdamW, SGD, ..., with --optimizer.lr; also --lr_scheduler",
+    "--pose_loss.start_epoch N": "first epoch with the pose loss; --pose_loss.weight X",
     "--trainer.default_root_dir FOLDER": "folder of the run: checkpoints, logs, results",
     "--trainer.max_epochs N": "epochs",
     "--trainer.max_time DD:HH:MM:SS": "time limit",

@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from jsonargparse import Namespace
 from lightning import LightningDataModule, LightningModule, Trainer
 from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
@@ -20,8 +21,19 @@ import bpnp.datamodules
 from bpnp.commands.parser import OneLineParser, plain
 from bpnp.files import claimed, config_content
 from bpnp.report.terminal import say
-from bpnp.training.callbacks import InterruptedCheckpoint, ResultsWriter, SafeCheckpointIO, interruptible
+from bpnp.training.callbacks import (
+    InterruptedCheckpoint,
+    PoseLossWarmup,
+    ResultsWriter,
+    SafeCheckpointIO,
+    interruptible,
+)
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError
+
+POSE_LOSS: dict[str, tuple[type, str]] = {
+    "start_epoch": (int, "first epoch with the pose loss, counted from 0; none for no switch"),
+    "weight": (float, "gamma_p of the paper after the switch; none for that of the model, or 1"),
+}
 
 
 class _Parser(OneLineParser, LightningArgumentParser):
@@ -54,6 +66,8 @@ class BpnpCLI(LightningCLI):
         parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
         parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
         parser.add_lightning_class_args(ResultsWriter, "results")
+        for name, (kind, meaning) in POSE_LOSS.items():
+            parser.add_argument(f"--pose_loss.{name}", type=kind | None, default=None, help=meaning)
         parser.set_defaults(
             {
                 "trainer.default_root_dir": "runs/default",
@@ -66,6 +80,31 @@ class BpnpCLI(LightningCLI):
         )
         for name in ("best_checkpoint", "last_checkpoint"):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
+
+    def before_instantiate_classes(self) -> None:
+        """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
+
+        Raises:
+            ValueError: a weight is set without an epoch.
+        """
+        given = {name: value for name, value in vars(self._get(self.config, "pose_loss")).items() if value is not None}
+        if not given:
+            return
+        trainer = self._get(self.config, "trainer")
+        listed = trainer.callbacks or []
+        trainer.callbacks = list(listed) if isinstance(listed, list) else [listed]
+        for callback in trainer.callbacks:
+            if callback.class_path.rpartition(".")[2] == PoseLossWarmup.__name__:
+                callback.init_args.update(Namespace(**given))
+                return
+        if "start_epoch" not in given:
+            raise ValueError(
+                "--pose_loss.weight needs --pose_loss.start_epoch, the first epoch with the pose loss. "
+                "Use --model.pose_weight for a pose loss in all epochs."
+            )
+        path = f"{PoseLossWarmup.__module__}.{PoseLossWarmup.__name__}"
+        settings = Namespace(start_epoch=given["start_epoch"], weight=given.get("weight"))
+        trainer.callbacks.append(Namespace(class_path=path, init_args=settings))
 
     @staticmethod
     def configure_optimizers(

@@ -29,7 +29,7 @@ from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
 from bpnp.report.terminal import console
-from bpnp.training.task import number_globally
+from bpnp.training.task import BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, mapped
 
 COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
@@ -37,25 +37,58 @@ RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPT
 
 
 class PoseLossWarmup(Callback):
-    """From the correspondence loss alone to L_c + weight * L_p (paper section 3.5).
+    """Switch from L_c alone to L_c + weight * L_p at an epoch (paper section 3.5).
 
-    Before `start_epoch` no pose is solved in training. Once switched, a resumed run stays switched.
+    No pose is solved in training before the switch. A run resumed after the switch stays switched.
 
     Args:
-        start_epoch: first epoch with the pose loss; the paper has 120.
-        weight: gamma_p of Eq. 15.
+        start_epoch: first epoch with the pose loss, counted from 0; 120 in the paper.
+        weight: gamma_p of Eq. 15; None for the task's `pose_weight`, or 1 if that is 0.
     """
 
-    def __init__(self, start_epoch: int = 120, weight: float = 1.0) -> None:
-        check_within(0, math.inf, start_epoch=start_epoch, weight=weight)
+    def __init__(self, start_epoch: int = 120, weight: float | None = None) -> None:
+        check_within(0, math.inf, start_epoch=start_epoch)
+        if weight is not None:
+            check_within(0, math.inf, weight=weight)
         self.start_epoch, self.weight = start_epoch, weight
         self.switched_at: int | None = None
+        self.configured = 0.0  # `pose_weight` of the task
+
+    def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Take the weight of the task.
+
+        Raises:
+            ValueError: the task has another weight, or no pose for the loss.
+        """
+        configured = getattr(pl_module, "pose_weight", None)
+        if not isinstance(configured, float | int):
+            raise ValueError(f"PoseLossWarmup sets `pose_weight`, which {type(pl_module).__name__} does not have.")
+        self.configured = float(configured)
+        if self.weight is not None and self.configured not in (0.0, self.weight):
+            raise ValueError(
+                f"model.pose_weight is {self.configured:g} and the weight of PoseLossWarmup is {self.weight:g}. "
+                "Set one of them (--model.pose_weight or --pose_loss.weight)."
+            )
+        if isinstance(pl_module, BlindPnPTask) and (estimates := pl_module.estimates["test"]):
+            pl_module.check_pose_loss(estimates)
+        never = 0 <= (trainer.max_epochs or -1) <= self.start_epoch and not trainer.fast_dev_run  # type: ignore[attr-defined]
+        if self.switched_at is None and never:
+            rank_zero_warn(
+                f"The pose loss joins at epoch {self.start_epoch}, and the training ends after {trainer.max_epochs} "
+                "epochs without it."
+            )
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Set the weight of this epoch."""
+        weight = self.weight if self.weight is not None else self.configured or 1.0
         if self.switched_at is None and trainer.current_epoch >= self.start_epoch:
             self.switched_at = trainer.current_epoch
-            rank_zero_info(f"epoch {trainer.current_epoch}: the pose loss joins with weight {self.weight}")
-        pl_module.pose_weight = 0.0 if self.switched_at is None else self.weight  # type: ignore[assignment]
+            rank_zero_info(f"Epoch {trainer.current_epoch}: the pose loss joins with weight {weight:g}.")
+        pl_module.pose_weight = 0.0 if self.switched_at is None else weight  # type: ignore[assignment]
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Restore the weight of the task, for another `fit`."""
+        pl_module.pose_weight = self.configured  # type: ignore[assignment]
 
     def state_dict(self) -> dict[str, Any]:
         return {"switched_at": self.switched_at}

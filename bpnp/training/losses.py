@@ -20,22 +20,37 @@ SMALLEST = 1e-12  # probability; keeps the logarithm of a padded point finite
 
 @dataclass(frozen=True)
 class Losses:
-    """The terms of L = L_c + gamma_p L_p (paper Eq. 15) for each sample; zero, without a gradient, where there is none.
+    """Terms of L = L_c + gamma_p L_p (paper Eq. 15) of each sample; zero, without a gradient, where undefined.
 
-    matched, posed: the samples that have a matching loss, and a pose loss.
+    Args:
+        matching: L_c, or the matching loss in its place, (b,).
+        matched: samples that have a matching loss, (b,).
+        pose: terms of L_p by name, (b,) each; None without a pose loss.
+        posed: samples that have a pose loss, (b,).
+        pose_weight: gamma_p.
     """
 
     matching: Float[Tensor, " b"]
     matched: Bool[Tensor, " b"]
-    pose: Float[Tensor, " b"] | None = None
+    pose: dict[str, Float[Tensor, " b"]] | None = None
     posed: Bool[Tensor, " b"] | None = None
     pose_weight: float = 0.0
 
     @property
-    def total(self) -> Float[Tensor, " b"]:
-        """L, whose mean over the batch has the mean of L_c over the samples with one; NaN if no sample has."""
-        matching = self.matching * (len(self.matched) / self.matched.sum())
-        return matching if self.pose is None else matching + self.pose_weight * self.pose
+    def total(self) -> Float[Tensor, ""]:
+        """L of the batch: the mean of L_c over the samples that have one, and gamma_p times that of L_p.
+
+        NaN if no sample has a matching loss.
+        """
+        total = self.matching.sum() / self.matched.sum()
+        return total if self.pose is None else total + self.pose_weight * sum(self.pose_means().values())
+
+    def pose_means(self) -> dict[str, Float[Tensor, ""]]:
+        """Return the mean of each term of L_p over the samples that have one; zero if there are none."""
+        if self.pose is None or self.posed is None:
+            return {}
+        count = self.posed.sum().clamp_min(1)
+        return {name: values.sum() / count for name, values in self.pose.items()}
 
 
 def matching_losses(prediction: Prediction, batch: Batch, *, kind: MatchingLoss, angle: float | None) -> Losses:
@@ -80,13 +95,13 @@ def correspondence_losses(prediction: Prediction, batch: Batch, *, angle: float 
     return (prediction.assignment * (1.0 - 2.0 * true)).sum((-2, -1))
 
 
-def pose_losses(pose: Pose, batch: Batch) -> Float[Tensor, " b"]:
-    """L_p per sample (paper Eq. 12); zero, without a gradient, where the pose did not converge."""
+def pose_losses(pose: Pose, batch: Batch) -> dict[str, Float[Tensor, " b"]]:
+    """Return the terms of L_p as `pose_terms`, zero and without a gradient where the pose did not converge."""
     solved, truth = pose.stats.converged, _true_pose(batch)
-    # A pose that was not found is NaN; the truth in its place has a loss, and no gradient, that are masked out.
+    # A missing pose is NaN. The true pose in its place has a loss without a gradient, which is then masked.
     rotation = torch.where(solved[:, None, None], pose.rotation, truth[0])
     translation = torch.where(solved[:, None], pose.translation, truth[1])
-    return pose_loss(rotation, translation, *truth) * solved
+    return {name: values * solved for name, values in pose_terms(rotation, translation, *truth).items()}
 
 
 def _true_pose(batch: Batch) -> tuple[Tensor, Tensor]:
@@ -149,11 +164,19 @@ def within_angle(
     return chords(bearings(points2d), points3d, rotation, translation) <= 2 * math.sin(angle / 2)
 
 
-def pose_loss(
+def pose_terms(
     rotation: Float[Tensor, "b 3 3"],
     translation: Float[Tensor, "b 3"],
     rotation_gt: Float[Tensor, "b 3 3"],
     translation_gt: Float[Tensor, "b 3"],
-) -> Float[Tensor, " b"]:
-    """L_p = angle(R, R_gt) + ||t - t_gt|| (paper Eqs. 12 to 14), in radians and scene units."""
-    return rotation_angle(rotation_gt, rotation) + torch.linalg.vector_norm(translation - translation_gt, dim=-1)
+) -> dict[str, Float[Tensor, " b"]]:
+    """Return the two terms of the pose loss L_p = L_r + L_t (paper Eq. 12).
+
+    Returns:
+        "rotation", L_r = angle(R, R_gt) in radians (Eq. 13), and "translation", L_t = ||t - t_gt|| in scene units
+        (Eq. 14), (b,) each.
+    """
+    return {
+        "rotation": rotation_angle(rotation_gt, rotation),
+        "translation": torch.linalg.vector_norm(translation - translation_gt, dim=-1),
+    }

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast
 
 import torch
 from lightning import LightningModule
-from lightning.pytorch.utilities.rank_zero import rank_zero_info
+from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Adam, Optimizer
@@ -43,6 +43,8 @@ from bpnp.types import Batch, Prediction
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not kept under "task": the checkpoint has what they made
 DECAYED = 0.02  # of the learning rate, after its fall
+WIDEST_MATCH = 0.5  # radians; every point matches many others beyond it, and degrees are mistaken for radians
+POSED = "pnp"  # the estimate that has a derivative, for the pose loss
 MOST_SKIPPED = 20  # consecutive steps without a finite gradient that end the run
 
 
@@ -65,7 +67,7 @@ class BlindPnPTask(LightningModule):
         decay_start: step at which it begins to fall, by a half cosine to a fiftieth; none for never.
         decay_steps: steps of the fall.
         pose_weight: gamma_p of Eq. 15, for the pose "pnp". While it is 0 no pose is solved in training;
-            `PoseLossWarmup` raises it.
+            `PoseLossWarmup` sets it from an epoch on.
         matching_loss: what trains the assignment: correspondence for the paper's L_c (Eq. 11); likelihood for the
             negative log likelihood of each point's partner (`matching_likelihood_loss`).
         correspondence_angle: with L_c, supervise by the pose alone: points within this angle (radians) count as
@@ -121,10 +123,16 @@ class BlindPnPTask(LightningModule):
         self.warmup_steps, self.decay_start, self.decay_steps = warmup_steps, decay_start, decay_steps
         if matching_loss != "correspondence" and correspondence_angle is not None:
             raise ValueError(f"expected `correspondence_angle` with matching_loss correspondence, got {matching_loss}")
+        if correspondence_angle is not None and not 0 < correspondence_angle <= WIDEST_MATCH:
+            raise ValueError(
+                f"correspondence_angle is {correspondence_angle:g} radians ({math.degrees(correspondence_angle):.0f} "
+                f"deg). Use an angle in radians, above 0 and at most {WIDEST_MATCH}, such as 0.01."
+            )
         self.matching_loss, self.correspondence_angle = matching_loss, correspondence_angle
         self.skipped_steps = 0
         self.consecutive_skipped_steps = 0
         self.optimizer_names: list[str] | None = None  # classes of the optimizers of this run or of its checkpoint
+        self.resumed_pose_weight = 0.0  # `pose_weight` at the time of the checkpoint
         self.optimizer_settings: list[list[dict[str, Any]]] = []  # configured settings by optimizer and group
         self.refine_validation = refine_validation
         self.numbers: set[int] = set()  # of the problems of this epoch of evaluation
@@ -139,6 +147,8 @@ class BlindPnPTask(LightningModule):
         for stage, names in self.estimates.items():
             for name in names:
                 self.metrics[f"{stage}_{name}"] = MetricCollection([PoseQuartiles(), PoseRecall()])
+        if pose_weight > 0 and estimates:
+            self.check_pose_loss(estimates)
 
     @classmethod
     def load_from_checkpoint(  # type: ignore[override]
@@ -192,6 +202,15 @@ class BlindPnPTask(LightningModule):
     def forward(self, batch: Batch) -> Prediction:
         return self.solver(batch)
 
+    def on_train_epoch_start(self) -> None:
+        """Warn once if a resumed run has lost the pose loss of its checkpoint."""
+        if self.resumed_pose_weight > 0 and self.pose_weight == 0:
+            rank_zero_warn(
+                f"The checkpoint was trained with a pose loss of weight {self.resumed_pose_weight:g}, and this run "
+                f"continues without it. Set --pose_loss.start_epoch 0 --pose_loss.weight {self.resumed_pose_weight:g}."
+            )
+        self.resumed_pose_weight = 0.0
+
     def on_train_batch_start(self, batch: object, batch_idx: int) -> None:
         check_batch(batch)
 
@@ -202,7 +221,7 @@ class BlindPnPTask(LightningModule):
         with exact_products(self.device):
             losses = self.losses(prediction, batch)
             figures = self._figures(losses, prediction, batch)
-        loss = losses.total.mean()
+        loss = losses.total
         self._log_train(loss=loss, skipped_steps=float(self.skipped_steps), **figures)
         # A loss that is not finite makes every gradient NaN, in every process, and so leaves out the step.
         return loss * torch.where(loss.isfinite(), 1.0, torch.nan)
@@ -229,16 +248,25 @@ class BlindPnPTask(LightningModule):
     on_test_batch_start = on_predict_batch_start = on_validation_batch_start
 
     def losses(self, prediction: Prediction, batch: Batch) -> Losses:
-        """The matching loss and, with a weight, that of the pose; a sample whose pose did not converge has none."""
+        """Return the matching loss and, with a `pose_weight`, the pose loss of the samples whose pose converged."""
         if self.loss is not None:
             losses = own_losses(self.loss, prediction, batch)
         else:
             losses = matching_losses(prediction, batch, kind=self.matching_loss, angle=self.correspondence_angle)
         if self.pose_weight == 0:
             return losses
-        pose = prediction.poses["pnp"]
+        self.check_pose_loss(tuple(prediction.poses))
+        pose = prediction.poses[POSED]
         values = pose_losses(pose, batch)
         return replace(losses, pose=values, posed=pose.stats.converged, pose_weight=self.pose_weight)
+
+    def check_pose_loss(self, estimates: tuple[str, ...]) -> None:
+        """Raise ValueError if the pose of the pose loss is not among the estimates of the solver."""
+        if POSED not in estimates:
+            raise ValueError(
+                f"The pose loss needs the pose {POSED!r}, and {type(self.solver).__name__} returns "
+                f"{', '.join(map(repr, estimates)) or 'no pose'}. Set model.pose_weight to 0 and use no PoseLossWarmup."
+            )
 
     def on_train_epoch_end(self) -> None:
         """Log the fractions of samples without a solved gradient and of clipped columns of the derivative."""
@@ -354,12 +382,14 @@ class BlindPnPTask(LightningModule):
         }
         checkpoint["skipped_steps"] = [self.skipped_steps, self.consecutive_skipped_steps]
         checkpoint["optimizer_names"] = self.optimizer_names
+        checkpoint["pose_weight"] = self.pose_weight
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint |= upgrade(checkpoint)  # of a Trainer without SafeCheckpointIO
         self._adopt(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
+        self.resumed_pose_weight = checkpoint.get("pose_weight", 0.0)
 
     def _adopt(self, content: Mapping[str, Any], *, grown: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose."""
@@ -408,7 +438,9 @@ class BlindPnPTask(LightningModule):
             figures["left_out"] = 1 - losses.matched.float().mean()
         if losses.pose is not None and losses.posed is not None:
             figures["without_pose"] = 1 - losses.posed.float().mean()
-            figures["pose_loss"] = losses.pose.sum() / losses.posed.sum()
+            means = {name: value.detach() for name, value in losses.pose_means().items()}
+            figures |= {f"{name}_loss": value for name, value in means.items()}
+            figures["pose_loss"] = torch.stack(list(means.values())).sum()
         stats = prediction.assignment_stats
         if stats is not None:
             figures["sinkhorn_iterations"] = stats.iterations.float().mean()

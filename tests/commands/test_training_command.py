@@ -4,11 +4,11 @@ import os
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 import torch
-from lightning import LightningModule
+from lightning import Callback, LightningModule, Trainer
 from small_data import MESHES, SMALL_NET, small_meshes
 from torch import Tensor, nn
 
@@ -19,6 +19,7 @@ from bpnp.cli import main
 from bpnp.files import CONFIGS
 from bpnp.models.weights import TrainedNet
 from bpnp.solving.arguments import checked_prior, source_from
+from bpnp.training import PoseLossWarmup
 
 SHORT = ["--trainer.max_epochs=1", "--trainer.limit_train_batches=2", "--trainer.limit_val_batches=1"]
 seen: list[Any] = []
@@ -168,3 +169,48 @@ def test_ctrl_c_tells_how_to_go_on(monkeypatch: pytest.MonkeyPatch, capsys: pyte
             main([command])
         assert ended.value.code == 130
         assert capsys.readouterr().err == f"bpnp: {told}\n"
+
+
+class Watch(Callback):
+    """Record the pose weight of each training step, and how many switches the trainer has."""
+
+    weights: ClassVar[list[float]] = []
+    switches: ClassVar[list[int]] = []
+
+    def on_train_start(self, trainer: Trainer, pl_module: Any) -> None:
+        self.weights.clear()
+        self.switches[:] = [sum(isinstance(each, PoseLossWarmup) for each in trainer.callbacks)]
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, *_: Any) -> None:
+        self.weights.append(pl_module.pose_weight)
+
+
+EPOCHS = ["--trainer.max_epochs=3", "--trainer.limit_train_batches=1", "--trainer.limit_val_batches=0"]
+
+
+def test_the_switch_to_the_pose_loss_has_options_of_its_own(tmp_path: Path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        "trainer:\n  callbacks:\n  - class_path: test_training_command.Watch\n"
+        "  - class_path: bpnp.training.PoseLossWarmup\n    init_args:\n      start_epoch: 120\n"
+    )
+    alone = ["--trainer.callbacks=test_training_command.Watch"]
+    common = ["fit", *MESHES, *SMALL_NET, *EPOCHS, "--trainer.enable_progress_bar=false"]
+    for name, options, weights, switches in (
+        ("off", alone, [0, 0, 0], 0),
+        ("on", [*alone, "--pose_loss.start_epoch=1"], [0, 1, 1], 1),
+        ("weight", [*alone, "--pose_loss.start_epoch=2", "--pose_loss.weight=0.5"], [0, 0, 0.5], 1),
+        ("of the model", [*alone, "--pose_loss.start_epoch=1", "--model.pose_weight=0.25"], [0, 0.25, 0.25], 1),
+        ("merged", [f"--config={own}", "--pose_loss.start_epoch=1", "--pose_loss.weight=2"], [0, 2, 2], 1),
+    ):
+        main([*common, *options, *folders(tmp_path / name)])
+        assert (Watch.weights, Watch.switches) == (weights, [switches]), name
+    (saved,) = (tmp_path / "merged").rglob("config.yaml")
+    main(["fit", f"--config={saved}", *folders(tmp_path / "again")])
+    assert (Watch.weights, Watch.switches) == ([0, 2, 2], [1])
+
+
+def test_a_weight_without_an_epoch_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", *MESHES, *SMALL_NET, "--pose_loss.weight=0.5", *folders(tmp_path)])
+    assert "--pose_loss.weight needs --pose_loss.start_epoch" in capsys.readouterr().err

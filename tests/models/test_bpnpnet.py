@@ -10,7 +10,7 @@ from bpnp.models import Refinement
 from bpnp.models.nets import PointFeatures
 from bpnp.report.results import rows_from
 from bpnp.search.settings import DEFAULT
-from bpnp.training.losses import correspondence_loss, pose_loss
+from bpnp.training.losses import correspondence_loss, pose_terms
 
 
 def different_sizes(*sizes: int, dtype: torch.dtype = torch.float64) -> Batch:
@@ -84,7 +84,7 @@ def test_learns_one_pair_by_heart(overfitted: tuple[BPnPNet, Batch, list[float]]
     for pose in prediction.poses.values():
         assert pose.stats.converged.all()
     found = prediction.poses["ransac"]
-    assert pose_loss(found.rotation, found.translation, batch.rotation, batch.translation).max() < 0.1
+    assert sum(pose_terms(found.rotation, found.translation, batch.rotation, batch.translation).values()).max() < 0.1
 
 
 def first_layers(net: BPnPNet) -> list[Tensor]:
@@ -100,7 +100,7 @@ def test_the_pose_loss_reaches_the_first_layers(overfitted: tuple[BPnPNet, Batch
     def loss() -> Tensor:
         pose = net(batch).poses["pnp"]
         assert pose.stats.converged.all()
-        return pose_loss(pose.rotation, pose.translation, batch.rotation, batch.translation).mean()
+        return sum(pose_terms(pose.rotation, pose.translation, batch.rotation, batch.translation).values()).mean()
 
     before = loss()
     before.backward()
@@ -130,7 +130,7 @@ def test_a_set_of_three_points_spoils_no_neighbour(overfitted: tuple[BPnPNet, Ba
     assert pose.found.tolist() == [True, False]
     torch.testing.assert_close(pose.rotation[:1], alone.poses["pnp"].rotation, atol=1e-4, rtol=0)
     net.zero_grad()
-    losses = pose_loss(pose.rotation, pose.translation, both.rotation, both.translation)
+    losses = sum(pose_terms(pose.rotation, pose.translation, both.rotation, both.translation).values())
     total = torch.where(pose.stats.converged, losses, 0) + correspondence_loss(prediction.assignment, both.match3d)
     total.sum().backward()
     assert all(p.grad.isfinite().all() for p in net.parameters() if p.grad is not None)

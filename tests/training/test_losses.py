@@ -16,7 +16,7 @@ from bpnp.training.losses import (
     correspondence_losses,
     matching_likelihood_loss,
     matching_losses,
-    pose_loss,
+    pose_terms,
     within_angle,
 )
 from bpnp.training.task import BlindPnPTask
@@ -63,7 +63,7 @@ def test_correspondence_loss_from_the_pose_is_equation_9_by_a_loop(threshold: fl
 def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
     planted = plant(50, 4)
     rotation, translation = planted.near(0.7)
-    found = pose_loss(rotation, translation, *planted.pose)
+    found = sum(pose_terms(rotation, translation, *planted.pose).values())
     turn = Rotation.from_matrix(planted.rotation.numpy()).inv() * Rotation.from_matrix(rotation.numpy())
     distance = (translation - planted.translation).pow(2).sum(-1).sqrt()
     assert (found - torch.from_numpy(turn.magnitude()) - distance).abs().max() < 1e-12
@@ -73,7 +73,7 @@ def test_pose_loss_is_scipys_angle_and_the_distance() -> None:
 def test_gradients_are_finite_at_the_truth(dtype: torch.dtype) -> None:
     planted = plant(3, 6, dtype=dtype)
     rotation, translation = (x.clone().requires_grad_() for x in planted.pose)
-    loss = pose_loss(rotation, translation, *planted.pose)
+    loss = sum(pose_terms(rotation, translation, *planted.pose).values())
     assert loss.max() < 1e-2
     loss.sum().backward()
     assert all(x.grad is not None and x.grad.isfinite().all() for x in (rotation, translation))
@@ -155,3 +155,9 @@ def test_says_what_is_missing() -> None:
         )
     with pytest.raises(ValueError, match="with matching_loss correspondence, got likelihood"):
         BlindPnPTask(matching_loss="likelihood", correspondence_angle=0.1)
+
+
+@pytest.mark.parametrize("angle", [10.0, 1.0, 0.0, -0.1, math.nan])
+def test_an_angle_that_is_not_in_radians_is_refused(angle: float) -> None:
+    with pytest.raises(ValueError, match="correspondence_angle is .* radians .*above 0 and at most 0.5"):
+        BlindPnPTask(correspondence_angle=angle)

@@ -3,10 +3,12 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from lightning import Callback, Trainer
 from planted import padded, plant, posed
+from scipy.spatial.transform import Rotation
 from small_data import quiet_trainer, small_meshes, small_net
 from torch import nn
 from torch.utils.data import DataLoader
@@ -15,7 +17,7 @@ import bpnp.training.task
 from bpnp import Batch, Matcher, Prediction
 from bpnp.report import read_results
 from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter
-from bpnp.training.losses import correspondence_loss, pose_loss
+from bpnp.training.losses import correspondence_loss
 from bpnp.training.task import BlindPnPTask, TrainingDivergedError, number_globally
 
 
@@ -52,12 +54,37 @@ def fit(tmp_path: Path, task: BlindPnPTask, ckpt_path: str | None = None, **sett
 
 
 def test_no_pose_is_solved_in_training_before_the_switch(tmp_path: Path) -> None:
-    task = BlindPnPTask(CountingSolver(), learning_rate=1e-4)
-    callbacks = [PoseLossWarmup(start_epoch=1, weight=0.5)]
+    task, weights = BlindPnPTask(CountingSolver(), learning_rate=1e-4), []
+
+    class Weights(Callback):
+        def on_train_batch_end(self, trainer: Trainer, task: BlindPnPTask, *_: object) -> None:
+            weights.append(task.pose_weight)
+
+    callbacks = [PoseLossWarmup(start_epoch=1, weight=0.5), Weights()]
     fit(tmp_path, task, max_epochs=2, limit_train_batches=3, callbacks=callbacks)
     assert task.solver.wanted == [False] * 3 + [True] * 3
     assert callbacks[0].switched_at == 1
-    assert task.pose_weight == 0.5
+    assert weights == [0.0] * 3 + [0.5] * 3
+    assert task.pose_weight == 0.0  # as configured, for another fit
+
+
+def test_the_weight_of_the_task_is_that_after_the_switch_or_refused(tmp_path: Path) -> None:
+    task, warmup = BlindPnPTask(CountingSolver(), pose_weight=0.25), PoseLossWarmup(start_epoch=0)
+    run = fit(tmp_path, task, max_steps=1, callbacks=[warmup])
+    logged = {name.removeprefix("train/"): float(value) for name, value in run.callback_metrics.items()}
+    pose = logged["rotation_loss"] + logged["translation_loss"]
+    assert logged["loss"] == pytest.approx(logged["correspondence_loss"] + 0.25 * pose, rel=1e-5)
+    with pytest.raises(ValueError, match=r"model.pose_weight is 0.25 and the weight of PoseLossWarmup is 2\."):
+        fit(tmp_path, task, callbacks=[PoseLossWarmup(start_epoch=1, weight=2.0)])
+
+
+def test_a_pose_loss_that_never_joins_or_is_lost_on_resuming_brings_a_warning(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="joins at epoch 5, and the training ends after 1 epochs without it"):
+        fit(tmp_path, BlindPnPTask(CountingSolver()), limit_train_batches=1, callbacks=[PoseLossWarmup(start_epoch=5)])
+    run = fit(tmp_path, BlindPnPTask(CountingSolver(), pose_weight=0.5), limit_train_batches=1)
+    run.save_checkpoint(file := str(tmp_path / "posed.ckpt"))
+    with pytest.warns(UserWarning, match="trained with a pose loss of weight 0.5, and this run continues without it"):
+        fit(tmp_path, BlindPnPTask(CountingSolver()), file, max_epochs=2, limit_train_batches=1)
 
 
 def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None:
@@ -130,18 +157,43 @@ def test_many_such_steps_in_a_row_end_the_run(tmp_path: Path, monkeypatch: pytes
     assert len(task.solver.wanted) == 4
 
 
-def test_a_sample_without_a_pose_has_no_pose_loss(tmp_path: Path) -> None:
-    batch = padded([plant(1, points, dtype=torch.float32) for points in (20, 3)])
+def test_the_pose_loss_is_the_mean_over_the_samples_with_a_pose(tmp_path: Path) -> None:
+    """Half of the samples have three points, and no pose; the weight of the others stays gamma_p."""
+    batch = padded([plant(1, points, seed=points, dtype=torch.float32) for points in (20, 3, 21, 3)])
     task = BlindPnPTask(small_net(), pose_weight=2.0)
     prediction = task.solver(batch)
-    solved = prediction.poses["pnp"].stats.converged
-    assert not solved[1]
-    losses = task.losses(prediction, batch).total
-    expected = correspondence_loss(prediction.assignment, batch.match3d)
-    found = prediction.poses["pnp"]
-    full = pose_loss(found.rotation, found.translation, batch.rotation, batch.translation)
-    expected = torch.where(solved, expected + 2 * full, expected)
-    torch.testing.assert_close(losses, expected)
+    found, solved = prediction.poses["pnp"], prediction.poses["pnp"].stats.converged
+    assert solved.any()
+    assert not solved[[1, 3]].any()
+    angles = [
+        (Rotation.from_matrix(a.T) * Rotation.from_matrix(b)).magnitude()
+        for a, b in zip(found.rotation[solved].detach().numpy(), batch.rotation[solved].numpy(), strict=True)
+    ]
+    distances = (found.translation - batch.translation).norm(dim=-1)[solved]
+    expected = correspondence_loss(prediction.assignment, batch.match3d).mean()
+    expected = expected + 2 * (np.mean(angles) + distances.mean())
+    losses = task.losses(prediction, batch)
+    torch.testing.assert_close(losses.total, expected.float(), rtol=1e-4, atol=1e-5)
+    assert float(losses.pose_means()["rotation"]) == pytest.approx(np.mean(angles), rel=1e-4)
+    assert float(losses.pose_means()["translation"]) == pytest.approx(float(distances.mean()), rel=1e-5)
+
+
+def test_the_terms_of_the_pose_loss_are_logged(tmp_path: Path) -> None:
+    run = fit(tmp_path, BlindPnPTask(small_net(), pose_weight=0.5), limit_train_batches=1)
+    logged = {name: float(value) for name, value in run.callback_metrics.items()}
+    pose = logged["train/rotation_loss"] + logged["train/translation_loss"]
+    assert logged["train/pose_loss"] == pytest.approx(pose)
+    assert logged["train/loss"] == pytest.approx(logged["train/correspondence_loss"] + 0.5 * pose, rel=1e-5)
+
+
+def test_a_pose_loss_without_its_pose_is_refused(tmp_path: Path) -> None:
+    class Matching(CountingSolver):
+        estimates = ("ransac",)
+
+    with pytest.raises(ValueError, match="The pose loss needs the pose 'pnp', and Matching returns 'ransac'"):
+        BlindPnPTask(Matching(), pose_weight=1.0)
+    with pytest.raises(ValueError, match="The pose loss needs the pose 'pnp', and Matching returns 'ransac'"):
+        fit(tmp_path, BlindPnPTask(Matching()), max_steps=1, callbacks=[PoseLossWarmup(start_epoch=100)])
 
 
 def test_results_of_a_test_and_poses_of_a_prediction(tmp_path: Path) -> None:
