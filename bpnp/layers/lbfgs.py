@@ -34,12 +34,13 @@ def lbfgs(
     Returns:
         Rotation, translation and the iterations of each sample.
     """
-    steps = torch.zeros(len(q), 6, dtype=q.dtype, device=q.device)
-    iterations = torch.zeros(len(q), dtype=torch.long, device=q.device)
-    for i in range(len(q)):
-        steps[i], iterations[i] = _minimise(
-            q[i], points[i], rotation[i], translation[i], tolerance=tolerance, max_iterations=max_iterations
-        )
+    # A trainer's inference mode would forbid the optimiser's gradients, of its tensors too.
+    with torch.inference_mode(False):
+        problem = q.clone(), points.clone(), rotation.clone(), translation.clone()
+        steps = torch.zeros(len(q), 6, dtype=q.dtype, device=q.device)
+        iterations = torch.zeros(len(q), dtype=torch.long, device=q.device)
+        for i, sample in enumerate(zip(*problem, strict=True)):
+            steps[i], iterations[i] = _minimise(*sample, tolerance=tolerance, max_iterations=max_iterations)
     rotation, translation = retract(steps, rotation, translation)
     return rotation, translation, iterations
 

@@ -43,6 +43,15 @@ def test_lbfgs_gives_the_same_gradient_and_leaves_the_samples_of_a_batch_apart()
     assert torch.allclose(lbfgs[1:2], alone, rtol=1e-9, atol=1e-12)
 
 
+def test_lbfgs_runs_in_a_trainers_inference_mode() -> None:
+    planted = plant(2, 30)
+    problem = planted.diffuse(0.1), planted.bearings, planted.points3d, *planted.near(0.1)
+    with torch.inference_mode():
+        rotation, _, stats = weighted_pnp(*problem, solver="lbfgs", max_iterations=200)
+    assert stats.converged.all()
+    assert rotation_angle(rotation, weighted_pnp(*problem)[0]).max() < 1e-5
+
+
 def test_lbfgs_stops_after_its_iterations_and_reports_it() -> None:
     planted = plant(2, 20)
     problem = planted.diffuse(0.3), planted.bearings, planted.points3d, *planted.near(0.3)

@@ -1,0 +1,131 @@
+"""The benchmarks of the paper's tables: what was stopped goes on, figures are those of the rows, pages are filled."""
+
+from pathlib import Path
+
+import numpy as np
+import paper_tables
+import pytest
+import table1
+from paper_tables import Training, effect, figures, filled, network, printed_rows, row_text, solve_problems
+from report_data import row
+from small_data import SMALL_FEATURES
+from torch import Tensor, nn
+
+from bpnp import Batch, Pose, Prediction, SolveStats
+from bpnp.cli import main
+from bpnp.datamodules import MeshDataModule
+
+SHAPES = {"num_points": 20, "pool_size": 20, "train_shapes": 4, "val_shapes": 2, "test_shapes": 6, "train_problems": 4}
+
+
+def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(paper_tables.subprocess, "run", lambda command, check: main(command[3:]))
+    shapes = [f"--data.{name}={value}" for name, value in SHAPES.items()]
+    small = ("--config=quickstart", *shapes, *SMALL_FEATURES, "--data.batch_size=2", f"--data.cache_dir={tmp_path}")
+    first = Training(tmp_path / "first", small, steps=2, epoch=1)
+    assert paper_tables.trained_steps(first.checkpoint) == 0
+    assert paper_tables.trained_steps(first.run()) == 2
+    longer = Training(tmp_path / "first", small, steps=3, epoch=1)
+    assert paper_tables.trained_steps(longer.run()) == 3
+    branch = Training(tmp_path / "branch", small, steps=4, epoch=1, start=first.checkpoint)
+    assert paper_tables.trained_steps(branch.run()) == 4
+    monkeypatch.setattr(paper_tables.subprocess, "run", lambda *_, **__: pytest.fail("trained again"))
+    assert branch.run() == branch.checkpoint
+    net, ours = network(branch.checkpoint), network(branch.checkpoint, ours=True)
+    assert (net.ransac.backend, net.ransac.threshold, net.pnp.solver, net.widths) == ("opencv", 0.01, "lbfgs", [])
+    assert (net.estimates, ours.estimates) == (("ransac", "pnp"), ("ransac", "pnp", "refined"))
+    assert len(ours.widths) == 8
+
+
+class Known(nn.Module):
+    """The true pose; counts its calls, and stops after some."""
+
+    estimates = ("pnp",)
+
+    def __init__(self, calls: int) -> None:
+        super().__init__()
+        self.left = calls
+
+    def forward(self, batch: Batch) -> Prediction:
+        self.left -= 1
+        if self.left < 0:
+            raise KeyboardInterrupt
+        assert isinstance(batch.rotation, Tensor)
+        assert isinstance(batch.translation, Tensor)
+        pose = Pose(batch.rotation, batch.translation, SolveStats.of(batch.translation[:, 0] < 9))
+        return Prediction(poses={"pnp": pose})
+
+
+def test_a_test_that_was_stopped_measures_what_is_missing_and_another_solver_all(tmp_path: Path) -> None:
+    data, file = MeshDataModule(**SHAPES, cache_dir=str(tmp_path)), tmp_path / "rows" / "known.jsonl"
+    with pytest.raises(KeyboardInterrupt):
+        solve_problems(file, lambda: Known(2), data, 5, {"steps": 1})
+    rows = solve_problems(file, lambda: Known(3), data, 5, {"steps": 1})
+    assert len({r.index for r in rows}) == 5
+    assert max(r.rotation_error_deg for r in rows) < 0.1
+    assert solve_problems(file, lambda: pytest.fail("built again"), data, 4, {"steps": 1}) == [
+        r for r in rows if r.index in set(paper_tables.problem_order(6)[:4])
+    ]
+    with pytest.raises(KeyboardInterrupt):
+        solve_problems(file, lambda: Known(4), data, 5, {"steps": 2})
+
+
+def test_the_figures_are_those_of_the_rows() -> None:
+    angles = [1.0, 2.0, 3.0, 40.0]
+    rows = [
+        row(i, rotation_error_deg=angle, translation_error=0.1 * angle, seconds=2.0) for i, angle in enumerate(angles)
+    ]
+    found = figures(rows, (15.0, 0.25))
+    assert [quartile[0] for quartile in found["rotation"]] == [1.75, 2.5, 12.25]
+    assert found["recall"][0] == 0.5  # the third is turned little and shifted too far
+    assert (found["problems"], found["seconds"]) == (4, 2.0)
+    low, middle, high = found["rotation"][1]
+    assert high >= low >= middle >= 1.0 or (middle <= low <= high)
+    better = [row(i, rotation_error_deg=angle - 0.5, translation_error=0.05 * angle) for i, angle in enumerate(angles)]
+    paired = effect(rows, better, (15.0, 0.25))
+    assert paired["rotation"] == [-0.5, -0.5, -0.5]
+    assert paired["rotation better"] == 1.0
+    assert paired["recall"][0] == 0.25
+    assert row_text("Lc", found).startswith("| Lc | 4 | 1.8 / 2.5 [")
+
+
+def test_the_papers_rows_are_printed_as_in_the_paper() -> None:
+    rows = list(printed_rows("modelnet40"))
+    assert (
+        rows[4] == "| *paper: Lc Lp* |  | 4.88 / 9.66 / 16.0 | 0.04 / 0.08 / 0.15 | 0.36 / 0.61 / 1.03 | 72 | 0.1 |\n"
+    )
+    assert len(rows) == 7
+
+
+def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp_path: Path) -> None:
+    page = "a\n<!-- t: one -->\nold\n<!-- end of t -->\nb\n<!-- t: two -->\nkept\n<!-- end of t -->\n"
+    new = filled(page, "t", {"one": "new\n"})
+    assert new == page.replace("old", "new")
+    (tmp_path / "page.md").write_text(page)
+    with pytest.raises(SystemExit, match="tables of page.md are not those of the record"):
+        paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
+    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=False)
+    paper_tables.fill_pages([tmp_path / "page.md"], "t", {"one": "new\n"}, check=True)
+
+
+def test_a_record_becomes_the_tables_of_the_page() -> None:
+    rng = np.random.default_rng(0)
+    rows = [row(i, rotation_error_deg=float(rng.gamma(2, 5))) for i in range(10)]
+    one = figures(rows, table1.RECALL)
+    keys = ("paper|Lc|ransac", "paper|Lc|pnp", "paper, our inference|Lc|refined", "baselines|search|search")
+    record = {
+        "rows": {f"modelnet10|0|{key}": one for key in keys},
+        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.RECALL)},
+        "training": {"seed 0": {"Lc": 500, "Lc Lp": 500, "learning_rate": 1e-4, "switch": 400}},
+    }
+    tables = table1.tables(record)
+    lines = tables["modelnet10-paper"].splitlines()
+    assert [line.split(" | ")[0] for line in lines[2:]] == [
+        "| Lc", "| Lc R", "| *paper: Lc*", "| *paper: Lc Lp*", "| *paper: Lc R*", "| *paper: Lc Lp R*",
+    ]  # fmt: skip
+    assert "| Lc, refined |" in tables["modelnet10-paper-our-inference"]
+    assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
+    assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
+    assert "| Lc Lp minus Lc | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
