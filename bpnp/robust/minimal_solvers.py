@@ -88,6 +88,21 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
     True
     """
     rays, points = (values.detach().double().cpu().numpy().reshape(-1, 3, 3) for values in (bearings, points3d))
+    found = torch.from_numpy(p3p_poses(rays, points)).reshape(*points3d.shape[:-2], 4, 4, 3).to(points3d)
+    rotation, translation = found[..., :3, :], found[..., 3, :]
+    return P3P(rotation, translation, rotation[..., 0, 0].isfinite())
+
+
+def p3p_poses(rays: Array, points: Array) -> Array:
+    """Solve `p3p` for arrays.
+
+    Args:
+        rays: (t, 3, 3) rays of three matches, of any length.
+        points: (t, 3, 3) their scene points.
+
+    Returns:
+        (t, 4, 4, 3) up to four poses of each, R and t below it; NaN where there is none.
+    """
     poses = np.full((len(points), 4, 4, 3), np.nan)
 
     def solve(first: int, last: int) -> None:
@@ -99,9 +114,7 @@ def p3p(bearings: Float[Tensor, "*b 3 3"], points3d: Float[Tensor, "*b 3 3"]) ->
         _solve_each(unit, triangles, poses[first:last], np.empty((4, 4, 3)))
 
     in_threads(solve, len(poses))
-    found = torch.from_numpy(poses).reshape(*points3d.shape[:-2], 4, 4, 3).to(points3d)
-    rotation, translation = found[..., :3, :], found[..., 3, :]
-    return P3P(rotation, translation, rotation[..., 0, 0].isfinite())
+    return poses
 
 
 @compiled

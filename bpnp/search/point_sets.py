@@ -99,6 +99,8 @@ class PointSets:
     odds2d (m, c), classes3d (n, c): their scalar product is how much likelier a match is by its classes than a mean
     one; the labels are then those of points that are sure of theirs, for searching.
     floor: smallest scale of the residuals that is believed, radians; None for a share of the bearings' spread.
+    radius: largest residual of a match in an enumeration, radians; None for that of its settings. clutter: fraction of
+    the image points without a partner, if it is known.
     prior: what is known of the pose. log10_tried: of the number of poses that were tried; None for as many as triples
     of matches give. focal: what is known of the focal length with which the bearings were made; None if it is given.
     """
@@ -112,6 +114,8 @@ class PointSets:
     scores2d: Array | None = None
     scores3d: Array | None = None
     floor: float | None = None
+    radius: float | None = None
+    clutter: float | None = None
     prior: Prior | None = None
     log10_tried: float | None = None
     odds2d: Array | None = None

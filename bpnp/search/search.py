@@ -21,6 +21,7 @@ from bpnp.search.kernels.neighbours import hashed
 from bpnp.search.kernels.sides import FORWARD
 from bpnp.search.point_sets import PointSets
 from bpnp.search.pool import Pool
+from bpnp.search.propose.known_matches import known_matches, poses_of_matches
 from bpnp.search.raster_search import around_each, looked_up
 from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Proposals, only_proposed, turns
@@ -64,7 +65,8 @@ def search_poses(
     With fewer than 4 points of a side, or all bearings or all points on one line or in one place, there are no
     candidates. Raises ValueError for `clutter` out of range.
     """
-    settings = settings if clutter is None else settings.expecting(clutter)
+    if clutter is not None:
+        settings, sets = settings.expecting(clutter), replace(sets, clutter=clutter)
     start, enumerated = time.monotonic(), no_pose("no pose was found")
 
     def tell(batches: int) -> None:
@@ -76,6 +78,9 @@ def search_poses(
         return Scene(sets, seed, settings, deadline)
 
     many = exceeds_enumeration(sets)
+    matches = known_matches(sets)
+    if matches is not None and (sets.prior is None or not is_enumerable(sets)):
+        return _of_known_matches(sets, *matches, entered, seed, settings)
     if not many:
         settings = settings.limited(min(settings.schedule.turns, settings.schedule.enumerated))
     if is_enumerable(sets) and not deadline.passed():
@@ -83,6 +88,8 @@ def search_poses(
         rule = settings.evidence
         enumerated = judged(found, sets, batches=0, exhaustive=exhaustive, rule=rule)
         enumerated = against_rivals(enumerated, sets, entered, rule, exhaustive=exhaustive)
+        if matches is not None and enumerated.log10_false_alarms > 0:  # their residuals may exceed its radius
+            return _of_known_matches(sets, *matches, entered, seed, settings)
         tell(0)
         # More search helps only where no pose exceeds chance yet, and there are enough points to anneal.
         small = min(len(sets.bearings), len(sets.points3d)) < settings.least_annealed
@@ -97,6 +104,20 @@ def search_poses(
         return no_pose("no pose fits: too few points with a label of the other side, or all on one line")
     pool = Pool(scene, sets, enumerated)
     return _until_certain(pool, turns(pool, around, proposals if many else None), tell)
+
+
+def _of_known_matches(
+    sets: PointSets,
+    i: NDArray[np.int64],
+    j: NDArray[np.int64],
+    entered: Callable[[], Scene],
+    seed: int,
+    settings: SearchSettings,
+) -> SearchResult:
+    """Judge the poses that known matches, indices (k,) of image points and of scene points, fit best."""
+    found, rule = poses_of_matches(sets, i, j, seed), settings.evidence
+    result = judged(found, sets, batches=0, exhaustive=True, rule=rule)
+    return against_rivals(result, sets, entered, rule, exhaustive=True)
 
 
 def lacks_partners(scene: Scene) -> bool:
@@ -142,7 +163,8 @@ def search_proposed(
     """
     if degenerate(sets.bearings) or degenerate(sets.points3d):
         return no_pose("no pose fits: too few points, or all on one line")
-    settings = settings if clutter is None else settings.expecting(clutter)
+    if clutter is not None:
+        settings, sets = settings.expecting(clutter), replace(sets, clutter=clutter)
     pool = Pool(Scene(sets, seed, settings, deadline), sets, no_pose("no pose was proposed"))
     return _until_certain(pool, only_proposed(pool, proposals))
 

@@ -142,7 +142,7 @@ def judged(
         count = match_count(candidates, sets)
         linear = linearised(sets, candidates.rotation[0], candidates.translation[0], float(candidates.scale[0]))
         off = math.degrees(rotation_bound(sets, linear, count))
-        if off >= HALF_TURN or not is_redundant(sets, count):
+        if off >= HALF_TURN or not (rig or is_redundant(sets, count)):
             reason = f"{chance}, but its {count:.0f} matches do not fix the rotation"
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:

@@ -80,7 +80,8 @@ def solve(
         matched; -1 fits any. Or probabilities (m, c) and (n, c) of c classes, whose rows add up to 1, such as a
         network's: a match counts as much more as its classes agree better than those of a mean one.
     scores2d, scores3d: (m,) and (n,) probabilities, above 0 and up to 1, that a point has a partner, such as from the
-        strength of a keypoint, or the number of views that see a point; only their ratios matter much.
+        strength of a keypoint, or the number of views that see a point; only their ratios matter. The search and the
+        verdict weigh the points with them.
     solver: "search", which needs no training; "auto", the same, which asks a packaged matcher for poses to start from
         when it is in doubt: "matcher-maps" with a `PosePrior`, such as the pose of a map's view of the same place, and
         "matcher-sfm" without a prior, if 2D points times 3D points are at most four million; a module from `Batch` to
@@ -88,9 +89,9 @@ def solve(
         but those that a search finds from poses of triples of matches drawn from its assignment, and nowhere else.
     prior: a `PosePrior`, a `GravityPrior`, or a BPnPNet or Matcher (or its checkpoint) whose pose is tried first.
     inlier_threshold: largest reprojection error of a match, in pixels with a camera, else in units of the normalised
-        image (radians for bearings). By default three times the residuals' own scale.
-    clutter: share of the points that has no partner, if known: it is expected throughout, and a pose that matches most
-        of the other points is believed sooner.
+        image (radians for bearings). By default three times the scale of the residuals. Few points are also searched
+        within this radius, by default within 3 pixels. Labels that pair each point with one other need no radius.
+    clutter: fraction of the points that has no partner, if it is known. The search and the verdict expect it.
     at_infinity: `points3d` are unit directions, such as of stars: the rotation alone is found, and the translation is
         zero. Pixels of a fisheye may lie 90 degrees and more off its axis. Points with the largest `scores2d` are tried
         first. An `image_size` or `focal_error` is for an unknown focal length here too. See docs/stars.md.

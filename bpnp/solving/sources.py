@@ -95,8 +95,9 @@ def _by_searches(problems: Mapping[int, Problem], options: Options) -> Iterator[
 
 def _by_search(i: int, problem: Problem, options: Options) -> Solution:
     start, deadline = time.perf_counter(), options.deadline(problem)
+    radius = None if options.inlier_threshold is None else options.inlier_threshold / problem.per_radian
     result = search_poses(
-        problem.sets,
+        replace(problem.sets, radius=radius),
         around=pose_prior(problem.prior, problem, deadline) if isinstance(problem.prior, nn.Module) else None,
         clutter=options.clutter,
         proposals=proposals_for(problem, options.seed) if options.asks else None,

@@ -48,6 +48,7 @@ Labels = NDArray[np.int64]
 
 FIXING = 3  # matches that fix a pose; one more fixes a focal length too
 SHARES = np.array([0.15, 0.4, 0.75])  # w
+LEAST_SHARE, MOST_SHARE = 0.02, 0.98  # of w where clutter or scores are given
 OUTLINE = 0.5  # width of the smoothing of l, in spreads of the bearings: the outline is no evidence beyond it
 MOST_SMOOTHED = 256  # projected points from which l is estimated
 FARTHEST = math.sqrt(18.0)  # distance over s beyond which a pair adds nothing to g
@@ -188,11 +189,24 @@ def _is_own(ratio: Array) -> NDArray[np.bool_]:
     return (ratio >= 1 / OWN) & (ratio <= OWN)
 
 
+def _shares(sets: PointSets) -> Array:
+    """Return the fractions w of image points with a partner that are tried: (W,), or (k, 1, W) of each chosen point in
+    proportion to its score."""
+    shares = SHARES if sets.clutter is None else np.array([1 - sets.clutter])
+    if sets.scores2d is not None:
+        shares = shares * (sets.scores2d[sets.image.chosen] / sets.scores2d.mean())[:, None, None]
+    elif sets.clutter is None:
+        return shares
+    return np.asarray(np.clip(shares, LEAST_SHARE, MOST_SHARE))
+
+
 def _terms(sets: PointSets, seen: Array, finest: int) -> Array:
     """log x_i / c_i (k, S', W), clumps weighted, at the scales from the finest one on, of points seen in directions
     (n, 3)."""
     image = sets.image
-    return np.asarray(image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], SHARES))
+    return np.asarray(
+        image.weights[:, finest:, finest:] @ point_evidence(sets, seen, image.scales[finest:], _shares(sets))
+    )
 
 
 def _log_evidence(sets: PointSets, terms: Array, finest: int, left_out: int | None = None) -> Array:
@@ -200,7 +214,7 @@ def _log_evidence(sets: PointSets, terms: Array, finest: int, left_out: int | No
     `_terms` (k, S', W); -inf at the scales before the finest one, which are not looked at."""
     image, count = sets.image, _fixing(sets) if left_out is None else left_out
     evidence = terms.sum(0) - sum_of_largest(terms * image.together[:, finest:, None], count)
-    total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * len(SHARES))
+    total = np.logaddexp.reduce(evidence, 1) - math.log(len(image.scales) * evidence.shape[1])
     return np.r_[np.full(finest, -math.inf), total]
 
 
@@ -240,13 +254,14 @@ def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Arra
         Kernels (k, S); density of the outline (k,), 0 if `even`; number of partners in view (k,) and of all (k,).
     """
     image, count = sets.image, len(sets.image.chosen)
+    weight = np.ones(len(seen)) if sets.scores3d is None else sets.scores3d / sets.scores3d.mean()
     in_view, ahead = np.zeros(len(seen), np.bool_), np.flatnonzero(np.isfinite(seen[:, 0]))
     across = (np.abs((seen[ahead] - image.centre) @ image.axes) <= image.half_widths).all(-1)
     in_view[ahead] = across & (seen[ahead] @ image.centre > 0)
     if sets.labelled_pairs is not None:
-        return _sums_of_pairs(sets, *sets.labelled_pairs, seen, in_view, scales, even)
+        return _sums_of_pairs(sets, *sets.labelled_pairs, seen, weight, in_view, scales, even)
     predicted, smooth, inside, every = np.zeros((count, len(scales))), np.zeros(count), np.zeros(count), np.zeros(count)
-    for rows, columns, odds, share in _partners(sets, len(seen)):
+    for rows, columns, odds, share in _partners(sets, weight):
         ahead = np.isfinite(seen[columns, 0])
         every[rows] += odds * share.sum()
         inside[rows] += odds * share[in_view[columns]].sum()
@@ -259,32 +274,40 @@ def _sums(sets: PointSets, seen: Array, scales: Array, even: bool) -> tuple[Arra
 
 
 def _sums_of_pairs(
-    sets: PointSets, i: Labels, j: Labels, seen: Array, in_view: NDArray[np.bool_], scales: Array, even: bool
+    sets: PointSets,
+    i: Labels,
+    j: Labels,
+    seen: Array,
+    weight: Array,
+    in_view: NDArray[np.bool_],
+    scales: Array,
+    even: bool,
 ) -> tuple[Array, Array, Array, Array]:
     """Compute `_sums` over given pairs (p,) of a chosen image point and a scene point."""
     count = len(sets.image.chosen)
-    every, inside = (np.asarray(np.bincount(i, of, count), np.float64) for of in (np.ones(len(i)), in_view[j]))
+    every, inside = (np.asarray(np.bincount(i, of[j], count), np.float64) for of in (weight, weight * in_view))
     ahead = np.isfinite(seen[j, 0])
     i, j = i[ahead], j[ahead]
     squared = ((sets.bearings[sets.image.chosen[i]] - seen[j]) ** 2).sum(-1)
-    kernels = (np.where(squared < (FARTHEST * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
-    predicted = np.stack([np.bincount(i, kernel, count) for kernel in kernels], -1)
+    near = (np.where(squared < (FARTHEST * s) ** 2, np.exp(-0.5 * squared / s**2), 0.0) for s in scales.tolist())
+    predicted = np.stack([np.bincount(i, weight[j] * kernel, count) for kernel in near], -1)
     width2 = (OUTLINE * sets.image.spread) ** 2
-    outline = np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
+    outline = weight[j] * np.exp(-0.5 * squared / width2) / (2 * math.pi * width2)
     smooth = np.zeros(count) if even else np.asarray(np.bincount(i, outline, count), np.float64)
     return np.asarray(predicted, np.float64), smooth, inside, every
 
 
-def _partners(sets: PointSets, n: int) -> Iterator[tuple[Labels, Labels, Array, Array]]:
+def _partners(sets: PointSets, weight: Array) -> Iterator[tuple[Labels, Labels, Array, Array]]:
     """Places in the chosen image points (k,) and in the scene of possible partners, the odds (k,) of the former and the
-    share (n,) of the latter: those of a label, or all with their probability of a class, one class after the other."""
-    chosen = sets.image.chosen
+    share (n,) of the latter, times its weight: those of a label, or all with their probability of a class, one class
+    after the other."""
+    chosen, n = sets.image.chosen, len(weight)
     if sets.odds2d is None or sets.classes3d is None:
         for rows, columns in label_groups(chosen, sets.labels2d, sets.labels3d, n):
-            yield rows, columns, np.ones(len(rows)), np.ones(len(columns))
+            yield rows, columns, np.ones(len(rows)), weight[columns]
         return
     for odds, share in zip(sets.odds2d[chosen].T, sets.classes3d.T, strict=True):
-        yield np.arange(len(chosen)), np.arange(n), odds, share
+        yield np.arange(len(chosen)), np.arange(n), odds, weight * share
 
 
 def _smoothed(image: ImageStatistics, bearings: Array, directions: Array, share: Array) -> Array:

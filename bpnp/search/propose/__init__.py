@@ -1,0 +1,1 @@
+"""Proposers: functions that return poses to be refined, scored and judged like any other hypothesis."""

@@ -1,0 +1,198 @@
+"""Poses of known matches: labels that pair each image point with one scene point make a PnP problem.
+
+P3P gives the poses of triples of matches. The best are refined on all matches (least squares), and on those that agree
+with the pose (iterated weights of an inlier mixture), so that one wrong match does not spoil the others. The residual
+may have any size: a search that looks for matches within a radius would lose it.
+"""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from bpnp.robust.minimal_solvers import p3p_poses
+from bpnp.search.candidates import Candidates
+from bpnp.search.evidence.partners import across, explained
+from bpnp.search.point_sets import PointSets
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+FIXING = 3  # matches that fix a pose
+TRIPLES = 1000  # of matches, at most; with a fifth of the matches right, all of them miss a right triple 3 times in 1e4
+SCORED = 500  # matches on which the poses of triples are compared
+REFINED = 6  # poses that are refined
+STEPS, ROUNDS = 10, 3  # of Levenberg and Marquardt; with new weights
+WRONG = 0.1  # fraction of known matches that are expected to be wrong
+DAMPING = 1e-3  # first factor of Levenberg and Marquardt
+SETTLED, EXACT = 1e-6, 1e-24  # relative and absolute change of a sum of squares, of radians, that ends the steps
+SAME_DEG, SAME_SHIFT = 0.1, 2e-3  # of refined poses that are one optimum, the shift in distances
+
+
+def known_matches(sets: PointSets) -> tuple[Labels, Labels] | None:
+    """Return the matches that the labels leave, or None.
+
+    Returns:
+        Indices (k,) of image points and (k,) of scene points, where each point with a possible partner has one alone,
+        and there are more matches than fix a pose. Otherwise None.
+
+    >>> sets = PointSets(np.eye(4, 3), np.eye(4, 3), labels2d=np.array([3, 2, 1, 0]), labels3d=np.arange(4))
+    >>> known_matches(sets)
+    (array([3, 2, 1, 0]), array([0, 1, 2, 3]))
+    """
+    if sets.labels2d is None or sets.labels3d is None or sets.odds2d is not None:
+        return None
+    if min(sets.labels2d.min(), sets.labels3d.min()) < 0:
+        return None
+    values, j, i = np.intersect1d(sets.labels3d, sets.labels2d, return_indices=True)
+    counts = [np.isin(side, values).sum() for side in (sets.labels2d, sets.labels3d)]
+    return (i, j) if FIXING < len(values) == counts[0] == counts[1] else None
+
+
+def poses_of_matches(sets: PointSets, i: Labels, j: Labels, seed: int = 0) -> Candidates:
+    """Return distinct poses that matches fit best, in the user's coordinates.
+
+    Args:
+        sets: Points of the problem.
+        i: (k,) indices of image points, more than three.
+        j: (k,) indices of their scene points.
+        seed: Of the triples that are drawn where there are more than `TRIPLES`.
+
+    Returns:
+        The least-squares poses of all matches, then those of the matches that agree, each with the fewest residuals
+        first; empty if no triple has a pose.
+    """
+    rays, points = sets.bearings[i], sets.points3d[j]
+    middle = points.mean(0)
+    size = max(float(np.sqrt(((points - middle) ** 2).sum(-1).mean())), 1e-300)
+    points = (points - middle) / size
+    rng = np.random.default_rng(seed)
+    triples = _triples(len(i), rng)
+    poses = p3p_poses(rays[triples], points[triples]).reshape(-1, 4, 3)
+    poses = poses[np.isfinite(poses).all((1, 2))]
+    if not len(poses):
+        return Candidates.unscored(np.empty((0, 3, 3)), np.empty((0, 3)))
+    some = np.arange(len(i)) if len(i) <= SCORED else rng.choice(len(i), SCORED, replace=False)
+    squared = _squared(rays[some], points[some], poses)
+    scales = _scales(sets)
+    density = 1 / sets.image.solid_angle
+    agreeing, scale_of = _agreement(squared, scales, density)
+    every = poses[np.argsort(np.sort(np.minimum(squared, 1.0), 1)[:, : -(len(some) // 4) or None].sum(1))[:REFINED]]
+    every = _refined(rays, points, every, np.ones((len(every), len(i))))
+    best = np.argsort(-agreeing, kind="stable")[:REFINED]
+    fitted, scale = poses[best], scales[scale_of[best]]
+    for _ in range(ROUNDS):
+        squared = _squared(rays, points, fitted)
+        weight = _inlier_probability(squared, scale[:, None], density)
+        count = weight.sum(1)
+        free = 2 * count - 2 * FIXING
+        scale = np.clip(np.sqrt((weight * squared).sum(1) / np.maximum(free, 1e-3)), scales[0], scales[-1])
+        enough = count > FIXING + 0.5
+        fitted, scale, weight = fitted[enough], scale[enough], weight[enough]
+        fitted = _refined(rays, points, fitted, weight, STEPS // 2)
+    ends = []
+    for group in (every, fitted):
+        if len(group):
+            left = _squared(rays, points, group)
+            ends.append(group[np.argsort(np.median(left, 1) if group is fitted else left.sum(1), kind="stable")])
+    poses = _distinct(np.concatenate(ends)) if ends else poses[:0]
+    rotation = poses[:, :3]
+    translation = size * poses[:, 3] - rotation @ middle
+    return _scored(sets, i, j, rotation, translation, scales)
+
+
+def _triples(count: int, rng: np.random.Generator) -> Labels:
+    """Return all triples (t, 3) of so many matches, or `TRIPLES` of them."""
+    if math.comb(count, 3) <= TRIPLES:
+        a, b, c = np.meshgrid(*[np.arange(count)] * 3, indexing="ij")
+        return np.argwhere((a < b) & (b < c))
+    return np.argsort(rng.random((TRIPLES, count)), 1)[:, :3] if count < 64 else rng.integers(count, size=(TRIPLES, 3))
+
+
+def _scales(sets: PointSets) -> Array:
+    """Return scales (S,) of residuals, radians: from the smallest of the image up to its spread."""
+    smallest = float(sets.image.scales[0])
+    return np.geomspace(smallest, max(2 * smallest, sets.image.spread), 12)
+
+
+def _squared(rays: Array, points: Array, poses: Array) -> Array:
+    """Return squared distances (h, k) of unit rays (k, 3) from directions of points (k, 3) under poses (h, 4, 3)."""
+    camera = points @ poses[:, :3].transpose(0, 2, 1) + poses[:, 3:]
+    length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
+    return np.asarray(((camera / length - rays) ** 2).sum(-1))
+
+
+def _inlier_probability(squared: Array, scale: Array, density: float) -> Array:
+    """Return the probability that a residual is one of an inlier, not of a point that is anywhere in view."""
+    inlier = (1 - WRONG) * np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
+    return np.asarray(inlier / (inlier + WRONG * density))
+
+
+def _agreement(squared: Array, scales: Array, density: float) -> tuple[Array, Labels]:
+    """Return the evidence (h,) of residuals (h, k), nats, at the scale where it is largest, and its index (h,).
+
+    The three largest terms are left out: a triple fits its own pose exactly.
+    """
+    evidence = np.empty((len(squared), len(scales)))
+    for s, scale in enumerate(scales.tolist()):
+        kernel = np.exp(-0.5 * squared / scale**2) / (2 * math.pi * scale**2)
+        terms = np.log(WRONG + (1 - WRONG) * kernel / density)
+        evidence[:, s] = np.sort(terms, 1)[:, :-FIXING].sum(1)
+    return evidence.max(1), evidence.argmax(1)
+
+
+def _refined(rays: Array, points: Array, poses: Array, weights: Array, steps: int = STEPS) -> Array:
+    """Return poses (h, 4, 3) after Levenberg-Marquardt steps on weighted residuals of unit rays (k, 3).
+
+    The step (w, s) of a pose is y -> exp([w]x) R p + t + s.
+    """
+    poses, damping = poses.copy(), np.full(len(poses), DAMPING)
+    cost = (weights * _squared(rays, points, poses)).sum(1)
+    for _ in range(steps if len(poses) else 0):
+        turned = points @ poses[:, :3].transpose(0, 2, 1)
+        camera = turned + poses[:, 3:]
+        length = np.maximum(np.linalg.norm(camera, axis=-1, keepdims=True), 1e-300)
+        seen = camera / length
+        by_shift = across(seen.reshape(-1, 3)).reshape(*seen.shape, 3) / length[..., None]
+        jacobian = np.concatenate([np.cross(turned[:, :, None], by_shift, axisb=3, axisc=3), by_shift], -1)
+        weighed = jacobian * weights[..., None, None]
+        products = np.einsum("hkai,hkaj->hij", weighed, jacobian)
+        gradient = np.einsum("hkai,hka->hi", weighed, rays - seen)
+        diagonal = np.einsum("hii->hi", products).copy()
+        diagonal = damping[:, None] * diagonal + 1e-12 * diagonal.max(1, keepdims=True) + 1e-300
+        step = np.linalg.solve(products + diagonal[..., None] * np.eye(6), gradient[..., None])[..., 0]
+        turn = Rotation.from_rotvec(step[:, :3]).as_matrix()
+        trial = np.concatenate([turn @ poses[:, :3], poses[:, 3:] + step[:, None, 3:]], 1)
+        new = (weights * _squared(rays, points, trial)).sum(1)
+        if (np.abs(cost - new) <= SETTLED * cost + EXACT).all():
+            break
+        better = new < cost
+        poses[better], cost[better] = trial[better], new[better]
+        damping = np.where(better, damping / 10, damping * 10)
+    return poses
+
+
+def _distinct(poses: Array) -> Array:
+    """Return the first of poses (h, 4, 3) that are the same optimum."""
+    kept: list[int] = []
+    for k in range(len(poses)):
+        turn = np.einsum("hij,ij->h", poses[kept, :3], poses[k, :3])
+        shift = np.linalg.norm(poses[kept, 3] - poses[k, 3], axis=-1)
+        same = (turn > 1 + 2 * math.cos(math.radians(SAME_DEG))) & (shift < SAME_SHIFT * np.linalg.norm(poses[k, 3]))
+        if not same.any():
+            kept.append(k)
+    return poses[kept]
+
+
+def _scored(sets: PointSets, i: Labels, j: Labels, rotation: Array, translation: Array, scales: Array) -> Candidates:
+    """Return poses (h, 3, 3), (h, 3) with the scale of their residuals, and score and matches at it."""
+    poses = np.concatenate([rotation, translation[:, None]], 1)
+    squared, density = _squared(sets.bearings[i], sets.points3d[j], poses), 1 / sets.image.solid_angle
+    own = scales[_agreement(squared, scales, density)[1]]
+    weight = _inlier_probability(squared, own[:, None], density)
+    free = np.maximum(2 * weight.sum(1) - 2 * FIXING, 1.0)
+    scale = np.clip(np.sqrt((weight * squared).sum(1) / free), scales[0], scales[-1])
+    found = [explained(sets, *each) for each in zip(rotation, translation, scale, strict=True)]
+    score, matched = (np.array([one[k] for one in found]) for k in (0, 1))
+    return replace(Candidates.unscored(rotation, translation), score=score, matched=matched, scale=scale)
