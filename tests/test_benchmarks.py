@@ -194,7 +194,7 @@ def test_tables_are_filled_and_checked(tmp_path: Path, monkeypatch: pytest.Monke
     assert text.endswith("after\n")
     assert "old" not in text
     written = json.loads(file.read_text())
-    assert written["full"]["leds: two rings"]["seed"] == 9
+    assert written["full"]["leds: two rings"]["seed"] == 506
     assert written["commit"]
     run("--check")
     guide.write_text(text.replace("0.25 /", "0.24 /"))
