@@ -85,8 +85,7 @@ def trainings(options: argparse.Namespace) -> dict[str, Training]:
     )  # fmt: skip
     epoch, end = options.epoch, options.steps + options.pose_steps
     first = Training(folder / "lc", arguments, options.steps, epoch)
-    switch = {"class_path": "bpnp.training.PoseLossWarmup", "init_args": {"start_epoch": options.steps // epoch}}
-    posed = (*arguments, f"--trainer.callbacks={json.dumps([switch])}")
+    posed = (*arguments, f"--pose_loss.start_epoch={options.steps // epoch}")
     branch = f"from{options.steps}"
     return {
         "first": first,

@@ -25,26 +25,42 @@ PAPERS: dict[str, Paper] = {"MeshDataModule": "modelnet40", "ColmapDataModule": 
 
 
 def report(
-    runs: list[Path], *, paper: Paper | None = None, html: Path | None = None, recall: Path | None = None
+    runs: list[Path],
+    *,
+    paper: Paper | None = None,
+    html: Path | None = None,
+    recall: Path | None = None,
+    curves: Path | None = None,
 ) -> None:
-    """Show results side by side: tables here, and on request a page and recall curves.
+    """Show results side by side: tables here, and on request a page, recall curves and the curves of a training.
 
     Args:
         runs: folders that `bpnp test` or `bpnp table` wrote, or their runs.
         paper: modelnet40 or megadepth, the paper's rows beneath, for orientation.
         html: write a page that needs no network.
         recall: write the recall curves as .png, .svg or .pdf.
+        curves: write losses and validation of the first run's training as .png, .svg or .pdf.
     """
     from bpnp.report.figures import recall_curve, save_figure
+    from bpnp.report.intervals import interval_table
     from bpnp.report.page import write_page
     from bpnp.report.tables import named_runs, read_runs, results_table
 
+    if curves is not None:
+        from bpnp.report.training_curves import training_curves, training_folder
+
+        folder = training_folder(runs[0])
+        if folder is None:
+            raise ValueError(f"{runs[0]} and the folder above it have no logs of a training; give the folder of a run")
+        say(f"wrote {save_figure(training_curves(folder), curves)}")
     paths = list(named_runs(runs).values())
     if html is not None:
         say(f"wrote {write_page(paths, html, paper=paper)}")
     if recall is not None:
         say(f"wrote {save_figure(recall_curve(paths), recall)}")
-    console().print(results_table(read_runs(paths), paper=paper))
+    results = read_runs(paths)
+    console().print(results_table(results, paper=paper))
+    console().print(interval_table(results))
 
 
 def view(

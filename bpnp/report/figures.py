@@ -46,7 +46,7 @@ def recall_curve(runs: Sequence[Path | str] | Mapping[str, Results]) -> "Figure"
         limits = np.linspace(0, limit, POINTS)
         for line in lines_of(runs):
             shares = recall_of(runs[line.run], line.estimate, key, limits)
-            axes.plot(limits, shares, **_line_style(line.colour, line.dashes), label=_text(line.label))
+            axes.plot(limits, shares, **line_style(line.colour, line.dashes), label=shown_text(line.label))
         axes.set(xlabel=RECALLS[key][1].replace(", of", ",\nof"), ylim=(0, 1.01), xlim=(0, limit))
         axes.grid(alpha=0.3)
     figure.axes[0].yaxis.set_major_formatter(lambda share, _: f"{100 * share:.0f} %")
@@ -68,7 +68,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
         figure.subplots(1, 2), ("rotation_q2_deg", "recall_joint_15deg_0.5"), (1, 100), strict=True
     ):
         for i, (method, rows) in enumerate(drawn.sort_values("rho").groupby("method", sort=False)):
-            style = _line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": _text(str(method))}
+            style = line_style(i, i // len(LIGHT)) | {"marker": "o", "ms": 3.5, "label": shown_text(str(method))}
             axes.plot(rows.rho, scale * rows[key].astype(float), **style)
         axes.set_xlabel("outliers a match, on both sides")
         axes.grid(alpha=0.3)
@@ -78,7 +78,7 @@ def outlier_curves(frame: "DataFrame") -> "Figure":
     return figure
 
 
-def _line_style(colour: int, dashes: int) -> dict[str, Any]:
+def line_style(colour: int, dashes: int) -> dict[str, Any]:
     """Matplotlib's options of a line from indices of the palette."""
     lengths = DASHES[dashes % len(DASHES)]
     return {"color": LIGHT[colour % len(LIGHT)], "linestyle": (0, lengths) if lengths else "-"}
@@ -92,11 +92,11 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(13, 6), layout="constrained")
-    figure.suptitle(_text(problem.id), fontsize=10)
+    figure.suptitle(shown_text(problem.id), fontsize=10)
     plot_scene(figure.add_subplot(1, 2, 1, projection="3d"), problem)
     axes = plot_image(figure.add_subplot(1, 2, 2), problem, estimate=estimate, lines=lines)
     name, pose = _estimate(problem, estimate)
-    axes.set_title(_text(f"reprojected by {name}") if np.isfinite(np.c_[pose]).all() else "no pose", fontsize=9)
+    axes.set_title(shown_text(f"reprojected by {name}") if np.isfinite(np.c_[pose]).all() else "no pose", fontsize=9)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False, fontsize=8)
     return figure
 
@@ -120,10 +120,10 @@ def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     for name, ((rotation, translation), colour) in cameras.items():
         corners = _upright((frustum - translation) @ rotation, frame)
         if np.linalg.norm(corners[0] - centre) > 6 * depth + np.linalg.norm(np.ptp(points, axis=0)):
-            axes.plot([], [], color=colour, label=_text(f"{name} (too far away)"))
+            axes.plot([], [], color=colour, label=shown_text(f"{name} (too far away)"))
             continue
         path = [0, 1, 2, 0, 3, 4, 0, 2, 3, 4, 1]
-        axes.plot(*corners[path].T, color=colour, lw=2.5 if name == "true pose" else 1.2, label=_text(name))
+        axes.plot(*corners[path].T, color=colour, lw=2.5 if name == "true pose" else 1.2, label=shown_text(name))
     axes.set_aspect("equal")
     axes.view_init(elev=25, azim=-60)
     axes.tick_params(labelsize=7)
@@ -262,7 +262,7 @@ def _unit(problem: ProblemPoints) -> str:
     return "normalised coordinates" if problem.camera is None else "pixels"
 
 
-def _text(name: str) -> str:
+def shown_text(name: str) -> str:
     """A name as matplotlib shows it letter by letter: no formulas, no bytes of no text, no hidden label."""
     shown = utf8(name).replace("$", r"\$")
     return f" {shown}" if shown.startswith("_") else shown

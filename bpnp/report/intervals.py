@@ -1,15 +1,34 @@
-"""Bootstrap intervals of figures of a test, and of the difference of two methods on the same problems."""
+"""Bootstrap intervals of figures of a test, and of the difference of two estimates on the same problems."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.text import Text
+
+from bpnp.report.results import ProblemRow, Results
+from bpnp.report.tables import lines_of, tested_problems
+from bpnp.report.terminal import SplitTable, number
 
 LEVEL = 0.95
 DRAWS = 2000
 FINITE = 1e12  # in place of infinity, so that an interpolation with it is defined
 
+JOINT = (15.0, 0.5)  # degrees, scene units
+HEADERS = (
+    "rotation\nmedian",
+    "95 %\ninterval",
+    "% within\n15deg 0.5",
+    "95 %\ninterval",
+    "rotation\n- first",
+    "95 %\ninterval",
+    "sec",
+)
+CAPTION = (
+    "Medians in degrees. Intervals: 95 %, bootstrap over the problems. - first: difference of the medians to the first "
+    "row, paired over the same problems; an interval on one side of zero is a difference that the problems show."
+)
 Statistic = Callable[[NDArray[np.float64]], NDArray[np.float64]]  # of the last axis
 
 
@@ -92,3 +111,38 @@ def _interval(value: float, drawn: NDArray[np.float64]) -> Interval:
     low, high = np.quantile(drawn, [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
     numbers = (float(x) if abs(x) < FINITE / 2 else float(np.sign(x) * np.inf) for x in (value, low, high))
     return Interval(*numbers)
+
+
+def interval_table(runs: Mapping[str, Results]) -> SplitTable:
+    """Return medians and recalls with intervals, differences to the first row, and seconds, a row per estimate."""
+    lines = lines_of(runs)
+    shown = [
+        (Text(line.label), list(map(Text, cells))) for line, cells in zip(lines, interval_cells(runs), strict=True)
+    ]
+    return SplitTable("Intervals and differences", HEADERS, (shown, []), CAPTION)
+
+
+def interval_cells(runs: Mapping[str, Results]) -> list[list[str]]:
+    """The texts of `interval_table`, a row per run and estimate, a cell per header."""
+    lines = lines_of(runs)
+    first, rows = lines[0], []
+    for line in lines:
+        found = runs[line.run].of(line.estimate)
+        angles = _angles(found)
+        rotation = bootstrap(angles)
+        within = [row.rotation_error_deg < JOINT[0] and row.translation_error < JOINT[1] for row in found]
+        recall = bootstrap(100 * np.array(within, float), share)
+        paired = ["", ""]
+        if line != first and tested_problems(runs[line.run]) == tested_problems(runs[first.run]):
+            difference = paired_difference(_angles(runs[first.run].of(first.estimate)), angles)
+            paired = [f"{difference.value:+.2g}", f"{difference.low:+.2g} to {difference.high:+.2g}"]
+        seconds = runs[line.run].estimates[line.estimate]["seconds_mean"]
+        rows.append([
+            number(rotation.value), f"{number(rotation.low)} to {number(rotation.high)}",
+            f"{recall.value:.0f}", f"{recall.low:.0f} to {recall.high:.0f}", *paired, number(seconds),
+        ])  # fmt: skip
+    return rows
+
+
+def _angles(rows: list[ProblemRow]) -> NDArray[np.float64]:
+    return np.array([row.rotation_error_deg for row in rows])

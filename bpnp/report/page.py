@@ -6,6 +6,7 @@ ten thousand problems stay under 20 MB. The template and what is drawn by the br
 
 import base64
 import gzip
+import io
 import json
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -22,10 +23,13 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
+from bpnp.report.intervals import CAPTION as INTERVALS
+from bpnp.report.intervals import HEADERS, interval_cells
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
 from bpnp.report.results import CAUSES, PLAUSIBLE_INLIERS, SOLVED_DEG, ProblemRow, Results, cause_shares, read_results
 from bpnp.report.tables import CAPTION, LOADING, RESULT_COLUMNS, Line, best_texts, cell, lines_of, named_runs, run_rows
 from bpnp.report.terminal import DASHES, INKS, Paper
+from bpnp.report.training_curves import training_curves, training_folder
 
 FACTS = ("written", "bpnp_version", "correspondence_loss", "settings")  # of a run
 SCRIPTS = ("page.js", "problem.js")
@@ -101,6 +105,10 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         heads=[column.header for column in RESULT_COLUMNS],
         rows=quartile_rows(runs, paper),
         caption=CAPTION,
+        interval_heads=HEADERS,
+        intervals=list(zip(lines, interval_cells(runs), strict=True)),
+        interval_caption=INTERVALS,
+        trainings=training_pictures(folders),
         charts=list(map(chart_text, charts)),
         causes=CAUSES,
         shares=[(line, *_shares(runs[line.run], line.estimate)) for line in lines],
@@ -109,6 +117,17 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         columns=COLUMNS,
         drawn=PROBLEMS,
     )
+
+
+def training_pictures(folders: Mapping[str, Path]) -> dict[str, str]:
+    """Draw the training of each run that has logs, as SVG in base64."""
+    pictures = {}
+    for name, folder in folders.items():
+        if (run := training_folder(folder)) is not None:
+            drawing = io.BytesIO()
+            training_curves(run).savefig(drawing, format="svg", metadata={"Date": None})
+            pictures[name] = base64.b64encode(drawing.getvalue()).decode()
+    return pictures
 
 
 def quartile_rows(runs: Mapping[str, Results], paper: Paper | None) -> list[TableRow]:

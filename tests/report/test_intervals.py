@@ -1,10 +1,20 @@
 """Bootstrap intervals against scipy's bootstrap, laws of chance, and pairs whose difference is known."""
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from report_data import rows
 from scipy import stats
 
-from bpnp.report.intervals import bootstrap, paired_difference, quantile, share
+from bpnp.report import ProblemRow, Results
+from bpnp.report.intervals import bootstrap, interval_cells, paired_difference, quantile, share
+from bpnp.report.results import summarise
+
+
+def results(found: Sequence[ProblemRow]) -> Results:
+    return Results(tuple(found), summarise(found), None, {}, "0", "")
 
 
 def test_the_interval_of_a_median_is_scipys() -> None:
@@ -48,3 +58,17 @@ def test_numbers_that_are_not_there_are_an_error() -> None:
         bootstrap(np.array([1.0, np.nan]))
     with pytest.raises(ValueError, match="the same problems, got 2 and 3"):
         paired_difference(np.ones(2), np.ones(3))
+
+
+def test_the_table_pairs_runs_of_the_same_problems_with_the_first_row() -> None:
+    """Every rotation error of the second run is 1 degree less; a run of other problems has no difference."""
+    first = [replace(row, rotation_error_deg=10.0 + row.index) for row in rows(40, seed=0, estimates=("pnp",))]
+    better = [replace(row, rotation_error_deg=row.rotation_error_deg - 1) for row in first]
+    runs = {"first": results(first), "better": results(better), "other": results(better[:30])}
+    cells = interval_cells(runs)
+    assert cells[0][4:6] == ["", ""]
+    assert cells[1][4:6] == ["-1", "-1 to -1"]
+    assert cells[2][4:6] == ["", ""]
+    assert [row[0] for row in cells] == ["29.5", "28.5", "23.5"]
+    low, high = (float(x) for x in cells[0][1].split(" to "))
+    assert 10 < low < 29.5 < high < 50

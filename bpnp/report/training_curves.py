@@ -1,0 +1,120 @@
+"""The curves of a training: its losses and the errors of its validation over the steps, with the switch of the pose
+loss."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bpnp.report.figures import line_style, shown_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+
+METRICS = "metrics.csv"
+LOSSES = {
+    "train/loss": "loss",
+    "train/correspondence_loss": "$L_c$",
+    "train/matching_loss": "matching loss",
+    "train/rotation_loss": "$L_r$, radians",
+    "train/translation_loss": "$L_t$, scene units",
+    "val/correspondence_loss": "$L_c$, validation",
+}
+SWITCH = "train/pose_loss"
+SMOOTH = 0.05  # of the steps are averaged
+
+
+def training_folder(path: Path | str) -> Path | None:
+    """Find the run of a test or of a run's folder that has the logs of a training; None if there is none."""
+    place = Path(path).absolute()
+    for folder in (place, place.parent):
+        if any((folder / "logs").glob(f"version_*/{METRICS}")):
+            return folder
+    return None
+
+
+def read_curves(run: Path | str) -> "DataFrame":
+    """Read what a training logged, a row per step.
+
+    Args:
+        run: folder of the run. A training that was resumed has several logs: from the first step of each on, it counts
+            instead of the earlier ones.
+
+    Raises:
+        ValueError: The folder has no log of a training, or one that cannot be read.
+    """
+    from pandas import DataFrame, concat, read_csv
+
+    files = sorted(Path(run).glob(f"logs/version_*/{METRICS}"), key=lambda file: int(file.parent.name.split("_")[1]))
+    curves = DataFrame()
+    for file in files:
+        try:
+            log = read_csv(file)
+            steps = log["step"]
+        except (ValueError, KeyError) as error:
+            raise ValueError(f"{file} is not the log of a training ({error})") from error
+        trained = any(name in log and log[name].notna().any() for name in LOSSES)
+        if trained:
+            earlier = curves[curves["step"] < steps.min()] if len(curves) else curves
+            curves = concat([earlier, log]) if len(earlier) else log
+    if curves.empty:
+        raise ValueError(f"{run} has no logs/version_*/{METRICS} of a training")
+    return curves.groupby("step").mean(numeric_only=True).reset_index()
+
+
+def switch_step(curves: "DataFrame") -> int | None:
+    """Return the first logged step with the pose loss; None if it never joined, or was there from the start."""
+    if SWITCH not in curves:
+        return None
+    posed, trained = curves[curves[SWITCH].notna()]["step"], curves[curves["train/loss"].notna()]["step"]
+    return int(posed.min()) if len(posed) and posed.min() > trained.min() else None
+
+
+def training_curves(run: Path | str) -> "Figure":
+    """Draw the losses of a training and the median errors of its validation; a line marks the switch of the pose loss.
+
+    Args:
+        run: folder of the run.
+
+    Raises:
+        ValueError: As `read_curves`.
+    """
+    from matplotlib.figure import Figure
+
+    curves, figure = read_curves(run), Figure(figsize=(11, 3.4), layout="constrained")
+    losses, rotation, translation = figure.subplots(1, 3)
+    for place, (key, label) in enumerate(LOSSES.items()):
+        _draw(losses, curves, key, label, place, smooth=key.startswith("train/"))
+    for place, estimate in enumerate(_estimates(curves)):
+        for axes, error in ((rotation, "rotation_q2_deg"), (translation, "translation_q2")):
+            _draw(axes, curves, f"val/{estimate}/{error}", shown_text(estimate), place, marker="o", ms=3)
+    losses.set(ylabel="loss")
+    rotation.set(ylabel="median rotation error, degrees", yscale="log")
+    translation.set(ylabel="median translation error", yscale="log")
+    joined = switch_step(curves)
+    for axes in (losses, rotation, translation):
+        axes.set_xlabel("step")
+        axes.grid(alpha=0.3)
+        if joined is not None:
+            axes.axvline(joined, color="black", lw=1, ls=":", label="pose loss joins")
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=8, frameon=False)
+    return figure
+
+
+def _estimates(curves: "DataFrame") -> list[str]:
+    parts = [str(name).split("/") for name in curves.columns]
+    return [part[1] for part in parts if len(part) == 3 and part[0] == "val" and part[2] == "rotation_q2_deg"]
+
+
+def _draw(
+    axes: Any, curves: "DataFrame", key: str, label: str, place: int, *, smooth: bool = False, **style: Any
+) -> None:
+    if key not in curves or not curves[key].notna().any():
+        return
+    known = curves[curves[key].notna() & np.isfinite(curves[key])]
+    values = known[key]
+    if smooth:
+        values = values.rolling(max(1, int(SMOOTH * len(values))), min_periods=1).mean()
+    axes.plot(known["step"], values, label=label, **line_style(place, 0), **style)

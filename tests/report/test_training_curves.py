@@ -1,0 +1,83 @@
+"""Training curves from logs whose values are known: the switch, a run that was resumed, what is drawn."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from report_data import rows
+
+from bpnp.cli import main
+from bpnp.report import write_results
+from bpnp.report.page import page_html
+from bpnp.report.training_curves import read_curves, switch_step, training_curves, training_folder
+
+HEAD = "epoch,step,train/loss,train/correspondence_loss,train/rotation_loss,train/translation_loss,train/pose_loss"
+VALIDATED = ",val/ransac/rotation_q2_deg,val/ransac/translation_q2\n"
+
+
+def log(run: Path, version: int, steps: range, *, switch: int, level: float) -> None:
+    """Losses of `level` / step; the pose loss from a step on; a validation every tenth step."""
+    lines = [HEAD + VALIDATED]
+    for step in steps:
+        posed = f"{level / step},{2 * level / step},{3 * level / step}" if step >= switch else ",,"
+        lines.append(f"0,{step},{level / step},{level / step},{posed},,\n")
+        if step % 10 == 0:
+            lines.append(f"0,{step},,,,,,{100 / step},{1 / step}\n")
+    folder = run / "logs" / f"version_{version}"
+    folder.mkdir(parents=True)
+    (folder / "metrics.csv").write_text("".join(lines))
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """100 steps; the second log goes on from step 50, before the first one ended at 60; version 10 sorts after 2."""
+    log(tmp_path, 2, range(1, 61), switch=80, level=1.0)
+    log(tmp_path, 10, range(50, 101), switch=80, level=2.0)
+    (tmp_path / "logs" / "version_11").mkdir()
+    (tmp_path / "logs" / "version_11" / "metrics.csv").write_text("epoch,step,test/found\n0,100,1.0\n")
+    return tmp_path
+
+
+def test_a_resumed_training_is_one_curve(run: Path) -> None:
+    curves = read_curves(run)
+    assert curves["step"].tolist() == list(range(1, 101))
+    expected = np.r_[1 / np.arange(1, 50), 2 / np.arange(50, 101)]
+    np.testing.assert_allclose(curves["train/loss"], expected)
+    assert curves["val/ransac/rotation_q2_deg"].dropna().tolist() == [100 / step for step in range(10, 101, 10)]
+
+
+def test_the_switch_is_the_first_step_with_the_pose_loss(run: Path, tmp_path: Path) -> None:
+    assert switch_step(read_curves(run)) == 80
+    log(tmp_path / "never", 0, range(1, 20), switch=99, level=1.0)
+    assert switch_step(read_curves(tmp_path / "never")) is None
+    log(tmp_path / "always", 0, range(1, 20), switch=0, level=1.0)
+    assert switch_step(read_curves(tmp_path / "always")) is None
+
+
+def test_the_figure_shows_the_losses_the_validation_and_the_switch(run: Path) -> None:
+    losses, rotation, translation = training_curves(run).axes
+    labels = losses.get_legend_handles_labels()[1]
+    assert labels == ["loss", "$L_c$", "$L_r$, radians", "$L_t$, scene units", "pose loss joins"]
+    assert losses.lines[-1].get_xdata() == [80, 80]
+    assert rotation.lines[0].get_ydata().tolist() == [100 / step for step in range(10, 101, 10)]
+    assert translation.lines[0].get_ydata().tolist() == [1 / step for step in range(10, 101, 10)]
+
+
+def test_the_report_draws_the_training_of_a_test(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_results(run / "test", rows(12, seed=1))
+    assert training_folder(run / "test") == training_folder(run) == run.absolute()
+    main(["report", str(run), "--curves", str(run / "curves.png"), "--html", str(run / "page.html")])
+    assert (run / "curves.png").read_bytes().startswith(b"\x89PNG")
+    assert 'src="data:image/svg+xml;base64,' in (run / "page.html").read_text()
+    printed = capsys.readouterr().out
+    assert "Intervals and differences" in printed
+
+
+def test_a_page_without_a_training_has_no_section_for_it_and_curves_are_one_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_results(tmp_path / "test", rows(12, seed=1))
+    assert "<h2>Training</h2>" not in page_html([tmp_path])
+    with pytest.raises(SystemExit):
+        main(["report", str(tmp_path), "--curves", str(tmp_path / "curves.png")])
+    assert "have no logs of a training; give the folder of a run" in capsys.readouterr().err
