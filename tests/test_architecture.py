@@ -92,12 +92,6 @@ def test_modules_do_not_import_in_circles() -> None:
         visit(name, ())
 
 
-def test_files_and_folders_have_their_sizes() -> None:
-    assert len(FILES) <= 150
-    for folder in {file.parent for file in FILES}:
-        assert 3 <= len(list(folder.glob("*.py"))) <= 12, named(folder)
-
-
 def test_no_assertion_decides_anything() -> None:
     """`assert` may tell a type checker that something is not None; Python can drop it."""
     for file in FILES:
