@@ -6,7 +6,9 @@ import numpy as np
 import paper_tables
 import pytest
 import table1
+import torch
 from paper_tables import Training, effect, figures, filled, network, printed_rows, row_text, solve_problems
+from paper_weights import pack
 from report_data import row
 from small_data import SMALL_FEATURES
 from torch import Tensor, nn
@@ -37,6 +39,11 @@ def test_a_training_goes_on_from_its_own_checkpoint_and_a_branch_from_anothers(
     assert (net.ransac.backend, net.ransac.threshold, net.pnp.solver, net.widths) == ("opencv", 0.01, "lbfgs", [])
     assert (net.estimates, ours.estimates) == (("ransac", "pnp"), ("ransac", "pnp", "refined"))
     assert len(ours.widths) == 8
+    pack(branch.checkpoint, tmp_path / "packed.ckpt")
+    packed = network(tmp_path / "packed.ckpt")
+    assert (tmp_path / "packed.ckpt").stat().st_size < branch.checkpoint.stat().st_size / 4
+    for name, value in net.state_dict().items():
+        torch.testing.assert_close(packed.state_dict()[name], value, rtol=1e-3, atol=1e-4)
 
 
 class Known(nn.Module):
