@@ -1,4 +1,4 @@
-"""The command line: `bpnp fit|validate|test` are Lightning's own, the others are typed functions."""
+"""The command line: `bpnp fit|validate|test|predict` are Lightning's own, the others are typed functions."""
 
 import ctypes
 import difflib
@@ -6,13 +6,16 @@ import logging
 import os
 import re
 import sys
+import sysconfig
 import textwrap
+import traceback
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
+from pathlib import Path
 
 from bpnp.commands import COMMANDS
-from bpnp.commands.parser import LIGHTNING, first_line, parsed_arguments, short_help
+from bpnp.commands.parser import LIGHTNING, first_line, parsed_arguments, plain, short_help
 from bpnp.files import config_names, packaged_config
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3  # of glibc's malloc.h: bytes from which memory is given back to the system
@@ -21,13 +24,16 @@ AFTER_CTRL_C = {
     "table": "; run it again to go on",
     "prepare": "; nothing was written, run it again to start anew",
 }
+LIGHTNING_MISTAKES = {
+    "MisconfigurationException",
+    "TrainingDivergedError",
+}  # of which Lightning is imported for runs only
 WIDTH = 80  # columns of the help
 
 
 def main(args: Sequence[str] | None = None) -> None:
     """Run a command. A mistake of the user's ends in one line on stderr and exit status 2, not in a traceback."""
     arguments = list(sys.argv[1:] if args is None else args)
-    logging.captureWarnings(True)
     _quieten()
     try:
         if args is None and arguments and arguments[0] in LIGHTNING:
@@ -39,15 +45,28 @@ def main(args: Sequence[str] | None = None) -> None:
     except BrokenPipeError:  # the reader of a pipe, such as head, closed it
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
-    except (ValueError, OSError) as error:
-        if os.environ.get("BPNP_TRACEBACK"):
+    except Exception as error:
+        if os.environ.get("BPNP_TRACEBACK") or not _is_mistake(error):
             raise
+        message = plain(str(error)) if arguments[:1] and arguments[0] in LIGHTNING else error
         # Names of files that are not UTF-8 reach us as surrogates, which a terminal cannot show.
-        print(f"bpnp: error: {error}".encode("utf-8", "replace").decode(), file=sys.stderr)
+        print(f"bpnp: error: {message}".encode("utf-8", "replace").decode(), file=sys.stderr)
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print(f"bpnp: interrupted{AFTER_CTRL_C.get(arguments[0], '')}", file=sys.stderr)
         raise SystemExit(130) from None
+
+
+def _is_mistake(error: Exception) -> bool:
+    """Whether an exception is a message to the user: raised without a frame of code outside of Python's libraries.
+
+    The exceptions of a user's own class, such as a callback or a data module, keep their traceback.
+    """
+    if not isinstance(error, (ValueError, OSError)) and type(error).__name__ not in LIGHTNING_MISTAKES:
+        return False
+    libraries = {str(Path(__file__).parent), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))}
+    files = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
+    return all(file.startswith(("<", *libraries)) for file in files)
 
 
 def _run(arguments: list[str]) -> None:
@@ -144,6 +163,7 @@ def _quieten() -> None:
     advice.addFilter(lambda record: not re.search("Tip:|weights_only", record.getMessage()))
     for part in (
         "does not have many workers",
+        "Couldn't infer the batch indices",
         "Using `DistributedSampler` with the dataloaders",
         "LeafSpec",
         "logs directory .* exists and is not empty",

@@ -83,6 +83,7 @@ class Prediction(Tensors):
         under its pose in evaluation.
     unmatched2d, unmatched3d: the probability that a point has no partner, of an assignment with bins for them.
     seconds: by the name of a pose, the time from the start of the batch until it was found; empty if not measured.
+    ids, index: those of the batch, of a prediction by `Trainer.predict`.
     """
 
     assignment: Float[Tensor, "b m n"] | None = None
@@ -92,6 +93,8 @@ class Prediction(Tensors):
     unmatched3d: Float[Tensor, "b n"] | None = None
     rematched: Float[Tensor, "b m n"] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    ids: tuple[str, ...] = ()
+    index: Int[Tensor, " b"] | None = None
 
 
 @dataclass  # not frozen: Lightning's precision plugins cast inputs by assigning to the fields of a copy

@@ -138,6 +138,7 @@ LIGHTNING = {
     "fit": "Train a solver.",
     "validate": "Evaluate a solver on the validation problems.",
     "test": "Evaluate a solver on the test problems and write their results.",
+    "predict": "Write the poses of a solver on the test problems, as CSV or JSON.",
 }
 OPTIONS = {
     "--config NAME": "packaged configuration or a YAML file; of several, later ones override",

@@ -1,34 +1,45 @@
-"""`bpnp fit`, `validate` and `test`: Lightning's own command line, with this project's run folder."""
+"""`bpnp fit`, `validate`, `test` and `predict`: Lightning's own command line, with this project's run folder.
+
+The network is that of the checkpoint: what `--ckpt_path` or `--model.weights` describes are the defaults of
+`model.solver`, so options that a configuration leaves out are the checkpoint's, and `BlindPnPTask` refuses those that
+contradict it.
+"""
 
 import re
 import sys
-from collections.abc import Sequence
-from contextlib import nullcontext
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from inspect import signature
 from itertools import pairwise
 from pathlib import Path
+from pydoc import locate
 from typing import Any
 
 from jsonargparse import Namespace
-from lightning import LightningDataModule, LightningModule, Trainer
-from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
-from lightning.pytorch.cli import LightningArgumentParser, LightningCLI
-from lightning.pytorch.loggers import CSVLogger
-from lightning.pytorch.utilities.exceptions import MisconfigurationException
+from lightning import Callback, LightningDataModule, LightningModule, Trainer
+from lightning.pytorch.callbacks import ModelCheckpoint, ProgressBar, RichProgressBar
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, Logger
 from lightning.pytorch.utilities.types import LRSchedulerTypeUnion
 from torch.optim import Optimizer
 
 import bpnp.datamodules
-from bpnp.commands.parser import OneLineParser, plain
-from bpnp.files import claimed, config_content
-from bpnp.report.terminal import say
-from bpnp.training.callbacks import (
+from bpnp.commands.parser import OneLineParser
+from bpnp.files import claimed, config_content, write_text
+from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
+from bpnp.report.terminal import console, say
+from bpnp.training.callbacks import EpochLines, PoseLossWarmup, ResultsWriter
+from bpnp.training.checkpoints import (
+    BestCheckpoint,
     InterruptedCheckpoint,
-    PoseLossWarmup,
-    ResultsWriter,
     SafeCheckpointIO,
     interruptible,
+    newest_checkpoint,
 )
-from bpnp.training.task import BlindPnPTask, TrainingDivergedError
+from bpnp.training.predictions import PredictionWriter
+from bpnp.training.task import BlindPnPTask
+
+DEFAULT_ROOT = "runs/default"
 
 POSE_LOSS: dict[str, tuple[type, str]] = {
     "start_epoch": (int, "first epoch with the pose loss, counted from 0; none for no switch"),
@@ -40,22 +51,42 @@ class _Parser(OneLineParser, LightningArgumentParser):
     """Lightning's parser with errors of one line."""
 
 
+class RunConfig(SaveConfigCallback):
+    """Write the configuration into the numbered folder of the CSV log, and log it to the other loggers."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs | {"save_to_log_dir": False})
+
+    def save_config(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        numbered = [logger.log_dir for logger in trainer.loggers if isinstance(logger, CSVLogger)]
+        name = "config.yaml" if numbered or stage == "fit" else f"config-{stage}.yaml"
+        text = self.parser.dump(self.config, skip_none=False)
+        write_text(Path(numbered[0] if numbered else trainer.default_root_dir) / name, text)
+        content = self.config.as_dict()
+        wanted = ("data", "optimizer", "lr_scheduler", "seed_everything", "ckpt_path")
+        options = {key: content[key] for key in wanted if content.get(key) is not None}
+        given = content["trainer"]
+        options["trainer"] = {key: given[key] for key in ("max_epochs", "precision", "gradient_clip_val")}
+        for logger in trainer.loggers:
+            if not isinstance(logger, CSVLogger):
+                logger.log_hyperparams(options)
+
+
 class BpnpCLI(LightningCLI):
     """Lightning's CLI with this project's run folder: checkpoints, logs and results under trainer.default_root_dir.
 
-    command: the one to parse and run.
+    Args:
+        command: the one to parse and run.
+        held: what has to end after the run.
     """
 
-    def __init__(self, command: str, *args: Any, **kwargs: Any) -> None:
-        self.command = command
+    def __init__(self, command: str, held: ExitStack, *args: Any, **kwargs: Any) -> None:
+        self.command, self.held = command, held
         super().__init__(*args, **kwargs)
 
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
-        """The one that was asked for: its parser alone takes a second to build."""
+        """Return the one that was asked for: its parser alone takes a second to build."""
         return {self.command: super().subcommands()[self.command]}
-
-    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        self.config = parser.parse_args(args)
 
     def init_parser(self, **kwargs: Any) -> LightningArgumentParser:
         parser = _Parser(**kwargs)
@@ -63,15 +94,17 @@ class BpnpCLI(LightningCLI):
         return parser
 
     def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
-        parser.add_lightning_class_args(ModelCheckpoint, "best_checkpoint")
+        self.options = parser
+        parser.add_lightning_class_args(BestCheckpoint, "best_checkpoint")
         parser.add_lightning_class_args(ModelCheckpoint, "last_checkpoint")
         parser.add_lightning_class_args(ResultsWriter, "results")
+        parser.add_lightning_class_args(PredictionWriter, "predictions")
         for name, (kind, meaning) in POSE_LOSS.items():
             parser.add_argument(f"--pose_loss.{name}", type=kind | None, default=None, help=meaning)
         parser.set_defaults(
             {
-                "trainer.default_root_dir": "runs/default",
-                "best_checkpoint.monitor": "val/rotation_q2_deg",
+                "trainer.default_root_dir": DEFAULT_ROOT,
+                "best_checkpoint.monitor": "val/rotation_q2_deg" if self.subclass_mode_model else "val/pose_error",
                 "best_checkpoint.filename": "best",
                 "best_checkpoint.enable_version_counter": False,
                 "last_checkpoint.filename": "last",
@@ -81,16 +114,43 @@ class BpnpCLI(LightningCLI):
         for name in ("best_checkpoint", "last_checkpoint"):
             parser.link_arguments("trainer.default_root_dir", f"{name}.dirpath", compute_fn=_checkpoint_folder)
 
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse the arguments with the network of the checkpoint as the default of `model.solver`."""
+        if self.command == "test":
+            self.options.set_defaults({"verbose": False})  # our own tables in place of a list of all metrics
+        elif self.command == "predict":
+            self.options.set_defaults({"return_predictions": False})  # which are written
+        self.config = parser.parse_args([word for word in args if not word.startswith("--print_config")])
+        config = self.config[self.command]
+        path = config.get("ckpt_path")
+        if path == "last":
+            path = str(newest_checkpoint(Path(_checkpoint_folder(config["trainer.default_root_dir"]))))
+        named = config.get("model.class_path")
+        solver = None
+        if named is None or issubclass(_located(named), BlindPnPTask):
+            weights = path or config.get("model.weights" if named is None else "model.init_args.weights")
+            solver = _solver_options(weights, config["model"]) if weights else None
+        if solver is not None:
+            model = {"class_path": named, "init_args": {"solver": solver}}
+            self.options.set_defaults({"model.solver": solver} if named is None else {"model": model})
+        self.config = parser.parse_args(args)
+        config = self.config[self.command]
+        config["ckpt_path"] = path
+        for logger in _listed(config.get("trainer.logger")):
+            _log_in(logger, config["trainer.default_root_dir"])
+
     def before_instantiate_classes(self) -> None:
         """Merge `--pose_loss` into the `PoseLossWarmup` of the configuration, or add one.
 
         Raises:
             ValueError: a weight is set without an epoch.
         """
-        given = {name: value for name, value in vars(self._get(self.config, "pose_loss")).items() if value is not None}
+        given = {
+            name: value for name, value in vars(self.config[self.command]["pose_loss"]).items() if value is not None
+        }
         if not given:
             return
-        trainer = self._get(self.config, "trainer")
+        trainer = self.config[self.command]["trainer"]
         listed = trainer.callbacks or []
         trainer.callbacks = list(listed) if isinstance(listed, list) else [listed]
         for callback in trainer.callbacks:
@@ -116,58 +176,111 @@ class BpnpCLI(LightningCLI):
         return LightningCLI.configure_optimizers(lightning_module, optimizer, lr_scheduler)
 
     def instantiate_trainer(self, **kwargs: Any) -> Trainer:
-        """A CSV log always, beside what the configuration logs to, all in the run's folder; a progress bar unless it is
-        not wanted."""
-        if self._get(self.config, "trainer.enable_progress_bar") is False:
-            self.trainer_defaults["callbacks"] = [InterruptedCheckpoint()]
+        """Add a CSV log and safe checkpoints; show progress as a bar in a terminal, else as a line an epoch."""
+        options = self.config_init[self.command]["trainer"]
+        root = options["default_root_dir"]
+        callbacks: list[Callback] = [InterruptedCheckpoint(_checkpoint_folder(root))]
+        bar = options["enable_progress_bar"] is not False and console().is_interactive
+        if not any(isinstance(callback, ProgressBar) for callback in _listed(options["callbacks"])):
+            callbacks.append(RichProgressBar() if bar else EpochLines())
+            kwargs["enable_progress_bar"] = bar
+        self.trainer_defaults["callbacks"] = callbacks
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.
-        plugins = self._get(self.config_init, "trainer.plugins") or []
-        plugins = [*(plugins if isinstance(plugins, list) else [plugins]), SafeCheckpointIO()]
-        chosen = self._get(self.config_init, "trainer.logger")
-        loggers = chosen if isinstance(chosen, list) else [] if chosen in (None, True, False) else [chosen]
-        root = self._get(self.config_init, "trainer.default_root_dir")
+        kwargs["plugins"] = [*_listed(options["plugins"]), SafeCheckpointIO()]
+        chosen = options["logger"]
+        loggers = [logger for logger in _listed(chosen) if isinstance(logger, Logger)]
         if chosen is not False and not any(isinstance(logger, CSVLogger) for logger in loggers):
             loggers = [*loggers, CSVLogger(root, name="logs")]
-        return super().instantiate_trainer(**{"plugins": plugins, "logger": loggers} | kwargs)
+        return super().instantiate_trainer(**{"logger": loggers} | kwargs)
 
-    def _prepare_subcommand_parser(self, klass: type, subcommand: str, **kwargs: Any) -> LightningArgumentParser:
-        """Our own tables instead of a list of all metrics, and no assignments kept in memory."""
-        parser = super()._prepare_subcommand_parser(klass, subcommand, **kwargs)
-        if subcommand == "test":
-            parser.set_defaults({"verbose": False})
-        return parser
+    def after_instantiate_classes(self) -> None:
+        """Let Ctrl-C end the run as it ends other commands."""
+        self.held.enter_context(interruptible(self.trainer))
 
-    def _parse_ckpt_path(self) -> None:
-        """Nothing to do: our checkpoints hold no settings of the trainer's. The trainer reads them, once."""
-
-    def _run_subcommand(self, subcommand: str) -> None:
-        """In a run folder that no other training holds."""
-        self._check_checkpoint(subcommand)
-        training = subcommand == "fit" and self.trainer.global_rank == 0
-        with claimed(Path(self.trainer.default_root_dir)) if training else nullcontext(), interruptible(self.trainer):
-            super()._run_subcommand(subcommand)
+    def before_fit(self) -> None:
+        """Hold the run folder. Raises ValueError if another process does, or if a training would be overwritten."""
+        root = Path(self.trainer.default_root_dir)
+        if self.trainer.fast_dev_run or self.trainer.global_rank != 0:  # type: ignore[attr-defined]
+            return
+        self.held.enter_context(claimed(root))
+        folder, path = Path(_checkpoint_folder(str(root))), self.config[self.command]["ckpt_path"]
+        continued = path is not None and Path(path).resolve().parent == folder.resolve()
+        if not continued and any(folder.glob("*.ckpt")):
+            raise ValueError(
+                f"{root} holds a training. Continue it with --ckpt_path last, or set --trainer.default_root_dir to "
+                "another folder."
+            )
 
     def after_fit(self) -> None:
-        """Say where the checkpoints are."""
+        """Print where the checkpoints are."""
         for path in sorted(Path(_checkpoint_folder(self.trainer.default_root_dir)).glob("*.ckpt")):
             if self.trainer.is_global_zero and not self.trainer.fast_dev_run:  # type: ignore[attr-defined]
                 say(f"wrote {path}")
+
+    def before_validate(self) -> None:
+        """Warn if the weights are untrained."""
+        config = self.config[self.command]
+        trained = re.search("checkpoint|pretrained", str(config.get("model.solver")))
+        if not (config["ckpt_path"] or config.get("model.weights") or trained) and list(self.model.parameters()):
+            sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
+
+    before_test = before_predict = before_validate
 
     def after_test(self) -> None:
         """Raise ValueError if there was nothing to test: Lightning is silent."""
         if not sum(self.trainer.num_test_batches):
             raise ValueError(f"expected problems to test on, got none from {type(self.datamodule).__name__}")
 
-    def _check_checkpoint(self, subcommand: str) -> None:
-        """Raise ValueError for `--ckpt_path last` where there is none; warn if untrained weights are evaluated."""
-        path = self._get(self.config, "ckpt_path")
-        folder = Path(_checkpoint_folder(self.trainer.default_root_dir))
-        if path == "last" and not list(folder.glob("last*.ckpt")):
-            raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
-        trained = re.search("checkpoint|pretrained", str(self._get(self.config, "model.solver")))
-        weights = path or self._get(self.config, "model.weights") or trained
-        if subcommand != "fit" and not weights and any(True for _ in self.model.parameters()):
-            sys.stderr.write("bpnp: no --ckpt_path: the weights of the solver are untrained\n")
+
+def _solver_options(path: str, model: Namespace) -> dict[str, Any] | None:
+    """The solver that a checkpoint describes as an option, class path and arguments; None if it describes none.
+
+    Classes are those of this package and those that the options of the model name: a checkpoint imports nothing.
+    """
+    description = read_checkpoint(path).get("solver")
+    named = [_located(name) for name in _class_paths(model.as_dict())]
+    classes = {class_name(cls): cls for cls in (*networks(), *PARTS, *named)}
+
+    def options_of(value: Any) -> Any:
+        if not is_description(value):
+            return value
+        if value["class"] not in classes:
+            raise ValueError(
+                f"{path} has a {value['class']}, which is not a class of bpnp. Name it in the configuration, such as "
+                "with --config and the config.yaml of its training."
+            )
+        cls, settings = classes[value["class"]], value["settings"] or {}
+        arguments = {key: options_of(each) for key, each in settings.items()}
+        return {"class_path": f"{cls.__module__}.{cls.__qualname__}", "init_args": arguments}
+
+    return options_of(description) if is_description(description) else None
+
+
+def _class_paths(options: Any) -> Iterator[str]:
+    """All class paths in options of any depth."""
+    if isinstance(options, Mapping):
+        if isinstance(options.get("class_path"), str):
+            yield options["class_path"]
+        for value in options.values():
+            yield from _class_paths(value)
+
+
+def _located(class_path: str) -> type[Any]:
+    """The class of a path that the parser has accepted."""
+    found = locate(class_path)
+    return found if isinstance(found, type) else object
+
+
+def _log_in(logger: Any, root: str) -> None:
+    """Set the folder of a configured logger to that of the run where it is still the working directory."""
+    if isinstance(logger, Namespace) and "save_dir" in logger.get("init_args", {}):
+        option = signature(_located(logger.class_path)).parameters["save_dir"]
+        if logger.init_args.save_dir in (None, option.default):
+            logger.init_args.save_dir = root
+
+
+def _listed(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else [] if value is None else [value]
 
 
 def _checkpoint_folder(root: str) -> str:
@@ -175,32 +288,28 @@ def _checkpoint_folder(root: str) -> str:
 
 
 def run_training(arguments: Sequence[str]) -> None:
-    """Parse the arguments of fit, validate or test, and run it.
+    """Parse the arguments of fit, validate, test or predict, and run it.
 
-    Raises ValueError for a mistake of the user's, and for a training that diverged.
+    Raises:
+        ValueError: the options are wrong, or the training diverged.
     """
     for name in dir(bpnp.datamodules):  # those that are imported are listed by --help and have short names
         getattr(bpnp.datamodules, name)
     own_task = _names_a_task(arguments)
-    try:
+    with ExitStack() as held:
         BpnpCLI(
             arguments[0],
+            held,
             LightningModule if own_task else BlindPnPTask,
             LightningDataModule,
             subclass_mode_model=own_task,
             subclass_mode_data=True,
             seed_everything_default=0,
-            save_config_kwargs={"overwrite": True},
-            trainer_defaults={
-                "callbacks": [RichProgressBar(), InterruptedCheckpoint()],
-                "max_epochs": 200,
-                "num_sanity_val_steps": 0,
-            },
+            save_config_callback=RunConfig,
+            trainer_defaults={"max_epochs": 200, "num_sanity_val_steps": 0},
             parser_kwargs={"prog": "bpnp", "allow_abbrev": False},
             args=list(arguments),
         )
-    except (MisconfigurationException, TrainingDivergedError, ValueError) as error:
-        raise ValueError(plain(str(error))) from error
 
 
 def _names_a_task(arguments: Sequence[str]) -> bool:

@@ -1,10 +1,12 @@
 """The LightningModule, its losses, and the callbacks of a training."""
 
-from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, SafeCheckpointIO, TrainingMonitor
+from bpnp.training.callbacks import PoseLossWarmup, ResultsWriter, TrainingMonitor
+from bpnp.training.checkpoints import BestCheckpoint, SafeCheckpointIO
 from bpnp.training.reprojection import ReprojectionLoss
 from bpnp.training.task import BlindPnPTask
 
 __all__ = [
+    "BestCheckpoint",
     "BlindPnPTask",
     "PoseLossWarmup",
     "ReprojectionLoss",

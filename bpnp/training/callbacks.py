@@ -1,12 +1,10 @@
-"""Callbacks of a training and of a test: the pose loss that joins later, safe checkpoints, what is watched, and the
-files that a test leaves."""
+"""Callbacks of a training and of a test: the pose loss that joins later, what is watched, and the files that a test
+leaves."""
 
-import io
 import json
 import math
-import signal
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,23 +14,21 @@ import torch.distributed as dist
 from lightning import LightningModule, Trainer
 from lightning.pytorch import Callback
 from lightning.pytorch.cli import SaveConfigCallback
-from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info, rank_zero_warn
 from torch import Tensor, nn
 
 from bpnp.checks import check_within
-from bpnp.files import written_whole
 from bpnp.models.evaluation import refinement_enabled
 from bpnp.models.nets import centred
-from bpnp.models.weights import read_checkpoint
 from bpnp.report.points import ProblemPoints, points_from, write_points
 from bpnp.report.results import SUMMARY, ProblemRow, rows_from, write_results
 from bpnp.report.tables import read_runs, results_table
-from bpnp.report.terminal import console
+from bpnp.report.terminal import console, say
 from bpnp.training.task import BlindPnPTask, number_globally
 from bpnp.types import Batch, Prediction, mapped
 
 COLLAPSED = 0.05  # spread of unit features below which an assignment is all but uniform
+LINE = ("train/loss", "val/correspondence_loss", "val/pnp/rotation_q2_deg", "val/pnp/translation_q2")  # of an epoch
 RETURNED = 'a dictionary with "prediction", "seconds" and "losses", as BlindPnPTask\'s does'
 
 
@@ -97,41 +93,16 @@ class PoseLossWarmup(Callback):
         self.switched_at = state_dict["switched_at"]
 
 
-class SafeCheckpointIO(TorchCheckpointIO):
-    """Checkpoints written whole or not at all, and read as data only, with one clear error for a file that is none."""
+class EpochLines(Callback):
+    """Prints a line after each epoch of a training, for logs and pipes, where a progress bar shows nothing."""
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        content = io.BytesIO()
-        torch.save(checkpoint, content)
-        with written_whole(Path(path)) as temporary:
-            temporary.write_bytes(content.getbuffer())
-
-    def load_checkpoint(
-        self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
-    ) -> dict[str, Any]:
-        return read_checkpoint(path, map_location=map_location)
-
-
-class InterruptedCheckpoint(Callback):
-    """Saves `checkpoints/interrupted.ckpt` in the trainer's default_root_dir when a training is stopped by Ctrl-C."""
-
-    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        if isinstance(exception, KeyboardInterrupt) and trainer.state.fn == "fit" and trainer.global_step > 0:
-            path = Path(trainer.default_root_dir) / "checkpoints" / "interrupted.ckpt"
-            trainer.save_checkpoint(path, weights_only=False)
-            rank_zero_info(f"interrupted in epoch {trainer.current_epoch}; go on with --ckpt_path {path}")
-
-
-@contextmanager
-def interruptible(trainer: Trainer) -> Iterator[None]:
-    """Raises KeyboardInterrupt after Ctrl-C in a run of the trainer, where Lightning ends the process with status 1."""
-    try:
-        yield
-    except SystemExit:
-        if trainer.interrupted:
-            signal.signal(signal.SIGINT, signal.default_int_handler)
-            raise KeyboardInterrupt from None
-        raise
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        names = [name for name in LINE if name in trainer.callback_metrics] or list(trainer.callback_metrics)[:4]
+        values = ", ".join(f"{name} {float(trainer.callback_metrics[name]):.4g}" for name in names)
+        if trainer.is_global_zero:
+            last = f"/{trainer.max_epochs}" if (trainer.max_epochs or 0) > 0 else ""
+            say(f"epoch {trainer.current_epoch + 1}{last}, step {trainer.global_step}: {values}")
+            sys.stdout.flush()
 
 
 class TrainingMonitor(Callback):

@@ -19,7 +19,8 @@ from bpnp.files import config_content, packaged_config
 from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
-from bpnp.training.callbacks import ResultsWriter, interruptible
+from bpnp.training.callbacks import ResultsWriter
+from bpnp.training.checkpoints import interruptible
 from bpnp.training.task import BlindPnPTask
 
 SHORT_NAMES = {

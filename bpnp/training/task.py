@@ -38,10 +38,12 @@ from bpnp.models.weights import (
 )
 from bpnp.precision import exact_products
 from bpnp.training.losses import Losses, MatchingLoss, correspondence_losses, matching_losses, own_losses, pose_losses
+from bpnp.training.predictions import in_scene_frame
 from bpnp.types import Batch, Prediction
 
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not kept under "task": the checkpoint has what they made
+POSED = "pnp"  # the estimate that has a derivative, for the pose loss
 DECAYED = 0.02  # of the learning rate, after its fall
 WIDEST_MATCH = 0.5  # radians; every point matches many others beyond it, and degrees are mistaken for radians
 POSED = "pnp"  # the estimate that has a derivative, for the pose loss
@@ -56,9 +58,10 @@ class BlindPnPTask(LightningModule):
     """Any solver, trained with L = L_c + pose_weight * L_p (paper Eqs. 11 to 15) and Adam.
 
     Args:
-        solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses, the first of
-            which is reported without its name (`val/rotation_q2_deg`) and selects checkpoints. If it has a method
-            `match(batch)` for a prediction without poses, that is what a training step without a pose calls.
+        solver: module that maps a Batch to a Prediction; its class attribute `estimates` names its poses. The error
+            that selects checkpoints, `val/pose_error`, is that of "pnp", or of the first where there is none. A
+            callback may also monitor the first without its name (`val/rotation_q2_deg`). If the solver has a method
+            `match(batch)` for a prediction without poses, a training step without a pose calls it.
         weights: packaged weights (a name of `docs/model-card.md`) or a checkpoint that the solver starts from; none for
             those that it was built with. Optimiser and step start anew, other than with `--ckpt_path`.
         learning_rate: of Adam; the paper has 1e-5.
@@ -234,7 +237,8 @@ class BlindPnPTask(LightningModule):
         return self._evaluate(batch, "test", first=batch_idx == 0)
 
     def predict_step(self, batch: Batch, batch_idx: int) -> Prediction:
-        return self.solver(batch)
+        """Return the prediction with `ids`, and with poses in the coordinates that the scene was given in."""
+        return in_scene_frame(self.solver(batch), batch)
 
     def on_validation_epoch_start(self) -> None:
         self.numbers.clear()
@@ -455,8 +459,14 @@ class BlindPnPTask(LightningModule):
             for place in (f"{stage}/{name}", stage) if i == 0 else (f"{stage}/{name}",):
                 # The metrics have already been gathered over processes.
                 figures = {f"{place}/{key}": value.float() for key, value in values.items()}
-                self.log_dict(figures)
+                # Once in the logs, with its name; without it to monitor, whatever the solver.
+                self.log_dict(figures, logger=place != stage)
                 self.tabled |= figures.keys()
+            if name == (POSED if POSED in self.estimates[stage] else self.estimates[stage][0]):
+                # L_p of the median errors (paper Eq. 12), which selects checkpoints.
+                error = torch.deg2rad(values["rotation_q2_deg"]) + values["translation_q2"]
+                self.log(f"{stage}/pose_error", error.float())
+                self.tabled.add(f"{stage}/pose_error")
         loss = cast(MeanOverProblems, self.metrics[stage])
         # compute() is a collective call: all processes make it, or none.
         if self.trainer.strategy.reduce_boolean_decision(loss.update_called, all=False):

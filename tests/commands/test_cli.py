@@ -19,7 +19,7 @@ def test_help_lists_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     main(["--help"])
     text = capsys.readouterr().out
     listed = [line.split()[0] for line in text.splitlines() if re.match("  \\w", line)]
-    assert listed == [*COMMANDS, "fit", "validate", "test"]
+    assert listed == [*COMMANDS, "fit", "validate", "test", "predict"]
     assert "quickstart" in text
     assert max(map(len, text.splitlines())) <= 80
 
@@ -61,7 +61,7 @@ def test_options_of_the_network_and_its_parts_are_explained(
         (["fit", *MESHES, "--data.num_points=many"], "error: data: expected num_points as int, got 'many'\n"),
         (["fit", *MESHES, "--data.batch_size=0"], "error: expected `batch_size` of 1 or more, got 0\n"),
         (["fit", *MESHES, "--model.loss=torch.nn.Nothing"], "'torch.nn' has no attribute 'Nothing'\n"),
-        (["fit", *MESHES, "--data.root=nowhere"], "expected a folder with <class>/{train,test}"),
+        (["fit", *MESHES, "--data.root=nowhere"], "nowhere is not a folder; a folder with <class>/{train,test}"),
         (["fit", *MESHES, "--config=nowhere.yaml"], "expected a configuration file or the name of a packaged one"),
         (["fit", "--config", "quickstrat"], "got 'quickstrat'; did you mean quickstart?"),
         (["fit", *MESHES, "--trainer.fast_dev_run=-1"], "fast_dev_run=-1 is not a valid configuration"),
@@ -151,7 +151,9 @@ def test_a_broken_configuration_is_named(content: str, message: str, fails: Call
     assert re.search(message, fails("fit", f"--config={tmp_path}/wrong.yaml"))
 
 
-def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str]) -> None:
+def test_fit_test_report(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], fails: Callable[..., str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     meshes = write_mesh_tree(tmp_path / "meshes")
     common = [
         *MESHES,
@@ -165,7 +167,9 @@ def test_fit_test_report(tmp_path: Path, capsys: pytest.CaptureFixture[str], fai
     assert {p.name for p in (tmp_path / "run" / "checkpoints").iterdir()} == {"best.ckpt", "last.ckpt"}
     assert {p.name for p in (tmp_path / "run").iterdir()} == {"checkpoints", "logs"}
     logs = list((tmp_path / "run").rglob("metrics.csv"))
-    assert "val/rotation_q2_deg" in logs[0].read_text().splitlines()[0]
+    assert "val/ransac/rotation_q2_deg" in logs[0].read_text().splitlines()[0]
+    monkeypatch.setenv("FORCE_COLOR", "1")  # for a terminal
+    monkeypatch.setenv("TERM", "xterm")
     main(["test", *common, "--ckpt_path=last"])
     assert "━" in capsys.readouterr().out
     main(["test", *common, f"--ckpt_path={tmp_path}/run/checkpoints/best.ckpt", "--trainer.enable_progress_bar=false"])

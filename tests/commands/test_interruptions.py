@@ -13,7 +13,7 @@ from small_data import MESHES, SMALL_NET
 from bpnp.cli import main
 from bpnp.report import read_results
 from bpnp.report.points import read_points
-from bpnp.training.callbacks import SafeCheckpointIO
+from bpnp.training.checkpoints import SafeCheckpointIO
 
 
 class Stop(Callback):

@@ -129,6 +129,8 @@ def test_the_progress_bar_shows_the_loss_and_the_end_the_checkpoints(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "160")
+    monkeypatch.setenv("FORCE_COLOR", "1")  # for a terminal
+    monkeypatch.setenv("TERM", "xterm")
     main(["fit", *MESHES, *SMALL_NET, *SHORT, *folders(tmp_path)])
     printed = capsys.readouterr().out
     assert "train/loss:" in printed

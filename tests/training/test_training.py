@@ -74,7 +74,7 @@ def test_a_killed_run_resumes_and_ends_as_an_uninterrupted_one(tmp_path: Path) -
     process.communicate()
     assert last.exists()
     main(words("fit", killed, *WARMUP, "--ckpt_path=last", "--trainer.max_epochs=4"))
-    for metric in ("val/rotation_q2_deg", "val/pnp/rotation_q2_deg", "val/correspondence_loss"):
+    for metric in ("val/ransac/rotation_q2_deg", "val/pnp/rotation_q2_deg", "val/correspondence_loss"):
         assert logged(killed, metric, 3) == logged(whole, metric, 3), metric
 
 

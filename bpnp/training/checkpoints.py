@@ -1,0 +1,109 @@
+"""Checkpoints of a training: how they are written, which are kept, and which one a run continues."""
+
+import io
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.plugins.io import TorchCheckpointIO
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
+
+from bpnp.files import written_whole
+from bpnp.models.weights import read_checkpoint
+
+INTERRUPTED = "interrupted"
+BEFORE_POSE_LOSS = "before_pose_loss.ckpt"
+
+
+def newest_checkpoint(folder: Path) -> Path:
+    """Return the checkpoint that `--ckpt_path last` continues: the last one, or a newer one of an interruption.
+
+    Raises:
+        ValueError: there is none.
+    """
+    files = [*folder.glob("last*.ckpt"), *folder.glob(f"{INTERRUPTED}.ckpt")]
+    if not files:
+        raise ValueError(f"expected a checkpoint for --ckpt_path last in {folder}, got none; try without it")
+    return max(files, key=lambda file: file.stat().st_mtime_ns)
+
+
+class SafeCheckpointIO(TorchCheckpointIO):
+    """Checkpoints written whole or not at all, and read as data only, with one clear error for a file that is none."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        content = io.BytesIO()
+        torch.save(checkpoint, content)
+        with written_whole(Path(path)) as temporary:
+            temporary.write_bytes(content.getbuffer())
+
+    def load_checkpoint(
+        self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        return read_checkpoint(path, map_location=map_location)
+
+
+class InterruptedCheckpoint(Callback):
+    """Save `interrupted.ckpt` when Ctrl-C or an error stops a training; a training that ends removes it.
+
+    With Lightning's `OnExceptionCheckpoint` instead, every `fit` without a checkpoint would resume the last one.
+
+    Args:
+        folder: where the file is written.
+    """
+
+    def __init__(self, folder: str | Path) -> None:
+        self.path = Path(folder) / f"{INTERRUPTED}.ckpt"
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        if trainer.state.fn == "fit" and trainer.global_step > 0 and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            trainer.save_checkpoint(self.path, weights_only=False)
+            rank_zero_info(f"stopped in epoch {trainer.current_epoch}; continue with --ckpt_path {self.path}")
+
+    def on_fit_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if trainer.is_global_zero and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            self.path.unlink(missing_ok=True)
+
+
+class BestCheckpoint(ModelCheckpoint):
+    """The checkpoint with the best `monitor`, chosen among epochs of one objective.
+
+    When the pose loss joins the correspondence loss, the choice starts anew: values from before the switch are of
+    another objective. The network at the switch is kept as `before_pose_loss.ckpt`. Arguments are those of Lightning's
+    `ModelCheckpoint`.
+    """
+
+    has_pose_loss: bool | None = None  # in the last epoch
+
+    def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        has_pose_loss = float(getattr(pl_module, "pose_weight", 0)) > 0
+        if has_pose_loss and self.has_pose_loss is False:
+            if self.dirpath is not None and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+                trainer.save_checkpoint(Path(self.dirpath) / BEFORE_POSE_LOSS)
+            self.best_k_models = {}
+            self.best_model_path = self.kth_best_model_path = ""
+            self.best_model_score = None
+        self.has_pose_loss = has_pose_loss
+
+    def state_dict(self) -> dict[str, Any]:
+        return super().state_dict() | {"has_pose_loss": self.has_pose_loss}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        super().load_state_dict(state_dict)
+        self.has_pose_loss = state_dict["has_pose_loss"]
+
+
+@contextmanager
+def interruptible(trainer: Trainer) -> Iterator[None]:
+    """Raise KeyboardInterrupt after Ctrl-C in a run of the trainer, where Lightning ends the process with status 1."""
+    try:
+        yield
+    except SystemExit:
+        if trainer.interrupted:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            raise KeyboardInterrupt from None
+        raise

@@ -1,0 +1,159 @@
+"""Poses of a prediction in the frame of the user's scene, in memory and as a CSV or JSON file."""
+
+import csv
+import io
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import roma
+import torch
+from lightning import LightningModule, Trainer
+from lightning.pytorch.callbacks import BasePredictionWriter
+from lightning.pytorch.utilities.rank_zero import rank_zero_info
+from torch import Tensor
+
+from bpnp.files import write_text
+from bpnp.geometry import quaternion_rotation
+from bpnp.types import Batch, Pose, Prediction
+
+COLUMNS = ("id", "estimate", "found", "converged", "qw", "qx", "qy", "qz", "tx", "ty", "tz")
+
+
+def in_scene_frame(prediction: Prediction, batch: Batch) -> Prediction:
+    """Name the problems of a prediction, and undo what was subtracted from the coordinates of their scenes.
+
+    Args:
+        prediction: poses of the problems of the batch.
+        batch: its `origin` o (b, 3) is None if nothing was subtracted.
+
+    Returns:
+        The prediction with `ids` and `index` of the batch and, with an origin, poses (R, t - R o) in float64, R being
+        the rotation nearest to that of the solver.
+    """
+    poses = prediction.poses
+    if batch.origin is not None:
+        poses = {name: _translated(pose, batch.origin) for name, pose in poses.items()}
+    return replace(prediction, poses=poses, ids=batch.ids, index=batch.index)
+
+
+def _translated(pose: Pose, origin: Tensor) -> Pose:
+    # The origin multiplies the rounding of a float32 rotation, so the rotation is made exact first.
+    rotation = quaternion_rotation(roma.rotmat_to_unitquat(pose.rotation.double()))
+    return replace(
+        pose,
+        rotation=rotation,
+        translation=pose.translation.double() - (rotation @ origin.to(rotation)[..., None])[..., 0],
+    )
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    """One estimate of one problem: camera = R p + t, as COLMAP's `cam_from_world`; NaN where there is none."""
+
+    index: int
+    id: str
+    estimate: str
+    found: bool
+    converged: bool
+    rotation: list[list[float]]
+    quaternion: list[float]  # w, x, y, z
+    translation: list[float]
+
+
+def pose_rows(prediction: Prediction) -> list[PoseRow]:
+    """Return every pose of a prediction with `ids`."""
+    rows = []
+    for estimate, pose in prediction.poses.items():
+        quaternion = roma.rotmat_to_unitquat(pose.rotation.double()).roll(1, -1)
+        quaternion = torch.where(pose.found[:, None], quaternion, torch.nan)
+        columns = (pose.found, pose.stats.converged, pose.rotation.double(), quaternion, pose.translation.double())
+        assert prediction.index is not None
+        for index, name, *values in zip(
+            prediction.index.tolist(), prediction.ids, *(column.tolist() for column in columns), strict=True
+        ):
+            rows.append(PoseRow(index, name, estimate, *values))
+    return rows
+
+
+class PredictionWriter(BasePredictionWriter):
+    """Write the poses of a prediction, sorted by problem, when it ends: whole, or not at all.
+
+    Args:
+        folder: where; null for the trainer's default_root_dir.
+        format: csv for quaternions (w, x, y, z) and translations; json for rotation matrices and translations.
+        overwrite: replace the file of an earlier prediction.
+    """
+
+    def __init__(
+        self, folder: str | None = None, format: Literal["csv", "json"] = "csv", overwrite: bool = False
+    ) -> None:
+        super().__init__("batch")
+        self.folder, self.format, self.overwrite = folder, format, overwrite
+        self.rows: list[PoseRow] = []
+
+    def path(self, trainer: Trainer) -> Path:
+        """Return the file that is written."""
+        return Path(self.folder or trainer.default_root_dir) / f"predictions.{self.format}"
+
+    def on_predict_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.rows = []
+        if self.path(trainer).exists() and not self.overwrite and not trainer.fast_dev_run:  # type: ignore[attr-defined]
+            raise ValueError(
+                f"{self.path(trainer)} exists. Use --predictions.folder for another folder, or --predictions.overwrite "
+                "true."
+            )
+
+    def write_on_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        prediction: Any,
+        batch_indices: Sequence[int] | None,
+        batch: Any,
+        batch_idx: int,
+        dataloader_idx: int,
+    ) -> None:
+        if isinstance(prediction, Prediction) and prediction.ids:  # else of a task of the user's own
+            self.rows += pose_rows(prediction)
+
+    def on_predict_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        gathered: list[Any] = [None] * trainer.world_size
+        if trainer.world_size > 1:
+            torch.distributed.all_gather_object(gathered, self.rows)
+        else:
+            gathered = [self.rows]
+        if trainer.is_global_zero and not trainer.fast_dev_run and any(gathered):  # type: ignore[attr-defined]
+            # A problem that several processes had counts once; a sort keeps the order of the estimates.
+            rows = {(row.index, row.estimate): row for part in gathered for row in part}
+            ordered = sorted(rows.values(), key=lambda row: row.index)
+            path = write_text(self.path(trainer), as_csv(ordered) if self.format == "csv" else as_json(ordered))
+            rank_zero_info(f"poses of {len({row.index for row in ordered})} problems in {path}")
+
+
+def as_csv(rows: Sequence[PoseRow]) -> str:
+    """Return a table with the columns `COLUMNS`."""
+    text = io.StringIO()
+    table = csv.writer(text)
+    table.writerow(COLUMNS)
+    for row in rows:
+        table.writerow([row.id, row.estimate, row.found, row.converged, *row.quaternion, *row.translation])
+    return text.getvalue()
+
+
+def as_json(rows: Sequence[PoseRow]) -> str:
+    """Return a list of poses; rotation and translation are null where there is none."""
+    content = [
+        {
+            "id": row.id,
+            "estimate": row.estimate,
+            "found": row.found,
+            "converged": row.converged,
+            "rotation": row.rotation if row.found else None,
+            "translation": row.translation if row.found else None,
+        }
+        for row in rows
+    ]
+    return json.dumps(content, indent=1) + "\n"
