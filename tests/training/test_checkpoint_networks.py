@@ -188,7 +188,7 @@ def test_the_names_in_a_checkpoint_stay(tmp_path: Path) -> None:
         "features3d": ("SceneFeatures", features | {"normalise"}),
         "transport": ("Sinkhorn", {"mu", "learn_mu", "dustbin", "tolerance", "max_iterations"}),
         "ransac": ("RansacPnP", {"backend", "matches_factor", "threshold", "max_iterations", "seed"}),
-        "pnp": ("WeightedPnP", {"tolerance", "max_iterations"}),
+        "pnp": ("WeightedPnP", {"tolerance", "max_iterations", "solver", "clip_columns"}),
         "refinement": ("Refinement", {"hypotheses", "enabled"}),
     }
     assert read_checkpoint(tmp_path / "run.ckpt")["solver"] == solver
