@@ -17,6 +17,9 @@ from bpnp.search.starts import GravityPrior, PosePrior, Prior
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
 TURNED_DEG = 5.0  # standard deviation up to which a known rotation lets two matches fix a pose
+RADIUS = 3e-3  # radians, of a match, where the size of a pixel is not known
+FLOORS = 30.0  # radius of a match in smallest believable scales: 3 pixels, where that is a tenth of one
+TILTED = 2.0  # radii by which a tilt may move image points for two matches to fix a pose: those of the last stage
 SIGMAS = 2.0  # of a prior: poses farther off could not have been tried
 LOG_DEPTHS = math.log(30.0)  # the farthest over the nearest distance at which a scene could stand
 PAIRS_A_POINT = 32  # pairs of one label, for each point, up to which each pair is computed
@@ -170,9 +173,26 @@ class PointSets:
         return isinstance(self.prior, PosePrior) and self.prior.rotation_sigma_deg <= TURNED_DEG
 
     @property
+    def match_radius(self) -> float:
+        """Largest residual of a match in an enumeration, radians: `radius`, or 3 pixels where a pixel is known."""
+        if self.radius is not None:
+            return self.radius
+        return RADIUS if self.floor is None else FLOORS * self.floor
+
+    @property
+    def knows_vertical(self) -> bool:
+        """Whether gravity is known so well that a tilt within its error moves no image point out of reach of its match;
+        always of three points, which fix no pose without it."""
+        if not isinstance(self.prior, GravityPrior):
+            return False
+        if min(len(self.bearings), len(self.points3d)) == 3:
+            return True
+        return math.radians(self.prior.sigma_deg) * self.image.spread <= TILTED * self.match_radius
+
+    @property
     def pairs_that_fix(self) -> int:
-        """How many matches fix a pose: 2 where gravity, or the rotation to a few degrees, is known, else 3."""
-        return 2 if self.knows_rotation or isinstance(self.prior, GravityPrior) else 3
+        """How many matches fix a pose: 2 where the vertical, or the rotation to a few degrees, is known, else 3."""
+        return 2 if self.knows_rotation or self.knows_vertical else 3
 
     @property
     def fitted(self) -> int:

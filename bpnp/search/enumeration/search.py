@@ -31,8 +31,8 @@ from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings
 from bpnp.search.evidence.partners import explained
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
-from bpnp.search.starts import PosePrior
-from bpnp.search.verdict import is_certain, weighed
+from bpnp.search.starts import GravityPrior, PosePrior
+from bpnp.search.verdict import is_certain, weighed, with_false_alarms
 
 ORDERS = {
     2: np.array([[0, 1, 1], [1, 0, 0]]),
@@ -166,8 +166,8 @@ def enumerate_poses(
 ) -> EnumeratedPoses:
     """Poses under which image points see scene points, one-to-one within `radius`.
 
-    radius: radians, the largest residual of a match, a few standard deviations of the noise; None for that of the
-        settings. deadline: of `Clock`.
+    radius: radians, the largest residual of a match, a few standard deviations of the noise; None for
+        `sets.match_radius`. deadline: of `Clock`.
     is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
     gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
     first.
@@ -181,8 +181,7 @@ def enumerate_poses(
     >>> np.allclose(found.rotation[0], np.eye(3)), found.match[0].tolist()
     (True, [0, 1, 2, 3, 4, 5])
     """
-    known = settings.radius if sets.floor is None else settings.floors * sets.floor
-    run = Enumeration(sets, known if radius is None else radius, settings)
+    run = Enumeration(sets, sets.match_radius if radius is None else radius, settings)
 
     def enough(safe: float = settings.safe) -> EnumeratedPoses | None:
         if run.best < run.tests:
@@ -275,7 +274,9 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
     needs to be, since the best pose is certain.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
-    goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance.
+    goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance. Where
+    no pose with the given gravity is significant, the search goes on without it: a hypothesis of two matches has the
+    error of the prior.
     """
     certain: Candidates | None = None
     annotated = sets
@@ -289,13 +290,19 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
         return certain is not None
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        poses = enumerate_poses(sets, radius=sets.radius, deadline=deadline.at, is_safe=is_safe, settings=rule)
+        poses = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, settings=rule)
         return poses, _candidates(poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None
     near = tracked and sets.pairs_that_fix == 2
     poses, candidates = enumerated(sets, replace(DEFAULT, stages=()) if near else DEFAULT)
-    if certain is None and tracked and (near or margin(poses) < 0):
+    if certain is None and isinstance(sets.prior, GravityPrior):
+        candidates = with_false_alarms(candidates, sets)
+        if candidates.log10_false_alarms.min(initial=math.inf) > settings.evidence.false_alarms:
+            poses, others = enumerated(replace(sets, prior=None), DEFAULT)
+            candidates = with_false_alarms(Candidates.concatenated([candidates, others]), sets)
+            candidates = candidates[np.argsort(candidates.log10_false_alarms, kind="stable")[: settings.kept]]
+    elif certain is None and tracked and (near or margin(poses) < 0):
         poses, others = enumerated(replace(sets, prior=None), DEFAULT)
         candidates = Candidates.concatenated([candidates, others])
         candidates = candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]]

@@ -52,8 +52,7 @@ class EnumerationSettings:
     """Constants of the enumeration.
 
     most_products: image points times scene points up to which points are few: 60 x 60. most_products_known: the same
-    where a prior lets two matches fix a pose. floors: radius of a match in smallest believable scales: 3 pixels where
-    that is a tenth of one. radius: of a match, radians, where no scale is known.
+    where a prior lets two matches fix a pose.
 
     stages: what is tried, one after the other; those of two matches only where a prior lets two fix a pose.
     kept: distinct poses. other_deg: poses farther apart answer differently. safe: nats beyond chance and ahead of
@@ -70,8 +69,6 @@ class EnumerationSettings:
 
     most_products: int = 4000
     most_products_known: int = 250_000
-    floors: float = 30.0
-    radius: float = 3e-3
     stages: tuple[Stage, ...] = (
         *(Stage(2, *near, 0.6) for near in ((5, 9), (9, 16), (63, 63))),
         *(Stage(2, 63, 63, 2.0), Stage(3, 3, 5, 0.5), Stage(3, 4, 7, 0.5), Stage(3, 3, 5, 2.0)),
