@@ -1,6 +1,7 @@
 """What the benchmarks of the paper's tables share: trainings and tests that go on where they were stopped, rows with
 intervals, and the tables of a page."""
 
+import argparse
 import json
 import re
 import subprocess
@@ -8,12 +9,14 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 from lightning import LightningDataModule
+from record import DATA, write
 from torch import nn
 
 from bpnp.files import written_whole
@@ -33,6 +36,35 @@ ERRORS = {
     "reprojection": "reprojection_error_deg",
 }
 QUARTERS = (0.25, 0.5, 0.75)
+
+
+ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
+BRANCHES = ("Lc", "Lc Lp")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of the paper: its name, its printed rows, the limits of its recall, and our test sets."""
+
+    name: str
+    paper: Paper
+    recall: tuple[float, float]  # degrees, scene units
+    sets: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A solver of a table: its group, its label, how many problems it gets, and what its results depend on."""
+
+    group: str
+    label: str
+    build: Callable[[], nn.Module]
+    limit: int
+    identity: dict[str, Any]
+
+    @property
+    def file(self) -> str:
+        return f"{self.group}-{self.label}".replace(" ", "_").replace(",", "")
 
 
 @dataclass(frozen=True)
@@ -127,6 +159,152 @@ def solve_problems(
             rows += new
     chosen = set(order)
     return sorted((row for row in rows if row.index in chosen), key=lambda row: row.index)
+
+
+def branches(
+    folder: Path, arguments: tuple[str, ...], *, steps: int, pose_steps: int, epoch: int
+) -> dict[str, Training]:
+    """A training with L_c, and two that go on from it: with L_c, and with L_c + L_p."""
+    first, end = Training(folder / "lc", arguments, steps, epoch), steps + pose_steps
+    posed = (*arguments, f"--pose_loss.start_epoch={steps // epoch}")
+    return {
+        "first": first,
+        "Lc": Training(folder / f"lc-from{steps}", arguments, end, epoch, first.checkpoint),
+        "Lc Lp": Training(folder / f"lclp-from{steps}", posed, end, epoch, first.checkpoint),
+    }
+
+
+def network_methods(weights: Iterable[tuple[str, str, Path]], *, problems: int, our_problems: int) -> Iterator[Method]:
+    """Networks, given as group, label and checkpoint, with the paper's inference and with ours."""
+    known = [(group, label, checkpoint) for group, label, checkpoint in weights if checkpoint.is_file()]
+    for ours in (False, True):
+        for group, label, checkpoint in known:
+            identity = {"steps": trained_steps(checkpoint), "bytes": checkpoint.stat().st_size, "ours": ours}
+            limit = min(problems, our_problems) if ours else problems
+            name = f"{group}, our inference" if ours else group
+            yield Method(name, label, partial(network, checkpoint, ours=ours), limit, identity)
+
+
+def measure(
+    table: Table,
+    trained: Mapping[str, Training],
+    methods: Callable[[str], Iterable[Method]],
+    data: Callable[[str], LightningDataModule],
+    options: argparse.Namespace,
+) -> dict[str, Any]:
+    """Train what is missing, test all methods on all sets, and return the record, which is written after each set.
+
+    methods, data: of the name of a test set.
+    """
+    for one in trained.values():
+        if not options.only_test:
+            one.run()
+    record: dict[str, Any] = json.loads(options.output.read_text()) if options.output.is_file() else {}
+    record = {key: record.get(key, {}) for key in ("rows", "effects", "training")}
+    steps = {label: trained_steps(one.checkpoint) for label, one in trained.items()}
+    if any(steps.values()):
+        facts = {"learning_rate": options.learning_rate, "switch": options.steps}
+        record["training"][f"seed {options.seed}"] = steps | facts
+    for name in options.sets:
+        found: dict[str, list[ProblemRow]] = {}
+        for method in methods(name):
+            if not any(part in f"{method.group} {method.label}" for part in options.only):
+                continue
+            file = options.run / f"seed{options.seed}" / "tests" / name / f"{method.file}.jsonl"
+            rows = solve_problems(file, method.build, data(name), method.limit, method.identity)
+            for estimate in dict.fromkeys(row.estimate for row in rows):
+                key = f"{name}|{options.seed}|{method.group}|{method.label}|{estimate}"
+                chosen = [row for row in rows if row.estimate == estimate]
+                found[f"{method.group}|{method.label}|{estimate}"] = chosen
+                record["rows"][key] = figures(chosen, table.recall)
+                print(f"{key}: {record['rows'][key]}", flush=True)
+        for estimate in ("pnp", "ransac"):
+            before, after = (found.get(f"paper|{label}|{estimate}") for label in BRANCHES)
+            if before and after:
+                record["effects"][f"{name}|{options.seed}|{estimate}"] = effect(before, after, table.recall)
+        write(options.output, record)
+    return record
+
+
+def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
+    """By name, the Markdown of the tables: the rows of a set and a group, the effect of L_p, the trainings."""
+    result: dict[str, str] = {}
+    lowest = min((int(key.split("|")[1]) for key in record["rows"]), default=0)
+    lines: dict[str, list[tuple[int, str]]] = {}
+    for key, found in record["rows"].items():
+        name, seed, group, label, estimate = key.split("|")
+        if int(seed) == lowest:
+            place = list(ESTIMATES).index(estimate) if estimate in ESTIMATES else 0
+            title = f"{name}-{group}".replace(", ", "-").replace(" ", "-")
+            lines.setdefault(title, []).append((place, row_text(label + ESTIMATES.get(estimate, ""), found)))
+    printed = list(printed_rows(table.paper))
+    for title, rows in lines.items():
+        beside = printed[3:] if title.endswith("-paper") else printed[:3] if title.endswith("-baselines") else []
+        ours = [text for _, text in sorted(rows, key=lambda row: row[0])]
+        result[title] = "".join([head(table.recall), *ours, *beside])
+    named = {"pnp": "Lc Lp minus Lc", "ransac": "Lc Lp R minus Lc R"}
+    for name in table.sets:
+        keys = {estimate: f"{name}|{lowest}|{estimate}" for estimate in named}
+        texts = [effect_text(named[e], record["effects"][k]) for e, k in keys.items() if k in record["effects"]]
+        if texts:
+            result[f"{name}-effect"] = effect_head(table.recall) + "".join(texts)
+    names = ("training", "steps until the switch", "steps of Lc", "steps of Lc Lp", "learning rate")
+    trained = [
+        (seed, one["switch"], *(one.get(label, 0) for label in BRANCHES), f"{one['learning_rate']:g}")
+        for seed, one in record["training"].items()
+    ]
+    result["training"] = "".join(
+        f"| {' | '.join(map(str, row))} |\n" for row in (names, ["---"] * len(names), *trained)
+    )
+    return result
+
+
+def options(
+    doc: str | None, *, file: Path, run: Path, sets: Sequence[str], steps: int, pose_steps: int
+) -> argparse.ArgumentParser:
+    """The options of a table."""
+    found = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    found.add_argument("--data", type=Path, default=DATA, help="folder of the data sets")
+    found.add_argument("--run", type=Path, default=run, help="(default: %(default)s)")
+    found.add_argument("--seed", type=int, default=0, help="of training and tests (default: %(default)s)")
+    found.add_argument("--steps", type=int, default=steps, help="until the switch (default: %(default)s)")
+    found.add_argument("--pose_steps", type=int, default=pose_steps, help="after it (default: %(default)s)")
+    found.add_argument("--epoch", type=int, default=100, help="steps between checkpoints (default: %(default)s)")
+    found.add_argument("--learning_rate", type=float, default=1e-4, help="the paper has 1e-5 (default: %(default)s)")
+    found.add_argument("--sets", nargs="*", default=list(sets), help="test sets (default: %(default)s)")
+    found.add_argument("--only", nargs="*", default=[""], help="parts of names: only methods with one of them")
+    found.add_argument("--problems", type=int, default=500, help="of a set, at most (default: %(default)s)")
+    found.add_argument("--our_problems", type=int, default=500, help="with our inference, and of the search")
+    found.add_argument("--baseline_problems", type=int, default=60, help="of a set (default: %(default)s)")
+    found.add_argument("--only_test", action="store_true", help="no training")
+    found.add_argument("--output", type=Path, default=file, help="(default: %(default)s)")
+    found.add_argument("--quick", action="store_true", help="150 + 50 steps, 20 problems, its own folder")
+    found.add_argument("--check", action="store_true", help="compare the pages with the record, measure nothing")
+    return found
+
+
+def run(
+    table: Table,
+    parser: argparse.ArgumentParser,
+    pages: Iterable[Path],
+    measured: Callable[[argparse.Namespace], dict[str, Any]],
+) -> None:
+    """Parse the options, measure, and fill the pages; a quick run prints its tables."""
+    chosen = parser.parse_args()
+    if chosen.check:
+        fill_pages(pages, table.name, markdown(table, json.loads(chosen.output.read_text())), check=True)
+        return
+    torch.set_num_threads(1)
+    if chosen.quick:
+        chosen.run = chosen.run.with_name(f"{chosen.run.name}-quick")
+        chosen.output = chosen.run / "record.json"
+        chosen.steps, chosen.pose_steps, chosen.epoch = 150, 50, 50
+        chosen.problems, chosen.our_problems, chosen.baseline_problems = 20, 5, 1
+    found = markdown(table, measured(chosen))
+    if chosen.quick:
+        print("\n\n".join(f"{name}\n{text}" for name, text in found.items()))
+    else:
+        fill_pages(pages, table.name, found, check=False)
 
 
 def figures(rows: Sequence[ProblemRow], recall: tuple[float, float]) -> dict[str, Any]:

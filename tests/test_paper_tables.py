@@ -120,14 +120,14 @@ def test_tables_stand_between_their_markers_and_a_page_that_differs_is_found(tmp
 def test_a_record_becomes_the_tables_of_the_page() -> None:
     rng = np.random.default_rng(0)
     rows = [row(i, rotation_error_deg=float(rng.gamma(2, 5))) for i in range(10)]
-    one = figures(rows, table1.RECALL)
+    one = figures(rows, table1.TABLE.recall)
     keys = ("paper|Lc|ransac", "paper|Lc|pnp", "paper, our inference|Lc|refined", "baselines|search|search")
     record = {
         "rows": {f"modelnet10|0|{key}": one for key in keys},
-        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.RECALL)},
+        "effects": {"modelnet10|0|pnp": effect(rows, rows, table1.TABLE.recall)},
         "training": {"seed 0": {"Lc": 500, "Lc Lp": 500, "learning_rate": 1e-4, "switch": 400}},
     }
-    tables = table1.tables(record)
+    tables = paper_tables.markdown(table1.TABLE, record)
     lines = tables["modelnet10-paper"].splitlines()
     assert [line.split(" | ")[0] for line in lines[2:]] == [
         "| Lc", "| Lc R", "| *paper: Lc*", "| *paper: Lc Lp*", "| *paper: Lc R*", "| *paper: Lc Lp R*",

@@ -1,0 +1,85 @@
+"""Table 2 of the paper: trains L_c and its fork L_c + L_p on photos of COLMAP models, and tests them on other scenes.
+
+    python -m benchmarks table2            # hours; a run that was stopped goes on
+    python -m benchmarks table2 --quick    # 20 minutes, another folder, no page
+    python -m benchmarks table2 --check    # whether docs/table2.md is what the record says
+
+The training is configs/paper/megadepth.yaml but for data, steps, learning rate and normalised scene points (the scenes
+have different units): first on drawn maps, `--drawn_steps`, then on the photos of `TRAINED`. The landmarks that are
+tested are apart from those that are trained on. Photos have up to 1,000 of the points that they see.
+"""
+
+import argparse
+import json
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import paper_tables
+from paper_tables import BRANCHES, Method, Table, Training
+from record import ROOT
+from torch import nn
+
+from bpnp.datamodules import ColmapDataModule
+from bpnp.models import Search
+from bpnp.models.baselines import GOSMA, RandomRansac, SoftPOSIT
+
+TRAINED = ("castle-P30", "statue_of_liberty", "sceaux_castle_txt", "walkthrough", "walk_2", "walk_4", "walk_6")
+TESTED = ("fountain-P11", "south_building", "tabletop")
+TABLE = Table("table2", "megadepth", (10.0, 1.0), ("photos",))
+FILE, PAGES = ROOT / "benchmarks" / "table2.json", (ROOT / "docs" / "table2.md",)
+POINTS = 1000
+BASELINES: dict[str, Callable[[], nn.Module]] = {
+    "SoftPOSIT near the truth": partial(SoftPOSIT, start="near_truth"),
+    "RANSAC": RandomRansac,
+    "GOSMA": GOSMA,
+}
+SEARCH_SECONDS = 10.0
+DRAWN = ("num_points=128", "outliers=0.0", "frame=upright", "train_problems=1600", "val_problems=16", "batch_size=16")
+
+
+def data_module(root: Path, seed: int, _: str) -> ColmapDataModule:
+    """All photos of the scenes that are left out."""
+    scenes = [str(root / "colmap" / scene) for scene in TESTED]
+    return ColmapDataModule(scenes, test_fraction=1.0, eval_max_points=POINTS, seed=seed)
+
+
+def trainings(options: argparse.Namespace) -> dict[str, Training]:
+    """On drawn maps, then on photos, and the two branches."""
+    shared = (
+        "--config=paper/megadepth", "--model.solver.features3d.normalise=true",
+        f"--model.learning_rate={options.learning_rate}", f"--seed_everything={options.seed}",
+    )  # fmt: skip
+    folder = options.run / f"seed{options.seed}"
+    drawn = ("--data=bpnp.datamodules.SyntheticMapDataModule", *(f"--data.{option}" for option in DRAWN))
+    start = Training(folder / "drawn", (*shared, *drawn), options.drawn_steps, options.epoch)
+    roots = json.dumps([str(options.data / "colmap" / scene) for scene in TRAINED])
+    photos = (f"--data.root={roots}", "--data.test_fraction=0", "--data.val_fraction=0.15")
+    arguments = (*shared, *photos, f"--data.seed={options.seed}", f"--model.weights={start.checkpoint}")
+    schedule = {"steps": options.steps, "pose_steps": options.pose_steps}
+    return {"drawn": start} | paper_tables.branches(folder, arguments, epoch=options.epoch, **schedule)
+
+
+def methods(options: argparse.Namespace, trained: dict[str, Training], _: str) -> Iterator[Method]:
+    """Networks with the paper's inference and with ours, then baselines."""
+    weights = [("paper", label, trained[label].checkpoint) for label in BRANCHES]
+    yield from paper_tables.network_methods(weights, problems=options.problems, our_problems=options.our_problems)
+    for name, baseline in BASELINES.items():
+        yield Method("baselines", name, baseline, options.baseline_problems, {"time_limit": 30})
+    search = partial(Search, time_limit=SEARCH_SECONDS)
+    limit = min(options.problems, options.our_problems)
+    yield Method("baselines", "search", search, limit, {"time_limit": SEARCH_SECONDS})
+
+
+def measured(options: argparse.Namespace) -> dict[str, Any]:
+    trained = trainings(options)
+    data = partial(data_module, options.data, options.seed)
+    return paper_tables.measure(TABLE, trained, partial(methods, options, trained), data, options)
+
+
+def main() -> None:
+    run = ROOT / "runs" / "table2"
+    parser = paper_tables.options(__doc__, file=FILE, run=run, sets=TABLE.sets, steps=2000, pose_steps=400)
+    parser.add_argument("--drawn_steps", type=int, default=2000, help="on drawn maps (default: %(default)s)")
+    paper_tables.run(TABLE, parser, PAGES, measured)
