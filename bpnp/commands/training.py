@@ -84,6 +84,10 @@ class BpnpCLI(LightningCLI):
         self.command, self.held = command, held
         super().__init__(*args, **kwargs)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out what this process holds: `ddp_spawn` pickles the parser, which refers to the CLI."""
+        return self.__dict__ | {"held": None}
+
     def subcommands(self) -> dict[str, set[str]]:  # type: ignore[override]
         """Return the one that was asked for: its parser alone takes a second to build."""
         return {self.command: super().subcommands()[self.command]}

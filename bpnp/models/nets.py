@@ -92,13 +92,14 @@ class MaskedBatchNorm(nn.BatchNorm1d):
     """Batch norm over the real points of (b, k, c), or over the samples of (b, c).
 
     In training the statistics cover the batches of all processes, so that splitting a batch over processes changes
-    nothing; a batch with a single value per channel has no variance and uses the running statistics.
+    nothing; a batch with a single value per channel has no variance and uses the running statistics. With `momentum`
+    None these are the mean over all batches, as in `torch.nn.BatchNorm1d`.
     """
 
     running_mean: Tensor
     running_var: Tensor
     num_batches_tracked: Tensor
-    momentum: float
+    momentum: float | None
 
     def forward(self, x: Tensor, mask: Bool[Tensor, "b k"] | None = None) -> Tensor:
         mean, variance = self.running_mean, self.running_var
@@ -120,10 +121,11 @@ class MaskedBatchNorm(nn.BatchNorm1d):
             scatter = collectives.all_reduce(scatter)
         enough = count > 1
         with torch.no_grad():
-            rate = self.momentum * enough.to(self.running_mean.dtype)
+            self.num_batches_tracked += enough.squeeze()
+            latest = 1 / self.num_batches_tracked.clamp_min(1) if self.momentum is None else self.momentum
+            rate = latest * enough.to(self.running_mean.dtype)
             self.running_mean.lerp_(mean.to(self.running_mean.dtype), rate)
             self.running_var.lerp_((scatter / (count - 1).clamp_min(1)).to(self.running_var.dtype), rate)
-            self.num_batches_tracked += 1
         return torch.where(enough, mean, self.running_mean), torch.where(enough, scatter / count, self.running_var)
 
 

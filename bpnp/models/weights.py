@@ -110,6 +110,14 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
     path: a file, or the name of packaged weights.
     Raises FileNotFoundError if there is no such file, ValueError naming it if it is truncated, foreign or holds code.
     """
+    content = read_data(path, map_location=map_location)
+    if "state_dict" not in content:
+        raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {path}")
+    return upgrade(content)
+
+
+def read_data(path: str | Path, *, map_location: Any = "cpu") -> dict[str, Any]:
+    """Read a dict of tensors, numbers and plain containers that torch saved; errors as in `read_checkpoint`."""
     file = checkpoint_path(path)
     try:
         content = torch.load(file, map_location=map_location, weights_only=True)
@@ -118,9 +126,9 @@ def read_checkpoint(path: str | Path, *, map_location: Any = "cpu") -> dict[str,
         raise ValueError(
             f"expected a checkpoint of `bpnp fit`, got a file that cannot be read: {file} ({reason})"
         ) from error
-    if not isinstance(content, dict) or "state_dict" not in content:
+    if not isinstance(content, dict):
         raise ValueError(f"expected a checkpoint of `bpnp fit`, got a file without a `state_dict`: {file}")
-    return upgrade(content)
+    return content
 
 
 def solver_state(content: Mapping[str, Any]) -> dict[str, Tensor]:

@@ -14,10 +14,11 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from lightning.pytorch.utilities.rank_zero import rank_zero_info
 
 from bpnp.files import written_whole
-from bpnp.models.weights import read_checkpoint
+from bpnp.models.weights import read_checkpoint, read_data
 
 INTERRUPTED = "interrupted"
 BEFORE_POSE_LOSS = "before_pose_loss.ckpt"
+WEIGHTS_ALONE = "weights_alone"
 
 
 def newest_checkpoint(folder: Path) -> Path:
@@ -33,17 +34,24 @@ def newest_checkpoint(folder: Path) -> Path:
 
 
 class SafeCheckpointIO(TorchCheckpointIO):
-    """Checkpoints written whole or not at all, and read as data only, with one clear error for a file that is none."""
+    """Write checkpoints whole or not at all, and read them as data only, with one clear error for another file.
+
+    A strategy that starts its processes itself (`ddp_spawn`, `ddp_notebook`) passes the trained weights to the main
+    process in a file of weights alone, which is written under `WEIGHTS_ALONE`.
+    """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
         content = io.BytesIO()
-        torch.save(checkpoint, content)
+        torch.save(checkpoint if "state_dict" in checkpoint else {WEIGHTS_ALONE: dict(checkpoint)}, content)
         with written_whole(Path(path)) as temporary:
             temporary.write_bytes(content.getbuffer())
 
     def load_checkpoint(
         self, path: Any, map_location: Any = lambda storage, loc: storage, weights_only: bool | None = None
     ) -> dict[str, Any]:
+        content = read_data(path, map_location=map_location)
+        if WEIGHTS_ALONE in content:
+            return dict(content[WEIGHTS_ALONE])
         return read_checkpoint(path, map_location=map_location)
 
 

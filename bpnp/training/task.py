@@ -282,6 +282,9 @@ class BlindPnPTask(LightningModule):
             self.log("train/backward_failed", share, on_epoch=True, sync_dist=True)
         for each in counts:
             each.reset()
+        # In the last epoch of StochasticWeightAveraging, which only updates batch norms, Lightning steps without a
+        # backward pass, with the gradients that it finds.
+        self.zero_grad()
         clipped = [module.clipped for module in self.solver.modules() if isinstance(module, WeightedPnP)]
         if columns := sum(each.columns for each in clipped):
             self.log("train/clipped_columns", sum(each.clipped for each in clipped) / columns, sync_dist=True)

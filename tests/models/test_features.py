@@ -49,8 +49,9 @@ def test_padding_changes_no_gradient_in_training(net: nn.Module) -> None:
         assert (a - b).abs().max() < 1e-9
 
 
-def test_batch_norm_is_torchs_on_the_real_points() -> None:
-    ours, theirs = MaskedBatchNorm(5).double(), nn.BatchNorm1d(5).double()
+@pytest.mark.parametrize("momentum", [0.1, None], ids=["rate", "mean of all batches"])
+def test_batch_norm_is_torchs_on_the_real_points(momentum: float | None) -> None:
+    ours, theirs = MaskedBatchNorm(5, momentum=momentum).double(), nn.BatchNorm1d(5, momentum=momentum).double()
     theirs.load_state_dict(ours.state_dict())
     for _ in range(4):
         single, padded, mask = sets(5)

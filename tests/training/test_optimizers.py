@@ -2,63 +2,36 @@
 
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
 from lightning import Callback, LightningModule, Trainer
 from planted import plant
-from small_data import MESHES, SMALL_NET, quiet_trainer, small_net
-from torch import Tensor
+from small_data import quiet_trainer, small_net
 from torch.optim import Optimizer
 from torch.utils.data import DataLoader
+from trainer_observer import Observer, fit
 
-from bpnp.cli import main
 from bpnp.training.task import BlindPnPTask
 
 pytestmark = pytest.mark.slow
-SHORT = ["--trainer.max_steps=4", "--trainer.limit_val_batches=0", "--trainer.enable_progress_bar=false"]
+SHORT = ["--trainer.max_steps=4", "--trainer.limit_val_batches=0"]
+BROKEN = "--trainer.callbacks+=test_optimizers.Broken"
 OPTIMIZERS = ["torch.optim.Adam", "torch.optim.AdamW", "torch.optim.SGD", "torch.optim.RMSprop"]
 
 
-class Observer(Callback):
-    """Record the optimizer and the weights of each step; replace the gradient of step `broken` by NaN."""
-
-    broken = -1
-    optimizer: Optimizer
-    rates: list[float]
-    weights: list[Tensor]
-    task: LightningModule
-
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        Observer.optimizer, Observer.task = trainer.optimizers[0], pl_module
-        Observer.weights, Observer.rates = [flat(pl_module)], []
+class Broken(Callback):
+    """Replace a gradient of the third step by NaN."""
 
     def on_after_backward(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if trainer.global_step == Observer.broken:
+        if trainer.global_step == 2:
             next(p.grad for p in pl_module.parameters() if p.grad is not None)[0] = math.nan
-
-    def on_before_optimizer_step(self, trainer: Trainer, pl_module: LightningModule, optimizer: Optimizer) -> None:
-        Observer.rates.append(optimizer.param_groups[0]["lr"])
-
-    def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
-        Observer.weights.append(flat(pl_module))
-
-
-def flat(module: LightningModule) -> Tensor:
-    return torch.cat([p.detach().flatten() for p in module.parameters()])
-
-
-def fit(folder: Path, *options: str, broken: int = -1) -> None:
-    Observer.broken = broken
-    run = [f"--trainer.default_root_dir={folder}/run", f"--data.cache_dir={folder}"]
-    main(["fit", *MESHES, *SMALL_NET, *SHORT, *run, "--trainer.callbacks=test_optimizers.Observer", *options])
 
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_a_step_with_a_nan_gradient_is_skipped_and_counted(name: str, tmp_path: Path) -> None:
-    fit(tmp_path, f"--optimizer={name}", "--optimizer.lr=1e-3", "--optimizer.weight_decay=0.1", broken=2)
-    assert type(Observer.optimizer).__name__ == name.rpartition(".")[2]
+    fit(tmp_path, f"--optimizer={name}", "--optimizer.lr=1e-3", "--optimizer.weight_decay=0.1", *SHORT, BROKEN)
+    assert type(Observer.trainer.optimizers[0]).__name__ == name.rpartition(".")[2]
     before, after = Observer.weights[2], Observer.weights[3]
     assert torch.equal(before, after)
     assert Observer.weights[-1].isfinite().all()
@@ -67,35 +40,29 @@ def test_a_step_with_a_nan_gradient_is_skipped_and_counted(name: str, tmp_path: 
 
 
 def test_the_first_step_of_sgd_is_the_rate_times_the_gradient(tmp_path: Path) -> None:
-    fit(tmp_path, "--optimizer=torch.optim.SGD", "--optimizer.lr=0.25", "--trainer.max_steps=1")
-    gradient = torch.cat([p.grad.flatten() for p in Observer.task.parameters() if p.grad is not None])
-    moved = [b for b, p in zip(split(1), Observer.task.parameters(), strict=True) if p.grad is not None]
-    start = [a for a, p in zip(split(0), Observer.task.parameters(), strict=True) if p.grad is not None]
-    torch.testing.assert_close(torch.cat(start) - torch.cat(moved), 0.25 * gradient, rtol=1e-4, atol=1e-7)
-
-
-def split(step: int) -> list[Tensor]:
-    return list(Observer.weights[step].split([p.numel() for p in Observer.task.parameters()]))
+    fit(tmp_path, *SHORT, "--optimizer=torch.optim.SGD", "--optimizer.lr=0.25", "--trainer.max_steps=1")
+    moved = Observer.weights[0] - Observer.weights[1]
+    torch.testing.assert_close(moved, 0.25 * Observer.gradient, rtol=1e-4, atol=1e-7)
 
 
 def test_a_scheduler_of_the_command_line_sets_the_rate(tmp_path: Path) -> None:
     schedule = ["--lr_scheduler=torch.optim.lr_scheduler.ExponentialLR", "--lr_scheduler.gamma=0.5"]
     options = ["--optimizer=torch.optim.AdamW", "--optimizer.lr=1e-4", *schedule]
-    fit(tmp_path, *options, "--trainer.max_epochs=3", "--trainer.limit_train_batches=1")
+    fit(tmp_path, *SHORT, *options, "--trainer.max_epochs=3", "--trainer.limit_train_batches=1")
     assert Observer.rates == pytest.approx([1e-4, 5e-5, 2.5e-5])
 
 
 def test_an_optimizer_of_the_command_line_keeps_the_warm_up_of_the_task(tmp_path: Path) -> None:
-    fit(tmp_path, "--optimizer=torch.optim.AdamW", "--optimizer.lr=1e-4", "--model.warmup_steps=9")
+    fit(tmp_path, *SHORT, "--optimizer=torch.optim.AdamW", "--optimizer.lr=1e-4", "--model.warmup_steps=9")
     assert Observer.rates == pytest.approx([1e-5, 2e-5, 3e-5, 4e-5])
 
 
 def test_a_resumed_run_has_the_settings_of_its_command(tmp_path: Path) -> None:
-    fit(tmp_path, "--model.learning_rate=1e-4", "--model.weight_decay=0.1", "--trainer.max_steps=2")
+    fit(tmp_path, *SHORT, "--model.learning_rate=1e-4", "--model.weight_decay=0.1", "--trainer.max_steps=2")
     last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
-    fit(tmp_path, "--model.learning_rate=3e-6", "--model.weight_decay=0.2", last)
+    fit(tmp_path, *SHORT, "--model.learning_rate=3e-6", "--model.weight_decay=0.2", last)
     assert Observer.rates == [3e-6, 3e-6]
-    assert Observer.optimizer.param_groups[0]["weight_decay"] == 0.2
+    assert Observer.trainer.optimizers[0].param_groups[0]["weight_decay"] == 0.2
     assert (Observer.weights[1] - Observer.weights[0]).abs().max() < 4e-6  # a step of Adam is at most its rate
 
 
@@ -103,18 +70,19 @@ def test_a_resumed_run_keeps_a_reduced_rate(tmp_path: Path) -> None:
     plateau = ["--lr_scheduler=lightning.pytorch.cli.ReduceLROnPlateau", "--lr_scheduler.monitor=train/loss"]
     plateau += ["--lr_scheduler.patience=0", "--lr_scheduler.threshold=1e9", "--lr_scheduler.factor=0.5"]
     options = ["--optimizer=torch.optim.Adam", "--optimizer.lr=1e-4", *plateau, "--trainer.limit_train_batches=1"]
-    fit(tmp_path, *options, "--trainer.max_steps=3")
+    fit(tmp_path, *SHORT, *options, "--trainer.max_steps=3")
     reduced = Observer.rates[-1]
     assert reduced < 1e-4
-    fit(tmp_path, *options, "--trainer.max_steps=4", f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    fit(tmp_path, *SHORT, *options, "--trainer.max_epochs=9", last)
     assert Observer.rates[0] == reduced
 
 
 def test_a_checkpoint_of_another_optimizer_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fit(tmp_path, "--trainer.max_steps=1")
+    fit(tmp_path, *SHORT, "--trainer.max_steps=1")
     last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
     with pytest.raises(SystemExit):
-        fit(tmp_path, "--optimizer=torch.optim.RMSprop", last)
+        fit(tmp_path, *SHORT, "--optimizer=torch.optim.RMSprop", last)
     error = capsys.readouterr().err
     assert "The checkpoint was trained with Adam, and this run uses RMSprop." in error
 

@@ -1,0 +1,216 @@
+"""Options of Lightning's Trainer on the quickstart, at two steps: each changes a number that is known without it."""
+
+import csv
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from lightning import Callback, Trainer
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+from trainer_observer import Observer, command, fit, flat
+
+from bpnp.cli import main
+from bpnp.models.weights import read_checkpoint
+from bpnp.report import read_results
+from bpnp.training import SafeCheckpointIO
+
+pytestmark = pytest.mark.slow
+TWO_STEPS = ["--trainer.limit_train_batches=2", "--trainer.max_epochs=1", "--trainer.limit_val_batches=0"]
+TWO_EPOCHS = ["--trainer.limit_train_batches=1", "--trainer.max_epochs=2", "--trainer.limit_val_batches=0"]
+
+
+@pytest.fixture(autouse=True)
+def _one_thread() -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
+
+
+def saved(folder: Path, name: str = "last") -> dict[str, Any]:
+    return read_checkpoint(folder / "run" / "checkpoints" / f"{name}.ckpt")
+
+
+def state(folder: Path, name: str = "last") -> torch.Tensor:
+    """The parameters in a checkpoint, in the order of the observed task."""
+    content = saved(folder, name)["state_dict"]
+    return torch.cat([content[key].flatten() for key, _ in Observer.task.named_parameters()])
+
+
+def test_fast_dev_run_takes_one_step_and_writes_nothing(tmp_path: Path) -> None:
+    fit(tmp_path, "--trainer.fast_dev_run=true")
+    assert len(Observer.problems) == 1
+    assert Observer.validated == [0]
+    assert not list((tmp_path / "run").rglob("*.ckpt"))
+
+
+def test_overfit_batches_repeats_one_batch(tmp_path: Path) -> None:
+    fit(tmp_path, "--trainer.overfit_batches=1", "--trainer.max_epochs=2")
+    assert len(Observer.problems) == 2
+    assert Observer.problems[0] == Observer.problems[1]
+
+
+def test_limits_count_batches(tmp_path: Path) -> None:
+    limits = ["--trainer.limit_train_batches=3", "--trainer.limit_val_batches=1", "--trainer.limit_test_batches=1"]
+    fit(tmp_path, *limits, "--trainer.max_epochs=1", "--data.eval_batch_size=2")
+    assert len(Observer.problems) == 3
+    assert Observer.validated == [0]
+    last = f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt"
+    main(command(tmp_path, *limits, "--data.eval_batch_size=2", last, word="test"))
+    assert read_results(tmp_path / "run" / "test").problems == 2
+
+
+def test_accumulated_gradients_step_once_for_two_batches(tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS, "--trainer.accumulate_grad_batches=2")
+    assert (len(Observer.problems), len(Observer.rates), saved(tmp_path)["global_step"]) == (2, 1, 1)
+    assert torch.equal(Observer.weights[0], Observer.weights[1])
+    assert not torch.equal(Observer.weights[1], Observer.weights[2])
+
+
+def test_early_stopping_ends_the_training(tmp_path: Path) -> None:
+    stop = ["--trainer.callbacks+=EarlyStopping", "--trainer.callbacks.monitor=val/correspondence_loss"]
+    fit(tmp_path, *stop, "--trainer.callbacks.stopping_threshold=10", "--trainer.limit_train_batches=1")
+    assert (Observer.trainer.current_epoch, len(Observer.problems)) == (1, 1)  # of 3 epochs
+
+
+def test_a_checkpoint_callback_of_the_user_writes_beside_ours(tmp_path: Path) -> None:
+    own = ["--trainer.callbacks+=ModelCheckpoint", "--trainer.callbacks.every_n_train_steps=1"]
+    own += ["--trainer.callbacks.save_top_k=-1", f"--trainer.callbacks.dirpath={tmp_path}/own"]
+    fit(tmp_path, *TWO_STEPS, *own, "--trainer.callbacks.filename={step}")
+    assert sorted(path.name for path in (tmp_path / "own").iterdir()) == ["step=1.ckpt", "step=2.ckpt"]
+    assert read_checkpoint(tmp_path / "own" / "step=1.ckpt")["global_step"] == 1
+    assert saved(tmp_path)["global_step"] == 2
+
+
+def test_the_rate_finder_sets_the_rate_of_the_training(tmp_path: Path) -> None:
+    find = ["--trainer.callbacks+=LearningRateFinder", "--trainer.callbacks.num_training_steps=20"]
+    find += ["--trainer.callbacks.min_lr=1e-6", "--trainer.callbacks.max_lr=0.1"]
+    fit(tmp_path, *find, "--trainer.max_steps=2", "--trainer.limit_val_batches=0", "--data.train_problems=88")
+    finder = next(each for each in Observer.trainer.callbacks if type(each).__name__ == "LearningRateFinder")
+    suggested = finder.optimal_lr.suggestion()
+    assert suggested not in (None, 1e-4)  # the rate of the quickstart
+    assert Observer.rates == [suggested] * 2
+
+
+def test_stochastic_weight_averaging_ends_at_the_mean_of_the_epochs(tmp_path: Path) -> None:
+    average = ["--trainer.callbacks+=StochasticWeightAveraging", "--trainer.callbacks.swa_lrs=1e-3"]
+    average += ["--trainer.callbacks.swa_epoch_start=2", "--trainer.callbacks.annealing_epochs=1"]
+    fit(tmp_path, *TWO_EPOCHS, *average, "--trainer.max_epochs=3")
+    # Lightning averages the weights that the second and the third epoch begin with.
+    expected = (Observer.weights[1] + Observer.weights[2]) / 2
+    torch.testing.assert_close(flat(Observer.task), expected)
+
+
+def test_an_exponential_moving_average_is_what_is_saved(tmp_path: Path) -> None:
+    average = ["--trainer.callbacks+=EMAWeightAveraging", "--trainer.callbacks.decay=0.75"]
+    fit(tmp_path, *TWO_STEPS, *average, "--model.learning_rate=1e-2")
+    _, first, second = Observer.weights
+    expected = 0.75 * first + 0.25 * second  # the average begins at the first update
+    torch.testing.assert_close(state(tmp_path), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("precision", "features", "weights"),
+    [("bf16-mixed", torch.bfloat16, torch.float32), ("64-true", torch.float64, torch.float64)],
+)
+def test_precision(precision: str, features: torch.dtype, weights: torch.dtype, tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS, f"--trainer.precision={precision}")
+    assert Observer.dtypes == {features}
+    assert state(tmp_path).dtype == weights
+    assert Observer.task.skipped_steps == 0
+
+
+class Ranks(Callback):
+    """Append the number of processes and the problems of each step to a file of each process."""
+
+    def on_train_batch_end(self, trainer: Trainer, pl_module: Any, outputs: Any, batch: Any, batch_idx: int) -> None:
+        with open(f"{trainer.default_root_dir}/rank{trainer.global_rank}", "a") as file:
+            file.write(f"{trainer.world_size} {len(batch)} {','.join(batch.ids)}\n")
+
+
+@pytest.mark.parametrize("strategy", ["ddp", "ddp_spawn"])
+def test_two_processes_share_each_batch(strategy: str, tmp_path: Path) -> None:
+    options = [*TWO_STEPS, f"--trainer.strategy={strategy}", "--trainer.devices=2", "--trainer.accelerator=cpu"]
+    line = [sys.executable, "-m", "bpnp", *command(tmp_path, *options)]
+    line.append("--trainer.callbacks=test_trainer_options.Ranks")
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "CUDA_VISIBLE_DEVICES": ""}
+    environment["PYTHONPATH"] = os.pathsep.join(sys.path)
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, check=False, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert saved(tmp_path)["global_step"] == 2
+    steps = [(tmp_path / "run" / f"rank{rank}").read_text().split() for rank in (0, 1)]
+    assert [each[:2] + each[3:5] for each in steps] == [["2", "2"] * 2] * 2  # of a batch of 4
+    problems = [name for each in steps for names in (each[2], each[5]) for name in names.split(",")]
+    assert len(set(problems)) == 8
+
+
+def test_the_weights_that_a_process_passes_on_are_read_as_they_were(tmp_path: Path) -> None:
+    """`ddp_spawn` and `ddp_notebook` write a state without a checkpoint around it."""
+    files, weights = SafeCheckpointIO(), {"solver.a": torch.arange(3.0), "solver.b": torch.ones(())}
+    files.save_checkpoint(weights, tmp_path / ".temp.ckpt")
+    read = files.load_checkpoint(tmp_path / ".temp.ckpt")
+    assert read.keys() == weights.keys()
+    assert all(torch.equal(read[name], value) for name, value in weights.items())
+
+
+def test_the_csv_logger_has_a_row_for_each_step(tmp_path: Path) -> None:
+    fit(tmp_path, *TWO_STEPS, "--trainer.log_every_n_steps=1")
+    (file,) = (tmp_path / "run").rglob("metrics.csv")
+    with file.open(newline="") as rows:
+        losses = [float(row["train/loss"]) for row in csv.DictReader(rows) if row.get("train/loss")]
+    assert len(losses) == 2
+    assert losses[-1] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]))
+
+
+def test_the_tensorboard_logger_has_the_loss_of_each_step(tmp_path: Path) -> None:
+    logger = ["--trainer.logger=TensorBoardLogger", f"--trainer.logger.save_dir={tmp_path}/board"]
+    fit(tmp_path, *TWO_STEPS, *logger, "--trainer.log_every_n_steps=1")
+    (file,) = (tmp_path / "board").rglob("events.out.tfevents.*")
+    events = EventAccumulator(str(file)).Reload()
+    losses = [event.value for event in events.Scalars("train/loss")]
+    assert len(losses) == 2
+    assert losses[-1] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]), rel=1e-6)
+
+
+def test_the_wandb_logger_has_the_loss_of_the_last_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    logger = ["--trainer.logger=WandbLogger", f"--trainer.logger.save_dir={tmp_path}/wandb"]
+    logger += ["--trainer.logger.project=bpnp", "--trainer.logger.offline=true"]
+    fit(tmp_path, *TWO_STEPS, *logger, "--trainer.log_every_n_steps=1")
+    run = Observer.trainer.loggers[0].experiment
+    assert run.summary["trainer/global_step"] == 1
+    assert run.summary["train/loss"] == pytest.approx(float(Observer.trainer.callback_metrics["train/loss"]))
+    run.finish()
+
+
+class Stop(Callback):
+    """Ctrl-C after the first step."""
+
+    def on_train_batch_end(self, *_: Any) -> None:
+        raise KeyboardInterrupt
+
+
+def test_a_run_goes_on_after_ctrl_c(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit) as ended:
+        fit(tmp_path, "--trainer.callbacks+=test_trainer_options.Stop", "--trainer.max_steps=2")
+    assert ended.value.code == 130
+    assert saved(tmp_path, "interrupted")["global_step"] == 1
+    stopped = state(tmp_path, "interrupted")
+    fit(tmp_path, "--trainer.max_steps=3", f"--ckpt_path={tmp_path}/run/checkpoints/interrupted.ckpt")
+    assert len(Observer.rates) == 2
+    torch.testing.assert_close(stopped, Observer.weights[0])
+    assert saved(tmp_path)["global_step"] == 3
+
+
+def test_a_run_resumed_after_the_switch_has_the_pose_loss_from_its_first_step(tmp_path: Path) -> None:
+    switch = ["--pose_loss.start_epoch=1", "--pose_loss.weight=0.5"]
+    fit(tmp_path, *TWO_EPOCHS, *switch)
+    assert Observer.pose_weights == [0, 0.5]
+    later = ["--pose_loss.start_epoch=90", "--pose_loss.weight=0.5", "--trainer.max_epochs=3"]
+    fit(tmp_path, *TWO_EPOCHS, *later, f"--ckpt_path={tmp_path}/run/checkpoints/last.ckpt")
+    assert Observer.pose_weights == [0.5]
