@@ -28,7 +28,8 @@ from bpnp.models.weights import checkpoint_path, pretrained_names
 
 SETS = {"modelnet10": 500, "psb": 100}  # test shapes
 TABLE = Table("table1", "modelnet40", (15.0, 0.5), tuple(SETS))
-FILE, PAGES = ROOT / "benchmarks" / "table1.json", (ROOT / "docs" / "table1.md", ROOT / "README.md")
+FILE = ROOT / "benchmarks" / "table1.json"
+PAGES = (ROOT / "README.md", ROOT / "docs" / "index.md", ROOT / "docs" / "table1.md")
 PACKAGED = ("procedural-euler", "paper-lc", "paper-lclp")
 BASELINES: dict[str, Callable[[], nn.Module]] = {"SoftPOSIT": SoftPOSIT, "RANSAC": RandomRansac, "GOSMA": GOSMA}
 SEARCH_SECONDS = 10.0
