@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from bpnp.checks import Arrays, checked_match, checked_points, listed, stacked
+from bpnp.checks import Arrays, check_normalised, checked_match, checked_points, listed, stacked
 from bpnp.geometry import is_finite
 
 _T = TypeVar("_T")
@@ -158,8 +158,8 @@ class Batch(Tensors):
         (3,), match3d (n,) and focal () likewise, or one focal for all. Padding is zero. The dtype is float64 if a 2D
         array is, else float32; the batch is on the CPU.
 
-        Raises ValueError that names the argument: wrong shape, NaN or infinity, no points, lists of different length,
-        or a match3d that holds no integers or an index that is no 2D point.
+        Raises ValueError that names the argument: wrong shape, NaN or infinity, pixels, no points, lists of different
+        length, or a match3d that holds no integers or an index that is no 2D point.
 
         >>> batch = Batch.from_arrays([torch.rand(5, 2), torch.rand(7, 2)], [torch.rand(9, 3), torch.rand(6, 3)])
         >>> tuple(batch.points2d.shape), batch.count2d.tolist(), batch.count3d.tolist()
@@ -169,6 +169,8 @@ class Batch(Tensors):
         size = len(sets2d)
         dtype = torch.float64 if any(x.dtype == torch.float64 for x in sets2d) else torch.float32
         sets2d = [checked_points("points2d", i, x, 2).to(dtype) for i, x in enumerate(sets2d)]
+        for points in sets2d:
+            check_normalised(points.detach(), "(points2d - principal point) / focal length")
         sets3d = [checked_points("points3d", i, x, 3).to(dtype) for i, x in enumerate(sets3d)]
         rotations = None if rotation is None else listed("rotation", rotation, 2)
         translations = None if translation is None else listed("translation", translation, 1)

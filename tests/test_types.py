@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+import bpnp
 from bpnp import Batch, Pose, SolveStats
+from bpnp.examples import load
 from bpnp.types import Prediction
 
 
@@ -148,3 +150,14 @@ def test_a_prediction_moves_with_its_poses() -> None:
     assert moved.poses["pnp"].rotation.dtype == moved.poses["pnp"].stats.residual.dtype == torch.float64
     assert moved.poses["pnp"].stats.iterations.dtype == torch.long
     assert moved.assignment is None
+
+
+def test_pixels_are_refused_as_bpnp_solve_refuses_them() -> None:
+    example = load("mesh")
+    with pytest.raises(ValueError, match="look like pixels; try camera=K") as solving:
+        bpnp.solve(example.points2d, example.points3d)
+    with pytest.raises(ValueError, match="look like pixels; try .points2d - principal point") as batching:
+        Batch.from_arrays(example.points2d, example.points3d)
+    assert str(solving.value).partition(";")[0] == str(batching.value).partition(";")[0]
+    focal, centre = example.camera[0, 0], example.camera[:2, 2]
+    assert len(Batch.from_arrays((example.points2d - centre) / focal, example.points3d)) == 1

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from bpnp.datamodules.shapes import SUFFIXES, MeshError, Sampler, Shapes, mesh_shapes, shape_files
+from bpnp.datamodules.shapes import SUFFIXES, MeshError, Sampler, Shapes, mesh_shapes, shape_files, training_first
 from bpnp.files import files_as_they_are, fingerprint
 
 TEXTS = (".txt", ".xyz")
@@ -74,12 +74,13 @@ def open_shapes(source: Path) -> Shapes:
     """Find the shapes of a folder.
 
     Args:
-        source: folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or its parent; or one
-            of the two archives in which ModelNet40's point clouds are spread: `modelnet40_ply_hdf5_2048` (HDF5) and
-            `modelnet40_normal_resampled` (text).
+        source: folder of meshes or point clouds in ModelNet40's layout, <class>/{train,test}/*, or a folder of such
+            folders; or one of the two archives in which ModelNet40's point clouds are spread:
+            `modelnet40_ply_hdf5_2048` (HDF5) and `modelnet40_normal_resampled` (text).
 
     Returns:
-        The shapes, named ``<class>/<split>/<stem>``, training shapes first.
+        The shapes, named ``<class>/<split>/<stem>``, training shapes first. The name has the suffix of the file where
+        several files of a folder have one stem, and begins with the folder where several folders have shapes.
 
     Raises:
         ValueError: The folder is missing or has no shape. The message names it.
@@ -87,15 +88,28 @@ def open_shapes(source: Path) -> Shapes:
     """
     if not source.is_dir():
         raise ValueError(f"{source} is not a folder; a folder with {LAYOUT} is needed (unpack the archive first)")
-    for folder in (source, *sorted(path for path in source.iterdir() if path.is_dir())):
-        if found := _hdf5_shapes(folder) or _listed_shapes(folder):
-            return found
-        if files := shape_files(folder, (*SUFFIXES, *CLOUD_SUFFIXES)):
-            meshes = {name: path for name, path in files.items() if not is_cloud(path)}
-            clouds = {name: partial(_cloud_samples, name, files[name]) for name in files.keys() - meshes.keys()}
-            samplers = mesh_shapes(meshes) | clouds
-            return Shapes({name: samplers[name] for name in files}, _identity(files))
-    raise ValueError(f"{source} has no shapes; a folder with {LAYOUT} is needed")
+    if found := _shapes_in(source):
+        return found
+    folders = {path.name: _shapes_in(path) for path in sorted(source.iterdir()) if path.is_dir()}
+    parts = {name: shapes for name, shapes in folders.items() if shapes is not None}
+    if not parts:
+        raise ValueError(f"{source} has no shapes; a folder with {LAYOUT} is needed")
+    if len(parts) == 1:
+        return next(iter(parts.values()))
+    samplers = {f"{folder}/{name}": make for folder, shapes in parts.items() for name, make in shapes.samplers.items()}
+    ordered = {name: samplers[name] for name in sorted(samplers, key=training_first)}
+    return Shapes(ordered, fingerprint([[folder, shapes.identity] for folder, shapes in parts.items()]))
+
+
+def _shapes_in(folder: Path) -> Shapes | None:
+    """Find the shapes of one folder in any of the layouts of `open_shapes`; None if it has none."""
+    if found := _hdf5_shapes(folder) or _listed_shapes(folder):
+        return found
+    files = shape_files(folder, (*SUFFIXES, *CLOUD_SUFFIXES))
+    meshes = {name: path for name, path in files.items() if not is_cloud(path)}
+    clouds = {name: partial(_cloud_samples, name, files[name]) for name in files.keys() - meshes.keys()}
+    samplers = mesh_shapes(meshes) | clouds
+    return Shapes({name: samplers[name] for name in files}, _identity(files)) if files else None
 
 
 def _identity(files: Mapping[str, Path]) -> str:

@@ -4,6 +4,7 @@ import io
 import math
 import re
 import zlib
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -261,13 +262,23 @@ def primitives() -> tuple[Mesh, ...]:
 
 
 def shape_files(folder: Path, suffixes: Sequence[str] = SUFFIXES) -> dict[str, Path]:
-    """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first."""
-    named = {
-        f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}": path
-        for path in folder.glob("*/[!.]*/[!.]*")
-        if path.suffix.lower() in suffixes and path.parent.name.lower() in ("train", "test") and path.is_file()
+    """Find <class>/{train,test}/<stem><suffix> in a folder, by ``<class>/<split>/<stem>``, training shapes first.
+
+    Files of one folder and one stem are named with their suffix.
+    """
+    named: dict[str, list[Path]] = defaultdict(list)
+    for path in sorted(folder.glob("*/[!.]*/[!.]*")):
+        if path.suffix.lower() in suffixes and path.parent.name.lower() in ("train", "test") and path.is_file():
+            named[f"{path.parent.parent.name}/{path.parent.name.lower()}/{path.stem}"].append(path)
+    files = {
+        name if len(paths) == 1 else f"{name}{path.suffix}": path for name, paths in named.items() for path in paths
     }
-    return {name: named[name] for name in sorted(named, key=lambda name: ("/test/" in name, name))}
+    return {name: files[name] for name in sorted(files, key=training_first)}
+
+
+def training_first(name: str) -> tuple[bool, str]:
+    """Sort key of the name of a shape."""
+    return "/test/" in name, name
 
 
 def mesh_shapes(files: Mapping[str, Path]) -> dict[str, Sampler]:

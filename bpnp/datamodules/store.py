@@ -6,12 +6,13 @@ compared with the manifest's checksum when the store is opened.
 """
 
 import json
+import os
 import shutil
 import warnings
 import zlib
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -114,6 +115,13 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
         )
     if not whole:
         raise StoreError(f"expected an unchanged {folder / MANIFEST}, got an edited or cut one; try preparing again")
+    columns = {f"{name}.npy" for name in (*manifest["bulk"], *(f"{name}_start" for name in manifest["bulk"]))}
+    columns |= {f"{name}.npy" for name in manifest["columns"]}
+    if columns != manifest["files"].keys() or any(Path(name).name != name for name in columns):
+        raise StoreError(
+            f"{folder / MANIFEST} names files other than the columns in its folder: {', '.join(manifest['files'])}. "
+            "Prepare the data set again."
+        )
     return manifest
 
 
@@ -213,21 +221,33 @@ class Recipe(Dataset[Made]):
 
 
 def prepare(recipe: Recipe, output: Path, *, processes: int = 1, wait_for_others: bool = False) -> Store:
-    """The store `output`, made unless it is there already, in the same way; a run that is stopped leaves nothing.
+    """Open the store `output`, or make it; a run that is stopped leaves nothing.
 
-    Raises StoreError if `output` is something else or was made with other parameters, or if no job gives a row;
-    ValueError if another process is making it, unless `wait_for_others`; whatever `work` raises.
+    The store is made in a folder beside `output`, which only this function writes to; what a killed process has left
+    there is removed.
+
+    Args:
+        recipe: how the store is made.
+        output: folder of the store.
+        processes: that read the source.
+        wait_for_others: whether to wait for another process that is making the store.
+
+    Raises:
+        StoreError: `output` is something else or was made with other parameters, or no job gives a row.
+        ValueError: another process is making the store, and `wait_for_others` is False.
     """
     if not is_store(output):
         if output.exists() and not is_store(output):  # unless another process has just made it
             raise StoreError(f"expected a new folder as output, got {output}, which is no store of bpnp; try another")
-        claim = output.with_name(f".{output.name}.unfinished")
-        with claimed(claim, wait=wait_for_others):
-            if not is_store(output):  # another process may have made it
-                for left in output.parent.glob(f".{output.name}.[0-9]*"):  # by a process that was killed
-                    shutil.rmtree(left, ignore_errors=True)
-                _make(recipe, output, processes)
-        shutil.rmtree(claim, ignore_errors=True)
+        work = output.with_name(f".{output.name}.unfinished")
+        try:
+            with claimed(work, wait=wait_for_others):
+                if not is_store(output):  # another process may have made it
+                    _make(recipe, work / "store", processes)
+                    os.replace(work / "store", output)
+        finally:
+            with suppress(OSError):  # another process is using it, or it is not ours
+                work.rmdir()
     store = open_store(output, recipe.kind)
     if different := sorted(key for key, value in recipe.parameters.items() if store.parameters.get(key) != value):
         raise StoreError(
@@ -263,6 +283,8 @@ def cached(recipe: Recipe, label: str, cache_dir: str | None) -> Store:
 
 
 def _make(recipe: Recipe, output: Path, processes: int) -> None:
+    for left in (output, *output.parent.glob(f".{output.name}.[0-9]*")):  # by a process that was killed
+        shutil.rmtree(left, ignore_errors=True)
     made, console = _made(recipe, processes), Console(stderr=True)
     with new_store(output, recipe.kind, recipe.widths) as writer:
         writer.parameters |= recipe.parameters

@@ -1,7 +1,6 @@
 """Work on the CPU: how it is shared among threads or processes, and ended when its time is over."""
 
 import math
-import multiprocessing
 import os
 import signal
 import threading
@@ -13,6 +12,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import ContextDecorator
 from dataclasses import dataclass
 from functools import lru_cache
+from multiprocessing.context import ForkContext, ForkProcess
 from typing import Any, TypeVar
 
 import torch
@@ -52,7 +52,7 @@ def in_processes(work: Callable[[int], Result], items: Sequence[int], count: int
     For work that is mostly Python, which threads would do one after the other.
     Raises what a worker raises, and RuntimeError if one is killed; all of them end with the iteration.
     """
-    others, context = multiprocessing.active_children(), multiprocessing.get_context("fork")
+    context = _Recording()
     pool = ProcessPoolExecutor(min(count, len(items)), context, initializer=_begin, initargs=(work,))
     try:
         with warnings.catch_warnings():
@@ -66,9 +66,21 @@ def in_processes(work: Callable[[int], Result], items: Sequence[int], count: int
             "(torch.set_num_threads, OMP_NUM_THREADS)"
         ) from error
     finally:
-        for worker in set(multiprocessing.active_children()) - set(others):
+        for worker in context.started:
             worker.kill()  # what they work on is not waited for
         pool.shutdown(cancel_futures=True)
+
+
+class _Recording(ForkContext):
+    """A context that records the processes it starts."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.started: list[ForkProcess] = []
+
+    def Process(self, *arguments: Any, **options: Any) -> ForkProcess:  # type: ignore[override]
+        self.started.append(ForkProcess(*arguments, **options))
+        return self.started[-1]
 
 
 def _begin(work: Callable[[int], Any]) -> None:

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from torch import nn
 
 from bpnp.cameras import CENTRE, Camera, is_opencv
+from bpnp.checks import check_normalised
 from bpnp.search.starts import GravityPrior, PosePrior
 
 Array = npt.NDArray[np.float64]
@@ -21,7 +22,6 @@ Prior = PosePrior | GravityPrior | nn.Module  # a TrainedNet
 ROUNDING = 1e-12  # of R R^T: a rotation in float64; others are made orthonormal
 UNIT = 1e-3  # largest error of a length, of a rotation, and of a sum of probabilities
 SURE = 0.97  # probability of a class from which a search matches a point to none of another one
-WIDEST = 10.0  # half the points 84 degrees off the axis: these are pixels
 INSIDE_ONE_PIXEL = 3.0
 WIDEST_ROW = 8  # numbers of a keypoint; an array with more columns is the wrong way round
 
@@ -243,11 +243,8 @@ def unit_bearings(rays: Array) -> Array:
 def check_unit(points2d: Array, camera: Camera | None) -> None:
     """Raise ValueError for pixels without a camera, or the reverse."""
     largest = np.abs(points2d).max()
-    if camera is None and np.median(np.linalg.norm(points2d, axis=-1)) > WIDEST:
-        raise ValueError(
-            f"expected normalised image coordinates without a `camera`, got values up to {largest:g}, which look "
-            "like pixels; try camera=K"
-        )
+    if camera is None:
+        check_normalised(points2d, "camera=K")
     if camera is not None and largest < INSIDE_ONE_PIXEL and camera.focal > 100:
         raise ValueError(
             f"expected pixels with a `camera`, got values up to {largest:g}, which look normalised; try without the "

@@ -174,6 +174,46 @@ def test_ctrl_c_says_that_nothing_was_written(
         main(["prepare", "modelnet40", str(meshes), "--output", str(tmp_path / "store"), "--processes", "1"])
     assert ended.value.code == 130
     assert "bpnp: interrupted; nothing was written, run it again to start anew" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["ModelNet40"]
+
+
+def test_folders_of_the_user_beside_the_store_stay(meshes: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    mine = [out / ".store.2024-notes" / "a.txt", out / ".store.unfinished" / "b.txt", out / ".store.1" / "c.txt"]
+    for file in mine:
+        file.parent.mkdir(parents=True)
+        file.write_text("mine")
+    run(meshes, out / "store")
+    assert [file.read_text() for file in mine] == ["mine"] * 3
+    assert sorted(path.name for path in out.iterdir()) == sorted([*(file.parent.name for file in mine), "store"])
+
+
+def test_a_folder_of_folders_gives_the_shapes_of_all(meshes: Path, tmp_path: Path) -> None:
+    both = tmp_path / "both"
+    shutil.copytree(meshes, both / "A")
+    shutil.copytree(meshes, both / "B")
+    (both / "C").mkdir()
+    store = run(both, tmp_path / "store")
+    splits = [name.split("/")[2] for name in names(store)]
+    assert splits == ["train"] * 16 + ["test"] * 8
+    assert {name.split("/")[0] for name in names(store)} == {"A", "B"}
+    first = next(row for row, name in enumerate(names(store)) if name.startswith("B/"))
+    mesh = read_mesh(both / f"{names(store)[first]}.off")
+    high, low = mesh.vertices.max(0), mesh.vertices.min(0)
+    spread = store.row(first)[POINTS].max(0) - store.row(first)[POINTS].min(0)
+    assert spread / spread[2] == pytest.approx((high - low) / (high - low)[2], rel=0.2)
+
+
+def test_files_of_one_stem_are_shapes_of_their_own(tmp_path: Path) -> None:
+    folder = tmp_path / "data" / "box" / "train"
+    folder.mkdir(parents=True)
+    for suffix, size in (("off", 1), ("obj", 2), ("ply", 3)):
+        trimesh.creation.box((1, 2, 3 + size)).export(folder / f"a.{suffix}")
+    trimesh.creation.box((1, 2, 3)).export(folder / "b.off")
+    samplers = open_shapes(tmp_path / "data").samplers
+    assert list(samplers) == ["box/train/a.obj", "box/train/a.off", "box/train/a.ply", "box/train/b"]
+    heights = [np.ptp(make(4000)[:, 2]) for make in samplers.values()]
+    assert heights == pytest.approx([5, 4, 6, 3], abs=0.05)
 
 
 def test_a_worker_that_is_killed_is_one_error(meshes: Path, tmp_path: Path) -> None:

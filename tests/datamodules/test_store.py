@@ -3,12 +3,14 @@
 import json
 import os
 import resource
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from bpnp.datamodules.store import Store, StoreError, is_store, new_store, open_store
+from bpnp.files import fingerprint
 
 WIDTHS = {"flat": 2, "deep": 3}
 
@@ -71,6 +73,25 @@ def test_a_broken_or_edited_manifest_and_another_kind_are_noticed(store: Store) 
         path.write_text(content)
         with pytest.raises(StoreError, match="edited" if "13" in content else str(store.folder)):
             open_store(store.folder, "toy")
+
+
+@pytest.mark.parametrize("part", ["bulk", "columns", "files"])
+def test_a_manifest_that_names_a_file_elsewhere_is_refused(store: Store, part: str) -> None:
+    """The other file is a whole column, and the manifest has its checksum."""
+    path = store.folder / "manifest.json"
+    manifest = json.loads(path.read_text())
+    content = (store.folder / "number.npy").read_bytes()
+    (store.folder.parent / "x.npy").write_bytes(content)
+    if part == "files":
+        manifest["files"]["../x.npy"] = [len(content), zlib.crc32(content)]
+    else:
+        manifest[part].append("../x")
+        manifest["files"] |= {"../x.npy": [len(content), zlib.crc32(content)]}
+        manifest["files"] |= {"../x_start.npy": [1, 1]} if part == "bulk" else {}
+    del manifest["checksum"]
+    path.write_text(json.dumps(manifest | {"checksum": fingerprint(manifest)}))
+    with pytest.raises(StoreError, match="names files other than the columns in its folder"):
+        open_store(store.folder, "toy")
 
 
 def test_a_failed_write_leaves_nothing(tmp_path: Path, store: Store) -> None:

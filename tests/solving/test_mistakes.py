@@ -95,7 +95,7 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("sky", {"points3d": X}, r"expected `points3d` of shape \(k, 3\)"),
         ("sky", {"points2d": PIXELS[:2]}, "expected 3 or more points in `points2d`"),
         ("sky", {"points2d": X}, "expected pixels with a `camera`"),
-        ("sky", {"camera": None}, "expected normalised image coordinates without a `camera`"),
+        ("sky", {"camera": None}, "expected normalised image coordinates in `points2d`"),
         ("sky", {"prior": NO_PRIOR}, "expected no `prior` with `at_infinity`, got Pose"),
         ("sky", {"normals3d": P}, "expected no `normals3d` with `at_infinity`"),
         ("sky", {"labels2d": [1], "labels3d": [1]}, "expected no `labels2d` with `at_infinity`"),

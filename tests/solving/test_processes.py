@@ -4,6 +4,7 @@ import math
 import multiprocessing
 import os
 import signal
+import threading
 import time
 from collections.abc import Iterator
 
@@ -72,3 +73,20 @@ def test_an_iteration_that_is_left_leaves_no_process() -> None:
     next(some)
     some.close()  # type: ignore[attr-defined]
     assert multiprocessing.active_children() == []
+
+
+def test_a_child_of_another_thread_goes_on() -> None:
+    """It is started while the iteration runs, so it is not among the children at the beginning."""
+    some = in_processes(lambda item: item, range(1000), 2)
+    next(some)
+    child = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
+    thread = threading.Thread(target=child.start)
+    thread.start()
+    thread.join()
+    some.close()  # type: ignore[attr-defined]
+    try:
+        assert multiprocessing.active_children() == [child]
+        assert child.is_alive()
+    finally:
+        child.kill()
+        child.join()
