@@ -200,8 +200,8 @@ def table(
             changes, folder = [*changes, f"--data.seed={seed}"], folder / f"seed-{seed}"
         described = read_data(recipe, changes)
         for method in chosen:
-            name = "".join(letter if letter.isalnum() or letter in "-_." else "-" for letter in method.label)
-            tests.setdefault((share, method.label), []).append(MethodTest(method, described, folder / name, limit))
+            test = MethodTest(method, described, folder / method.folder_name, limit)
+            tests.setdefault((share, method.label), []).append(test)
     every = [test for several in tests.values() for test in several]
     out = console()
     with ExitStack() as held:

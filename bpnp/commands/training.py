@@ -28,7 +28,7 @@ from bpnp.commands.parser import OneLineParser
 from bpnp.files import claimed, config_content, write_text
 from bpnp.models.weights import PARTS, class_name, is_description, networks, read_checkpoint
 from bpnp.report.terminal import console, say
-from bpnp.training.callbacks import EpochLines, PoseLossWarmup, ResultsWriter
+from bpnp.training.callbacks import PoseLossWarmup, ProgressLines, ResultsWriter
 from bpnp.training.checkpoints import (
     BestCheckpoint,
     InterruptedCheckpoint,
@@ -186,7 +186,7 @@ class BpnpCLI(LightningCLI):
         callbacks: list[Callback] = [InterruptedCheckpoint(_checkpoint_folder(root))]
         bar = options["enable_progress_bar"] is not False and console().is_interactive
         if not any(isinstance(callback, ProgressBar) for callback in _listed(options["callbacks"])):
-            callbacks.append(RichProgressBar() if bar else EpochLines())
+            callbacks.append(RichProgressBar() if bar else ProgressLines())
             kwargs["enable_progress_bar"] = bar
         self.trainer_defaults["callbacks"] = callbacks
         # Not a default of the trainer: an object among the defaults could not be written to config.yaml.

@@ -87,21 +87,43 @@ class PoseLossWarmup(Callback):
         pl_module.pose_weight = self.configured  # type: ignore[assignment]
 
     def state_dict(self) -> dict[str, Any]:
-        return {"switched_at": self.switched_at}
+        return {"switched_at": self.switched_at, "start_epoch": self.start_epoch, "weight": self.weight}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         self.switched_at = state_dict["switched_at"]
+        for name in ("start_epoch", "weight"):  # which version 0.2 did not save
+            saved, own = state_dict.get(name, getattr(self, name)), getattr(self, name)
+            if saved != own:
+                rank_zero_info(f"The pose loss has {name}={own} (saved: {saved}).")
 
 
-class EpochLines(Callback):
-    """Prints a line after each epoch of a training, for logs and pipes, where a progress bar shows nothing."""
+class ProgressLines(Callback):
+    """Print a line after each epoch of a training and each tenth of a test or prediction: for pipes, where a progress
+    bar shows nothing."""
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         names = [name for name in LINE if name in trainer.callback_metrics] or list(trainer.callback_metrics)[:4]
         values = ", ".join(f"{name} {float(trainer.callback_metrics[name]):.4g}" for name in names)
+        last = f"/{trainer.max_epochs}" if (trainer.max_epochs or 0) > 0 else ""
+        self._print(trainer, f"epoch {trainer.current_epoch + 1}{last}, step {trainer.global_step}: {values}")
+
+    def on_test_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_test_batches))
+
+    def on_predict_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int, *_: int
+    ) -> None:
+        self._print_tenth(trainer, batch_idx + 1, sum(trainer.num_predict_batches))
+
+    def _print_tenth(self, trainer: Trainer, done: int, total: int | float) -> None:
+        if done * 10 // total > (done - 1) * 10 // total:
+            self._print(trainer, f"{done} of {total} batches")
+
+    def _print(self, trainer: Trainer, line: str) -> None:
         if trainer.is_global_zero:
-            last = f"/{trainer.max_epochs}" if (trainer.max_epochs or 0) > 0 else ""
-            say(f"epoch {trainer.current_epoch + 1}{last}, step {trainer.global_step}: {values}")
+            say(line)
             sys.stdout.flush()
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from jsonargparse import ArgumentParser, Namespace
-from lightning import LightningDataModule, Trainer
+from lightning import Callback, LightningDataModule, Trainer
 from torch import nn
 from torch.utils.data import DataLoader, DistributedSampler
 
@@ -19,7 +19,7 @@ from bpnp.files import config_content, packaged_config
 from bpnp.models import TrainedNet
 from bpnp.models.weights import checkpoint_path
 from bpnp.report.results import SUMMARY, Results, plain, read_results, summarise
-from bpnp.training.callbacks import ResultsWriter
+from bpnp.training.callbacks import ProgressLines, ResultsWriter
 from bpnp.training.checkpoints import interruptible
 from bpnp.training.task import BlindPnPTask
 
@@ -46,6 +46,11 @@ class Method:
     init_args: dict[str, Any]
     checkpoint: str | None = None
     time_limit: float | None = None
+
+    @property
+    def folder_name(self) -> str:
+        """The label as the name of a folder."""
+        return re.sub(r"[^\w.-]", "-", self.label)
 
     @property
     def identity(self) -> dict[str, Any]:
@@ -75,8 +80,8 @@ class Method:
 def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> list[Method]:
     """Methods from `[LABEL=]WHAT[@CHECKPOINT]`, WHAT a short name, a class path or a YAML file with a solver in it.
 
-    Raises ValueError for what names no method, settings that it does not have, a missing checkpoint, or two methods of
-    one label.
+    Raises ValueError for what names no method, settings that it does not have, a missing checkpoint, a label that is no
+    name of a folder, or two methods whose folders would be the same.
     """
     methods: dict[str, Method] = {}
     for text in texts:
@@ -85,10 +90,13 @@ def parse_methods(texts: Sequence[str], *, time_limit: float | None = None) -> l
         class_path, init_args = _solver(what, text)
         if not equals:
             label = Path(what).stem if what.endswith(".yaml") else what.rpartition(".")[2]
-        if label in methods:
-            raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
         weights = str(checkpoint_path(checkpoint)) if at else None
-        methods[label] = method = Method(label, class_path, init_args, weights, time_limit)
+        method = Method(label, class_path, init_args, weights, time_limit)
+        if not method.folder_name.strip("."):
+            raise ValueError(f"the label {label!r} of {text!r} cannot name a folder of results. Use LABEL=METHOD.")
+        if method.folder_name in methods:
+            raise ValueError(f"expected a label for each method, got {label!r} twice; try LABEL=METHOD")
+        methods[method.folder_name] = method
         if class_path not in TRAINED or weights is None:
             _parsed(nn.Module, "solver", method.settings)  # before any test runs
     return list(methods.values())
@@ -184,8 +192,9 @@ class MethodTest:
         messages.setLevel(logging.WARNING)
         torch.set_num_threads(1)
         torch.manual_seed(0)  # of a network without a checkpoint
+        callbacks: list[Callback] = [writer] if progress_bar else [writer, ProgressLines()]
         trainer = Trainer(
-            accelerator="cpu", devices=1, callbacks=[writer], logger=False, enable_checkpointing=False,
+            accelerator="cpu", devices=1, callbacks=callbacks, logger=False, enable_checkpointing=False,
             enable_progress_bar=progress_bar, enable_model_summary=False,
         )  # fmt: skip
         try:

@@ -44,6 +44,7 @@ from bpnp.types import Batch, Prediction
 Stage = Literal["val", "test"]
 REBUILT = {"solver", "weights"}  # options that are not kept under "task": the checkpoint has what they made
 POSED = "pnp"  # the estimate that has a derivative, for the pose loss
+WARMUP = "PoseLossWarmup"  # the callback that raises `pose_weight`, which imports this module
 DECAYED = 0.02  # of the learning rate, after its fall
 WIDEST_MATCH = 0.5  # radians; every point matches many others beyond it, and degrees are mistaken for radians
 POSED = "pnp"  # the estimate that has a derivative, for the pose loss
@@ -394,9 +395,21 @@ class BlindPnPTask(LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         checkpoint |= upgrade(checkpoint)  # of a Trainer without SafeCheckpointIO
         self._adopt(checkpoint)
+        self._check_pose_loss_goes_on(checkpoint)
         self.skipped_steps, self.consecutive_skipped_steps = checkpoint.get("skipped_steps", (0, 0))
         self.optimizer_names = checkpoint.get("optimizer_names", ["Adam"])  # of versions that had no other
         self.resumed_pose_weight = checkpoint.get("pose_weight", 0.0)
+
+    def _check_pose_loss_goes_on(self, checkpoint: Mapping[str, Any]) -> None:
+        """Raise ValueError if a training with the callback `PoseLossWarmup` is resumed without it and a pose loss."""
+        if self._trainer is None or self.trainer.state.fn != "fit" or self.pose_weight > 0:
+            return
+        names = {type(callback).__name__ for callback in self.trainer.callbacks}  # type: ignore[attr-defined]
+        if WARMUP in checkpoint.get("callbacks", {}) and WARMUP not in names:
+            raise ValueError(
+                f"The checkpoint was trained with {WARMUP}, and this run has neither it nor a model.pose_weight. Use "
+                "the configuration of its training, --pose_loss.start_epoch, or --model.weights for a new training."
+            )
 
     def _adopt(self, content: Mapping[str, Any], *, grown: bool = False) -> None:
         """Load the solver's weights, and print the settings in which it differs from the checkpoint on purpose."""

@@ -95,6 +95,23 @@ def test_the_switch_survives_resuming_with_another_start(tmp_path: Path) -> None
     assert resumed.solver.wanted == [True]
 
 
+def test_a_training_does_not_lose_its_pose_loss(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    file, options = str(tmp_path / "one.ckpt"), {"max_epochs": 2, "limit_train_batches": 1}
+    run = fit(
+        tmp_path, BlindPnPTask(CountingSolver()), callbacks=[PoseLossWarmup(0, weight=0.1)], limit_train_batches=1
+    )
+    run.save_checkpoint(file)
+    with pytest.raises(ValueError, match="trained with PoseLossWarmup, and this run has neither it nor"):
+        fit(tmp_path, BlindPnPTask(CountingSolver()), file, **options)
+    weighted = BlindPnPTask(CountingSolver(), pose_weight=0.1)
+    fit(tmp_path, weighted, file, **options)
+    assert weighted.solver.wanted == [True]
+    fit(tmp_path, BlindPnPTask(CountingSolver()), file, callbacks=[PoseLossWarmup(0, weight=0.5)], **options)
+    assert "The pose loss has weight=0.5 (saved: 0.1)." in caplog.text
+    quiet_trainer(tmp_path).test(BlindPnPTask(CountingSolver()), datamodule=small_meshes(tmp_path), ckpt_path=file)
+
+
 def test_a_step_without_a_finite_loss_is_left_out_and_counted(tmp_path: Path) -> None:
     def run(broken_calls: tuple[int, ...], steps: int) -> BlindPnPTask:
         torch.manual_seed(3)
