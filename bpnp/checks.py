@@ -140,10 +140,10 @@ def check_normalised(points2d: Any, remedy: str) -> None:
         points2d: (m, 2) array or tensor, finite.
         remedy: what the message proposes.
     """
-    distances = np.linalg.norm(np.asarray(points2d), axis=-1)
-    if np.median(distances) > WIDEST:
+    points = np.asarray(points2d)
+    if np.median(np.linalg.norm(points, axis=-1)) > WIDEST:
         raise ValueError(
-            f"expected normalised image coordinates in `points2d`, got values up to {np.abs(points2d).max():g}, which "
+            f"expected normalised image coordinates in `points2d`, got values up to {np.abs(points).max():g}, which "
             f"look like pixels; try {remedy}"
         )
 
