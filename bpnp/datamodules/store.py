@@ -113,11 +113,6 @@ def _manifest(folder: Path, kind: str) -> dict[str, Any]:
             f"expected {kind} in format {FORMAT}, got {manifest.get('kind')} in format {manifest.get('format')} in "
             f"{folder}; try the other data module, or preparing again with this version"
         )
-    names = [*manifest.get("files", ()), *manifest.get("bulk", ()), *manifest.get("columns", ())]
-    if outside := [name for name in names if name in ("", ".", "..") or Path(name).name != name]:
-        raise StoreError(
-            f"{folder / MANIFEST} names {outside[0]!r}, which is not a file of its folder; prepare it again"
-        )
     if not whole:
         raise StoreError(f"expected an unchanged {folder / MANIFEST}, got an edited or cut one; try preparing again")
     columns = {f"{name}.npy" for name in (*manifest["bulk"], *(f"{name}_start" for name in manifest["bulk"]))}

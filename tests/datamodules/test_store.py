@@ -94,18 +94,6 @@ def test_a_manifest_that_names_a_file_elsewhere_is_refused(store: Store, part: s
         open_store(store.folder, "toy")
 
 
-@pytest.mark.parametrize("name", ["../../x", "/etc/hostname", "..", ""])
-def test_a_manifest_names_files_of_its_folder_only(store: Store, name: str) -> None:
-    path = store.folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    del manifest["checksum"]
-    for changed in ({"files": {name: [1, 1]}}, {"bulk": [name]}, {"columns": [name]}):
-        content = manifest | changed
-        path.write_text(json.dumps(content | {"checksum": fingerprint(content)}))
-        with pytest.raises(StoreError, match=f"manifest.json names '{name}', which is not a file of its folder"):
-            open_store(store.folder, store.kind)
-
-
 def test_a_failed_write_leaves_nothing(tmp_path: Path, store: Store) -> None:
     def stopped() -> None:
         with new_store(tmp_path / "other", "toy", WIDTHS) as writer:
