@@ -5,7 +5,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from itertools import product
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -15,6 +15,7 @@ from bpnp.files import claimed, packaged_config, write_text
 from bpnp.report.terminal import Paper, console, say
 
 if TYPE_CHECKING:
+    from bpnp.cameras import Camera
     from bpnp.report.figures import Lines
     from bpnp.report.points import ProblemPoints
     from bpnp.report.tables import Row
@@ -70,8 +71,12 @@ def view(
     output: Path | None = None,
     estimate: str | None = None,
     lines: Literal["true", "assigned", "none"] = "true",
+    photo: Path | None = None,
+    camera: str | None = None,
 ) -> None:
     """Draw a problem of a test, or a solution: points and cameras in space, and what is seen in the image.
+
+    With a photo, the 3D points are drawn over it as each pose projects them.
 
     Args:
         run: folder that `bpnp test` wrote, or its run; or the JSON of a solution.
@@ -79,13 +84,17 @@ def view(
         output: .png, .svg or .pdf; RUN/views/PROBLEM.png by default.
         estimate: whose pose reprojects the 3D points; the first by default.
         lines: which matches to draw.
+        photo: picture of the problem; needs --camera.
+        camera: of the photo: a 3x3 matrix in a file, MODEL,PARAMETERS, or a COLMAP model that has the photo.
     """
-    from bpnp.report.figures import plot_problem, save_figure
+    from bpnp.report.figures import plot_photo, plot_problem, read_photo, save_figure
     from bpnp.report.tables import named_runs
 
     names = problems or []
     if output is not None and len(names) > 1:
         raise ValueError(f"expected one problem with --output, got {len(names)}; try without --output")
+    if (photo is None) != (camera is None):
+        raise ValueError("a photo is drawn with its camera; give --photo and --camera together")
     if not run.exists():
         raise ValueError(f"expected the folder of a test or the JSON of a solution, got {run}, which is not there")
     if run.is_file() and names:
@@ -99,8 +108,21 @@ def view(
         drawn = chosen_problems(folder, names)
     for problem in drawn:
         name = run.stem if run.is_file() else re.sub(r"[^A-Za-z0-9._-]+", "_", problem.id) or str(problem.index)
-        figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
+        if photo is None or camera is None:
+            figure = plot_problem(problem, estimate=estimate, lines=LINES[lines])
+        else:
+            seen = replace(problem, camera=_camera_of(camera, photo))
+            figure = plot_photo(seen, read_photo(photo), estimates=None if estimate is None else [estimate])
         say(f"wrote {save_figure(figure, output or folder / 'views' / f'{name}.png')}")
+
+
+def _camera_of(text: str, photo: Path) -> "Camera":
+    """The camera of a photo, as `--camera` names it."""
+    from bpnp.cameras import camera_from
+    from bpnp.commands.point_files import COLMAP_CAMERAS, read_camera
+
+    of_model = Path(text).is_dir() or Path(text).stem == COLMAP_CAMERAS
+    return camera_from(read_camera(text, photo.name if of_model else None))
 
 
 def _solution(path: Path) -> "ProblemPoints":

@@ -101,6 +101,29 @@ def plot_problem(problem: ProblemPoints, *, estimate: str | None = None, lines: 
     return figure
 
 
+def plot_photo(problem: ProblemPoints, photo: Array, *, estimates: Sequence[str] | None = None) -> "Figure":
+    """Draw the 3D points over the photo as each pose projects them, an image per estimate (paper Fig. 4).
+
+    Args:
+        problem: with the camera of the photo.
+        photo: (h, w, 3), uint8.
+        estimates: whose poses; all by default.
+
+    Raises:
+        ValueError: The camera is missing or of another image shape, or an estimate is unknown.
+    """
+    from matplotlib.figure import Figure
+
+    names = list(problem.estimates) if estimates is None else list(estimates)
+    figure = Figure(figsize=(min(4 * WIDTH, WIDTH * len(names) / 2), 4.2), layout="constrained")
+    for axes, name in zip(figure.subplots(1, len(names), squeeze=False)[0], names, strict=True):
+        plot_image(axes, problem, estimate=name, lines=None, photo=photo)
+        found = np.isfinite(np.c_[problem.estimates[name]]).all()
+        axes.set_title(shown_text(name if found else f"{name}: no pose"), fontsize=10)
+    figure.suptitle(shown_text(problem.id), fontsize=10)
+    return figure
+
+
 def plot_scene(axes: Any, problem: ProblemPoints) -> Any:
     """3D points, true and estimated cameras, in the axes of the true camera (right, forward, up). Returns the axes.
 

@@ -1,10 +1,19 @@
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from report_data import HOSTILE, drawn_problem, write_run
+import torch
+from PIL import Image
+from report_data import HOSTILE, drawn_problem, planted, write_run
 
-from bpnp.report.figures import plot_problem, recall_curve, save_figure
+from bpnp import Pose, Prediction, SolveStats
+from bpnp.cameras import camera_from
+from bpnp.cli import main
+from bpnp.report import write_results
+from bpnp.report.figures import plot_photo, plot_problem, recall_curve, save_figure
+from bpnp.report.points import points_from, write_points
+from bpnp.report.results import rows_from
 
 
 def points_of(axes: object, marker: str) -> np.ndarray:
@@ -52,3 +61,31 @@ def test_figures_are_written_whole(tmp_path: Path, suffix: str) -> None:
     assert path.read_bytes().startswith(heads[suffix])
     with pytest.raises(ValueError, match=r"expected a file name that ends in .png, .svg, .pdf, got 'pair.jpg'"):
         save_figure(plot_problem(drawn_problem(0, "")), tmp_path / "pair.jpg")
+
+
+def test_a_photo_shows_the_points_where_the_camera_projects_them(tmp_path: Path) -> None:
+    """Pixels by hand, K (R p + t) / z, of two estimates; `bpnp view --photo` writes the picture."""
+    batch = planted((30,), clutter=4)
+    matrix = np.array([[500.0, 0, 320], [0, 510.0, 240], [0, 0, 1]])
+    stats = SolveStats.of(torch.tensor([True]))
+    true = Pose(batch.rotation, batch.translation, stats)
+    moved = Pose(batch.rotation, batch.translation + torch.tensor([0.3, 0.0, 0.0]), stats)
+    prediction = Prediction(poses={"pnp": true, "search": moved})
+    (problem,) = points_from(prediction, batch)
+    photo = np.full((480, 640, 3), 200, np.uint8)
+    figure = plot_photo(replace(problem, camera=camera_from(matrix)), photo)
+    assert [axes.get_title() for axes in figure.axes] == ["pnp", "search"]
+    for axes, pose in zip(figure.axes, (true, moved), strict=True):
+        crosses = next(line for line in axes.lines if line.get_marker() == "x")
+        camera = problem.points3d @ pose.rotation[0].numpy().T + pose.translation[0].numpy()
+        pixels = (camera / camera[:, 2:]) @ matrix.T
+        np.testing.assert_allclose(crosses.get_xydata(), pixels[:, :2], atol=0.6)  # of half a pixel's offset at most
+    write_results(tmp_path / "test", rows_from(prediction, batch, 1.0))
+    write_points(tmp_path / "test", [problem])
+    Image.fromarray(photo).save(tmp_path / "photo.png")
+    np.savetxt(tmp_path / "K.txt", matrix)
+    arguments = ["--photo", str(tmp_path / "photo.png"), "--output", str(tmp_path / "view.png")]
+    main(["view", str(tmp_path), *arguments, "--camera", str(tmp_path / "K.txt")])
+    assert (tmp_path / "view.png").stat().st_size > 5000
+    with pytest.raises(SystemExit):
+        main(["view", str(tmp_path), *arguments])
