@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from bpnp.geometry import same_pose, turned_by
 from bpnp.search.evidence.settings import ImagePoints
 from bpnp.search.kernels.neighbours import sums_near
+from bpnp.search.propose.symmetries import Motions
 from bpnp.search.starts import GravityPrior, PosePrior, Prior
 
 Array = NDArray[np.float64]
@@ -155,6 +156,11 @@ class PointSets:
         i = [np.repeat(rows, len(columns)) for rows, columns in groups]
         j = [np.tile(columns, len(rows)) for rows, columns in groups]
         return np.concatenate(i), np.concatenate(j)
+
+    @cached_property
+    def registered(self) -> list[tuple[Array, Array, Motions]]:
+        """Poses (3, 3), (3,) and the motions of the scene that were found from their matched points."""
+        return []
 
     @cached_property
     def middle(self) -> Array:

@@ -30,7 +30,7 @@ from bpnp.search.raster_search import (
     search_near,
 )
 from bpnp.search.starts import PosePrior, Prior
-from bpnp.search.verdict import starts_met
+from bpnp.search.verdict import is_symmetric, starts_met
 
 Proposals = Callable[[], tuple[NDArray[np.float64], NDArray[np.float64]]]  # rotations (s, 3, 3), translations (s, 3)
 
@@ -79,8 +79,10 @@ def _sure(pool: Pool, drawn: Iterator[Candidates]) -> Iterator[Candidates]:
     """What excludes the likelier case: a raster search around the best pose, or more starts from anywhere."""
     leaders, settings = pool.leaders(), pool.scene.settings
     looks, rule = pool.looks(leaders), settings.evidence
-    hits = starts_met(leaders, pool.sets, rule)
-    if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far_missed(hits, rule):
+    symmetric = bool(pool.sets.registered) and is_symmetric(leaders, pool.sets, rule)
+    hits = starts_met(leaders, pool.sets, rule, symmetric=symmetric)
+    far = far_missed(hits, rule, symmetric=symmetric)
+    if looks < settings.schedule.looks and near_missed(hits, looks, rule) > far:
         yield _look(pool)
     else:
         yield next(drawn)

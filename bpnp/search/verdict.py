@@ -17,9 +17,11 @@ from numpy.typing import NDArray
 from bpnp.search.candidates import Candidates
 from bpnp.search.evidence.alternatives import Seen, contesting, log10_missed, misfit, number, other_pose, rougher
 from bpnp.search.evidence.false_alarms import alarms_of
+from bpnp.search.evidence.repetitions import registered
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.evidence.uncertainty import focal_bound, is_redundant, linearised, rotation_bound
 from bpnp.search.point_sets import PointSets
+from bpnp.search.propose.symmetries import Motions
 from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
@@ -91,21 +93,70 @@ def match_count(candidates: Candidates, sets: PointSets) -> float:
 
 
 def missed(candidates: Candidates, sets: PointSets, looks: int, rule: Evidence, *, independent: bool = True) -> float:
-    """log10 of the probability that weighed candidates lack a better optimum; 0 where chance explains the first.
+    """Return log10 of the probability that weighed candidates lack a better optimum.
 
-    looks: in vain around the first one. independent: whether its matches are evidence of each other.
+    Args:
+        candidates: poses in the user's coordinates, best first.
+        sets: the points of the problem.
+        looks: number of local searches around the first candidate that found nothing better.
+        rule: constants of the verdict.
+        independent: False to leave out the evidence of the matches.
+
+    Returns:
+        The logarithm; 0 where the first candidate is not significant. Where a motion maps the matched points onto
+        others, the matches of a wrong pose are no independent coincidences, and only basin counts reduce it.
     """
     alarms = float(candidates.log10_false_alarms[0]) if len(candidates) else math.inf
     if alarms > 0:
         return 0.0
     decades = -alarms / max(match_count(candidates, sets), 1.0) if independent else 0.0
-    return log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
+    value = log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
+    if value > rule.missed or not is_symmetric(candidates, sets, rule):
+        return value
+    return log10_missed(starts_met(candidates, sets, rule, symmetric=True), 0.0, looks, rule, symmetric=True)
 
 
-def starts_met(candidates: Candidates, sets: PointSets, rule: Evidence) -> int:
-    """How many independent starts ended at the first candidate, or at another one that is no different pose."""
-    poses = candidates.rotation, candidates.translation
-    return int(candidates.hits[sets.same_pose(*poses, rule.other_deg, rule.other_shift)].sum())
+def motions_of(candidates: Candidates, sets: PointSets, rule: Evidence) -> Motions:
+    """Return the motions that map the matched points of the first candidate onto other scene points.
+
+    They are computed once for a pose and those that are no different pose.
+    """
+    pose = candidates.rotation[:1], candidates.translation[:1]
+    for rotation, translation, motions in sets.registered:
+        poses = np.concatenate([pose[0], rotation[None]]), np.vstack([pose[1], translation])
+        if sets.same_pose(*poses, rule.other_deg, rule.other_shift)[1]:
+            return motions
+    scale = max(float(candidates.scale[0]), float(sets.image.scales[0]))
+    motions = registered(sets, pose[0][0], pose[1][0], scale, rule)
+    sets.registered.append((pose[0][0], pose[1][0], motions))
+    return motions
+
+
+def is_symmetric(candidates: Candidates, sets: PointSets, rule: Evidence) -> bool:
+    """Return whether a motion maps so many of the matched points of the first candidate onto other scene points that
+    it could by itself explain a better pose."""
+    return float(motions_of(candidates, sets, rule).fraction.max(initial=0)) >= rule.repetitions.symmetric
+
+
+def starts_met(candidates: Candidates, sets: PointSets, rule: Evidence, *, symmetric: bool = False) -> int:
+    """Return the basin count of the first candidate and of others that are no different pose.
+
+    Args:
+        candidates: poses in the user's coordinates, best first.
+        sets: the points of the problem.
+        rule: constants of the verdict.
+        symmetric: count the poses too that the motions of the scene confuse with the first one. These are compared with
+            it one by one; a better pose elsewhere has as many copies.
+    """
+    first = candidates.rotation[:1], candidates.translation[:1]
+    if symmetric:
+        copies = motions_of(candidates, sets, rule).competitors(first[0][0], first[1][0])
+        first = np.concatenate([first[0], copies[0]]), np.concatenate([first[1], copies[1]])
+    counted = np.zeros(len(candidates), bool)
+    for rotation, translation in zip(*first, strict=True):
+        poses = np.concatenate([rotation[None], candidates.rotation]), np.vstack([translation, candidates.translation])
+        counted |= sets.same_pose(*poses, rule.other_deg, rule.other_shift)[1:]
+    return int(candidates.hits[counted].sum())
 
 
 def judged(

@@ -176,7 +176,7 @@ def _partners(near: float, sets: PointSets, rotation: Array, translation: Array,
     return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
 
 
-def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) -> float:
+def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence, *, symmetric: bool = False) -> float:
     """log10 of the probability that a better optimum than the best pose exists and was not met.
 
     It lies near the best pose or far from it, and what the matches say counts against both:
@@ -207,7 +207,7 @@ def log10_missed(hits: int, decades_a_match: float, looks: int, rule: Evidence) 
     >>> [round(log10_missed(*seen, rule), 2) for seen in ((0, 0.0, 0), (7, 0.0, 0), (7, 0.0, 1), (1, 1.0, 0))]
     [0.0, -2.0, -3.24, -3.3]
     """
-    unseen = near_missed(hits, looks, rule) + far_missed(hits, rule)
+    unseen = near_missed(hits, looks, rule) + far_missed(hits, rule, symmetric=symmetric)
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
 
 
@@ -217,6 +217,7 @@ def near_missed(hits: int, looks: int, rule: Evidence) -> float:
     return max(0.5**hits, rule.another) * overlooked
 
 
-def far_missed(hits: int, rule: Evidence) -> float:
-    """Probability that a better optimum far from the best pose was not met."""
-    return rule.another * 0.5**hits
+def far_missed(hits: int, rule: Evidence, *, symmetric: bool = False) -> float:
+    """Return the probability that a better optimum far from the best pose was not met: without the prior probability
+    that there is one where the scene is symmetric."""
+    return (1.0 if symmetric else rule.another) * 0.5**hits

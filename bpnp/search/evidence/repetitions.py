@@ -1,6 +1,8 @@
-"""Poses that a repeated structure confuses: a facade moved by a window, a lattice by a cell, a plane by half a turn."""
+"""Poses that a symmetric or repeated structure confuses: an object turned by a symmetry, a facade moved by a window."""
 
 import math
+from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,65 +10,113 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from bpnp.search.evidence.false_alarms import SHARES, alarms_of, directions_of, point_evidence
 from bpnp.search.evidence.settings import Evidence, Repetitions
-from bpnp.search.kernels.neighbours import HashedPoints, hashed
 from bpnp.search.point_sets import PointSets
+from bpnp.search.propose.symmetries import Motions, matching_tolerance, mirror_pose, self_motions
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array]
 DEFAULT = Repetitions()
 
 
+def registered(sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence) -> Motions:
+    """Return the rigid motions that map the matched points of a pose onto other scene points.
+
+    If a pose is wrong because of a symmetry or a repetition, one of these motions maps (nearly) all of its matched
+    points onto those of the right pose, whatever fraction of the scene they are.
+
+    Args:
+        sets: the points of a problem.
+        rotation: (3, 3), translation: (3,) of the pose.
+        scale: standard deviation of its residuals, radians.
+        rule: constants of the verdict.
+
+    Returns:
+        Motions with the fraction of the matched points that each maps, the largest first; none of too few points.
+    """
+    limits, points = rule.repetitions, sets.points3d
+    camera = points @ rotation.T + translation
+    depth = np.linalg.norm(camera, axis=-1)
+    away, nearest = cKDTree(camera / np.maximum(depth, 1e-300)[:, None]).query(sets.bearings)
+    matched = np.unique(nearest[away < limits.near * scale])
+    if len(matched) < limits.fewest:
+        return Motions.none()
+    noise = scale * float(np.median(depth[matched]))
+    labels, normals = sets.labels3d, sets.normals3d if sets.cosines3d is None else None
+    if len(points) <= limits.whole and 2 * len(matched) >= limits.share * len(points):
+        tolerance = matching_tolerance(points, np.arange(len(points)), noise)
+        motions = _of_scene(*(_frozen(x) for x in (points, labels, normals)), tolerance)
+        return motions.of(points, matched, tolerance, limits.share)
+    middle = np.median(points[matched], 0)
+    near = np.sort(np.argsort(np.linalg.norm(points - middle, axis=-1), kind="stable")[: limits.around])
+    sources = np.flatnonzero(np.isin(near, matched))
+    if len(sources) < limits.fewest:
+        return Motions.none()
+    part = points[near]
+    return self_motions(
+        part,
+        matching_tolerance(part, sources, noise),
+        sources=sources,
+        labels3d=None if labels is None else labels[near],
+        normals3d=None if normals is None else normals[near],
+        least=limits.share,
+        bases=limits.bases if len(part) <= limits.many else limits.fewer_bases,
+    )
+
+
+Frozen = tuple[bytes, str, tuple[int, ...]] | None
+
+
+def _frozen(array: NDArray[Any] | None) -> Frozen:
+    """Return an array as a key of a cache."""
+    return None if array is None else (np.ascontiguousarray(array).tobytes(), array.dtype.str, array.shape)
+
+
+@lru_cache(maxsize=64)
+def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float) -> Motions:
+    """Return the motions of a whole scene, which all problems of it share."""
+    arrays = [None if x is None else np.frombuffer(x[0], x[1]).reshape(x[2]) for x in (points, labels, normals)]
+    assert arrays[0] is not None
+    least = DEFAULT.share_of_scene
+    return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least)
+
+
 def repeated_poses(
     sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence
 ) -> tuple[Pose, bool]:
-    """Poses (c, 3, 3), (c, 3) that see other scene points where this one sees those that have a partner in the image.
+    """Return the poses that the scene's own motions confuse with one.
 
-    If a motion p -> Q p + d takes these points onto other scene points, the pose (R Q^T, t - R Q^T d) sees the latter
-    in the same directions. Q: none and, unless a prior excludes them, half turns about the axes of the points, and
-    quarter turns where they repeat. d: from one of three points in their middle to any of the scene points nearest to
-    them. scale: of the residuals, radians. Only poses that a verdict takes for different from this one
-    (`Evidence.other_deg`), the few with the fewest false alarms; and whether there are so few motions that these stand
-    for all.
+    Args:
+        sets: the points of a problem.
+        rotation: (3, 3), translation: (3,) of the pose.
+        scale: standard deviation of its residuals, radians.
+        rule: constants of the verdict.
 
-    >>> import numpy as np
-    >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
-    >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
-    >>> image = motif + [0, 0, 6]  # the first of three equal things
-    >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-    >>> (_, translations), _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
-    >>> sorted(translations[:, 0].round(6).tolist())
-    [-4.0, -2.0]
+    Returns:
+        Rotations (c, 3, 3) and translations (c, 3): those that a verdict takes for different from the pose
+        (`Evidence.other_deg`), at most `Repetitions.kept`, with the fewest false alarms; and whether there are so few
+        motions that these stand for all.
+
+    Examples:
+        >>> import numpy as np
+        >>> motif = np.random.default_rng(0).uniform(0, 1, (12, 3))
+        >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
+        >>> image = motif + [0, 0, 6]  # the first of three equal things
+        >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
+        >>> (_, translations), _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> sorted(translations[:, 0].round(6).tolist())
+        [-4.0, -2.0]
     """
-    none, limits = ((np.empty((0, 3, 3)), np.empty((0, 3))), True), rule.repetitions
-    points = sets.points3d
-    camera = points @ rotation.T + translation
-    depth = np.linalg.norm(camera, axis=-1)
-    seen = camera / np.maximum(depth, 1e-300)[:, None]
-    away, nearest = cKDTree(seen).query(sets.bearings)
-    matched = np.unique(nearest[away < limits.near * scale])
-    if len(matched) < limits.fewest:
-        return none
-    tolerance = limits.near * scale * float(np.median(depth[matched]))
-    own = points[matched]
-    own = own[np.argsort(np.linalg.norm(own - np.median(own, 0), axis=-1), kind="stable")]
-    some = np.linspace(limits.references, len(own) - 1, limits.most).astype(int)
-    own = own[np.unique(np.r_[: limits.references, some])]
-    around = points[np.argsort(np.linalg.norm(points - own[0], axis=-1), kind="stable")[: limits.around]]
-    scene = hashed(points, tolerance)
-    found = [(share, np.eye(3), shift) for share, shift in _shifts(scene, around, own, np.eye(3), limits)]
-    turns = [] if sets.knows_rotation else _turns(own, found[0][2] if found else None)
-    for turn in turns:
-        found += [(share, turn, shift) for share, shift in _shifts(scene, around, own, turn, limits)]
-    found = sorted(found, key=lambda motion: -motion[0])
-    if not found:
-        return none
-    rotations = np.array([rotation, *(rotation @ turn.T for _, turn, _ in found)])
-    translations = np.array([translation, *(translation - rotation @ turn.T @ shift for _, turn, shift in found)])
-    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
-    rotations, translations = rotations[other[: limits.weighed]], translations[other[: limits.weighed]]
+    limits = rule.repetitions
+    motions = registered(sets, rotation, translation, scale, rule)
+    rotations, translations = motions.competitors(rotation, translation)
+    if (mirrored := mirror_pose(sets.points3d, rotation, translation)) is not None:
+        rotations, translations = np.concatenate([rotations, mirrored[0][None]]), np.vstack([translations, mirrored[1]])
+    every = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
+    other = np.flatnonzero(~sets.same_pose(*every, rule.other_deg, rule.other_shift))
+    rotations, translations = every[0][other], every[1][other]
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
     best = np.argsort(alarms, kind="stable")[: limits.kept]
-    return (rotations[best], translations[best]), len(other) <= limits.compared
+    return (rotations[best], translations[best]), motions.complete
 
 
 def decades_behind(
@@ -115,52 +165,3 @@ def _among(sets: PointSets, seen: Array) -> NDArray[np.bool_]:
     except (QhullError, ValueError):  # on a line, or too few
         return np.zeros(len(points), bool)
     return np.asarray((points @ sides[:, :2].T + sides[:, 2] <= 0).all(-1))
-
-
-def _turns(points: Array, shift: Array | None) -> list[Array]:
-    """Half turns about the principal axes of points (k, 3); if a shift (3,) repeats them, also those about its
-    direction and across it, and quarter turns about the normal."""
-    axes = np.linalg.eigh(np.cov(points.T))[1].T
-    turns = [2 * np.outer(axis, axis) - np.eye(3) for axis in axes]
-    if shift is not None:
-        along = shift - (shift @ axes[0]) * axes[0]
-        length = float(np.linalg.norm(along))
-        if length > 0.5 * float(np.linalg.norm(shift)):
-            along /= length
-            across = np.cross(axes[0], along)
-            turns += [2 * np.outer(axis, axis) - np.eye(3) for axis in (along, across)]
-            quarter = np.outer(across, along) - np.outer(along, across) + np.outer(axes[0], axes[0])
-            turns += [quarter, quarter.T]
-    return turns
-
-
-def _shifts(
-    scene: HashedPoints, around: Array, points: Array, turn: Array, limits: Repetitions
-) -> list[tuple[float, Array]]:
-    """Shifts (3,) that take the turned points (k, 3) onto points of the scene, and the share that comes to lie on one;
-    those with the largest share first. around: scene points that the first ones are laid onto."""
-    turned = points @ turn.T
-    shifts = (around - turned[: limits.references, None]).reshape(-1, 3)
-    if np.array_equal(turn, np.eye(3)):
-        shifts = shifts[np.linalg.norm(shifts, axis=-1) > 2 * scene.tolerance]
-    first = turned[np.linspace(0, len(turned) - 1, limits.first).astype(int)]
-    shifts, _ = _lying_on(scene, first, shifts, limits.share)
-    if not len(shifts):
-        return []
-    shifts, share = _lying_on(scene, turned, _apart(shifts[: limits.confirmed], scene.tolerance), limits.share)
-    return list(zip(share.tolist(), shifts, strict=True))
-
-
-def _lying_on(scene: HashedPoints, points: Array, shifts: Array, share: float) -> tuple[Array, Array]:
-    """The shifts (s, 3) that take such a share of the points (k, 3) or more to within the tolerance of one of the
-    scene, and these shares (s,); the largest first."""
-    least = math.ceil(share * len(points))
-    counts = scene.count_on(points, shifts, least)
-    best = np.argsort(-counts, kind="stable")[: int((counts >= least).sum())]
-    return shifts[best], counts[best] / len(points)
-
-
-def _apart(shifts: Array, tolerance: float) -> Array:
-    """Of shifts (s, 3) that agree to within the tolerance the first."""
-    cells = np.round(shifts / (2 * tolerance))
-    return shifts[np.sort(np.unique(cells, axis=0, return_index=True)[1])]

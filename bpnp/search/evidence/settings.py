@@ -42,28 +42,30 @@ class Contested:
 
 @dataclass(frozen=True)
 class Repetitions:
-    """Motions of repeated structures (`bpnp.search.evidence.repetitions`).
+    """Motions that map a scene onto itself (`bpnp.search.evidence.repetitions`).
 
-    near: scales of the residuals within which an image point has a partner, and a moved point lies on another. share:
-    of the points with a partner that must come to lie on others. fewest: points with a partner; of fewer, three that
-    fix a pose are too large a part. references: points that are laid onto each of the `around` nearest ones; a motion
-    may leave one of them without a counterpart. first, most: points that are moved to find motions, and to confirm
-    them. confirmed, weighed, kept: motions, best first, that are confirmed, whose poses are weighed, and returned.
-    compared: motions of a structure beyond which a few cannot stand for all, as some of them fits as well.
-    most_missing: share of its points that a map may lack.
+    near: scales of the residuals within which an image point has a match, and a moved point lies on another.
+    fewest: matched points; with fewer, three that fix a pose are too large a part.
+    share: smallest fraction of the matched points that a motion maps, share_of_scene: the same of a whole scene.
+    symmetric: fraction of the matched points; a motion that maps more of them could by itself explain a better pose.
+    whole: points up to which a scene is registered as a whole, once for all problems of it.
+    around: points nearest to the matched ones that these are registered with. bases, fewer_bases: of such a
+        registration, with up to `many` points and with more: a motion of nine tenths of the matches is missed by
+        (1 - 0.9^3)^8 = 3e-5 of the latter.
+    kept: competing poses, those with the fewest false alarms. most_missing: fraction of its points that a map may lack.
     """
 
     near: float = 3.0
-    share: float = 0.5
     fewest: int = 6
-    references: int = 3
+    share: float = 0.3
+    share_of_scene: float = 0.2
+    symmetric: float = 0.5
+    whole: int = 150
     around: int = 4096
-    first: int = 4
-    most: int = 48
-    confirmed: int = 512
-    weighed: int = 24
-    kept: int = 4
-    compared: int = 400
+    many: int = 500
+    bases: int = 16
+    fewer_bases: int = 8
+    kept: int = 6
     most_missing: float = 1 / 3
 
 

@@ -110,19 +110,25 @@ def _enter(table: Any) -> None:
         links[e], heads[h] = heads[h], e
 
 
+@part
+def lies_on(table: Any, x: Any, y: Any, z: Any) -> Any:
+    """Return whether (x, y, z) is within the tolerance of a point of the table."""
+    points, tolerance, heads, links = table
+    e = heads[entry(heads, x, y, z, 2 * tolerance)]
+    while e >= 0:
+        dx, dy, dz = points[e >> 3, 0] - x, points[e >> 3, 1] - y, points[e >> 3, 2] - z
+        if dx * dx + dy * dy + dz * dz < tolerance * tolerance:
+            return True
+        e = links[e]
+    return False
+
+
 @compiled
 def _count_on(table: Any, moved: Any, shifts: Any, least: int, counts: Any) -> None:
-    points, tolerance, heads, links = table
     for s in range(len(shifts)):
         counts[s] = 0
         for k in range(len(moved)):
             if counts[s] + len(moved) - k < least:
                 break
             x, y, z = moved[k, 0] + shifts[s, 0], moved[k, 1] + shifts[s, 1], moved[k, 2] + shifts[s, 2]
-            e = heads[entry(heads, x, y, z, 2 * tolerance)]
-            while e >= 0:
-                dx, dy, dz = points[e >> 3, 0] - x, points[e >> 3, 1] - y, points[e >> 3, 2] - z
-                if dx * dx + dy * dy + dz * dz < tolerance * tolerance:
-                    counts[s] += 1
-                    break
-                e = links[e]
+            counts[s] += lies_on(table, x, y, z)

@@ -1,0 +1,115 @@
+"""Objects of k equal parts and some unique points: the true pose explains more points than one turned by a symmetry.
+
+Kinds: cloud (random points), tower (parts around an upright axis), wheel (points of a rim and of spokes), few (a cloud
+of few points), and device (LEDs with normals, nearly symmetric under a half turn). Unique points number 0 (exactly
+symmetric: no pose can be told from its turned copies) to 12.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from record import Array, Problem
+from scipy.spatial.transform import Rotation
+
+import bpnp
+
+NOISE = 1e-3  # of normalised image coordinates
+JITTER = 0.004  # of a near symmetry, in extents of the device
+
+
+class Kind(NamedTuple):
+    """Points of a part, unique points, and the image's random points as a fraction of all."""
+
+    name: str
+    fold: int
+    each: int
+    unique: int
+    outliers: float = 0.0
+
+    @property
+    def label(self) -> str:
+        return f"{self.name}, {self.fold} parts of {self.each}, {self.unique} unique, {self.outliers:.0%} outliers"
+
+
+KINDS = (
+    *(Kind("cloud", fold, 90 // fold, unique) for fold in (2, 3, 5) for unique in (0, 4, 8, 12)),
+    *(Kind("cloud", fold, 180 // fold, unique, 0.2) for fold in (3, 6) for unique in (0, 8, 12)),
+    *(Kind("tower", fold, 90 // fold, unique, 0.2) for fold in (2, 3, 4) for unique in (0, 8, 12)),
+    *(Kind("wheel", fold, 120 // fold, unique) for fold in (4, 6) for unique in (0, 8, 12)),
+    *(Kind("few", fold, each, unique) for fold, each in ((2, 10), (3, 7), (5, 6)) for unique in (0, 3, 8)),
+)
+
+
+def points_of(kind: Kind, rng: np.random.Generator) -> Array:
+    """Return the points (n, 3) of an object, the unique ones last."""
+    part = rng.uniform(-1, 1, (kind.each, 3))
+    unique = rng.uniform(-1, 1, (kind.unique, 3))
+    if kind.name == "tower":
+        part = part * (0.2, 0.3, 1) + (0.3, 0, 0)
+        unique *= (0.5, 0.5, 1)
+    elif kind.name == "wheel":
+        rim = rng.random(kind.each) < 0.5
+        angle = np.where(rim, rng.uniform(-np.pi, np.pi, kind.each) / kind.fold, 0.05 * part[:, 1])
+        radius = np.where(rim, 1 + 0.03 * part[:, 0], rng.uniform(0.1, 1, kind.each))
+        part = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.1 * part[:, 2]], -1)
+        unique *= (0.8, 0.8, 0.2)
+    turns = Rotation.from_rotvec([[0, 0, 2 * np.pi * k / kind.fold] for k in range(kind.fold)])
+    return np.concatenate([*(part @ turn.T for turn in turns.as_matrix()), unique])
+
+
+def problems(kind: Kind, limit: int, seed: int, time_limit: float | None = None) -> Iterator[Problem]:
+    """Yield problems of a kind: any rotation, four to six units away, with noise of a pixel at a focal length of 1000.
+
+    With outliers a fifth of the object's points are hidden too.
+    """
+    for k in range(limit):
+        rng = np.random.default_rng([seed, KINDS.index(kind), k])
+        points = points_of(kind, rng)
+        points = points @ Rotation.random(random_state=rng).as_matrix().T
+        rotation = Rotation.random(random_state=rng).as_matrix()
+        translation = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(4, 6)])
+        camera = points @ rotation.T + translation
+        image = camera[:, :2] / camera[:, 2:] + NOISE * rng.normal(size=(len(points), 2))
+        if kind.outliers:
+            shown = image[rng.permutation(len(image))[: int(0.8 * len(image))]]
+            count = round(len(shown) * kind.outliers / (1 - kind.outliers))
+            image = np.concatenate([shown, rng.uniform(shown.min(0), shown.max(0), (count, 2))])
+        known: dict[str, Any] = {"seed": k, "time_limit": time_limit}
+        search = partial(bpnp.solve, rng.permutation(image), rng.permutation(points), **known)
+        yield Problem(f"{kind.label} #{k}", search, [(rotation, translation)], points)
+
+
+def near_symmetric_device(rng: np.random.Generator, pairs: int = 14, unique: int = 4) -> tuple[Array, Array]:
+    """Return LEDs (n, 3), metres, and normals (n, 3) of a shell that a half turn maps onto itself, but for jitter and
+    some unique LEDs."""
+    outward = rng.normal(size=(pairs + unique, 3)) * (1, 1, 0.4)
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    points = outward / np.linalg.norm(outward / (0.09, 0.05, 0.04), axis=1, keepdims=True)
+    half = np.array([-1.0, -1.0, 1.0])
+    points = np.concatenate([points, points[:pairs] * half])
+    normals = np.concatenate([outward, outward[:pairs] * half])
+    return points + JITTER * 0.09 * rng.normal(size=points.shape), normals
+
+
+def device_problems(limit: int, seed: int, *, normals: bool = True, frames: int = 20) -> Iterator[Problem]:
+    """Yield pictures of near-symmetric devices, `frames` of each: 0.3 px at a focal length of 500, LEDs that face the
+    camera, none to three other lights."""
+    camera = np.array([[500.0, 0, 400], [0, 500, 400], [0, 0, 1]])
+    for k in range(limit):
+        points, outward = near_symmetric_device(np.random.default_rng([seed, 1, k // frames]))
+        rng = np.random.default_rng([seed, 2, k])
+        seen = np.empty((0, 2))
+        while len(seen) < 8:
+            rotation = Rotation.random(random_state=rng).as_matrix()
+            translation = np.array([*rng.uniform(-0.05, 0.05, 2), rng.uniform(0.25, 0.7)])
+            at = points @ rotation.T + translation
+            facing = -((outward @ rotation.T) * at).sum(1) > 0.25 * np.linalg.norm(at, axis=1)
+            seen = (at[:, :2] / at[:, 2:] * 500 + 400)[facing]
+        others = rng.uniform(seen.min(0) - 30, seen.max(0) + 30, (rng.integers(0, 4), 2))
+        pixels = rng.permutation(np.concatenate([seen + 0.3 * rng.normal(size=seen.shape), others]))
+        known: dict[str, Any] = {"normals3d": outward if normals else None, "seed": k, "time_limit": 10}
+        search = partial(bpnp.solve, pixels, points, camera, **known)
+        name = f"device {k // frames}, {'' if normals else 'no '}normals #{k}"
+        yield Problem(name, search, [(rotation, translation)], points)

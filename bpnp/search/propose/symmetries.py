@@ -1,0 +1,408 @@
+"""Rigid motions that map a part of a scene onto the scene: the poses that a symmetry or a repetition confuses.
+
+If p -> S p + d maps scene points onto other scene points, the pose (R S^T, t - R S^T d) projects the images of these
+points to where (R, t) projects the points themselves. Every such pose is a competitor of (R, t).
+
+The motions are found by registering the scene with itself. A base of four points is matched with every congruent base
+of the scene: three edges of a triangle decide the motion, the fourth point and a sample of the scene confirm it.
+Bases lie in a neighbourhood of some points, so that the cost of a base grows linearly with the scene.
+A motion that maps a fraction x of the points is found by a base with a probability of at least x^3, by all B bases but
+with (1 - x^3)^B; a part that is connected in space is found sooner.
+
+Source: D. Aiger, N. J. Mitra, D. Cohen-Or, 4-points congruent sets for robust pairwise surface registration, ACM TOG
+2008, whose coplanar bases are replaced by triangles.
+"""
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from bpnp.geometry import distinct
+from bpnp.loops.vectors import compiled, part
+from bpnp.search.kernels.neighbours import HashedPoints, hashed, lies_on
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+# Points of the neighbourhood in which a base and its matches lie, of scenes up to so many points and of larger ones.
+NEIGHBOURS, MANY_NEIGHBOURS, MANY = 96, 48, 500
+BASES = 32  # a motion of half of the points is missed by (1 - 1/8)^32 = 1.4 % of the registrations, at most
+WIDEST = 4  # triangles of which a base is the largest
+FIRST = 7  # sampled points of which at least one confirms: one of 12 motions of a third of the points fails
+CHECKED = 32  # sampled points that confirm a motion before all points do
+MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together: some 0.1 s
+CONFIRMING = 8  # pairs that take as long as a sampled point
+MOST_FOUND = 4096  # motions of all bases together that are ranked
+REFINED = 48  # motions, those of the largest fraction first, that are refined
+NEAR_SYMMETRY = 0.02  # of the extent, by which a point of a near symmetry may lie off
+SPACING = 0.25  # at a quarter of the spacing 1 to 6 % of the points lie on others by chance
+FLAT = 0.1  # of a scene's second extent, that the third one has at most where the scene counts as flat
+ROUNDS = 3  # of the refinement: nearest points, rigid fit
+SAME_DEG = 3.0  # motions with rotations closer than this and shifts closer than four tolerances are one
+
+
+class Motions(NamedTuple):
+    """Rigid motions p -> rotation p + shift of a scene, those that map the largest fraction first.
+
+    Attributes:
+        rotation: (k, 3, 3).
+        shift: (k, 3), in the unit of the scene.
+        fraction: (k,) of the source points that come to lie within the tolerance of a scene point.
+        complete: False where the scene has more motions than were ranked, as a lattice has.
+    """
+
+    rotation: Array
+    shift: Array
+    fraction: Array
+    complete: bool
+
+    @classmethod
+    def none(cls) -> "Motions":
+        """Return an empty record."""
+        return cls(np.empty((0, 3, 3)), np.empty((0, 3)), np.empty(0), True)
+
+    def competitors(self, rotation: Array, translation: Array) -> tuple[Array, Array]:
+        """Return the poses (k, 3, 3), (k, 3) that these motions confuse with the pose (3, 3), (3,)."""
+        rotations = rotation @ self.rotation.transpose(0, 2, 1)
+        return rotations, translation - np.einsum("kij,kj->ki", rotations, self.shift)
+
+    def of(self, points3d: Array, sources: Indices, tolerance: float, least: float) -> "Motions":
+        """Return those motions of a scene that map at least a fraction `least` of some of its points (k,)."""
+        tree = cKDTree(points3d)
+        moved = np.einsum("kij,sj->ksi", self.rotation, points3d[sources]) + self.shift[:, None]
+        near = np.isfinite(tree.query(moved, distance_upper_bound=tolerance)[0])
+        fraction = near.mean(-1) if len(sources) else np.zeros(len(near))
+        order = np.argsort(-fraction, kind="stable")
+        order = order[fraction[order] >= least]
+        return Motions(self.rotation[order], self.shift[order], fraction[order], self.complete)
+
+
+def mirror_pose(points3d: Array, rotation: Array, translation: Array) -> tuple[Array, Array] | None:
+    """Return the pose that sees a flat scene nearly the same, its normal on the other side of the line of sight.
+
+    Args:
+        points3d: (n, 3) scene points.
+        rotation: (3, 3), translation: (3,) of a pose.
+
+    Returns:
+        Rotation (3, 3) and translation (3,), or None where the scene is not flat (`FLAT`).
+
+    Source: D. Oberkampf, D. DeMenthon, L. Davis, Iterative pose estimation using coplanar feature points, CVIU 1996.
+    """
+    middle = points3d.mean(0)
+    _, extents, axes = np.linalg.svd(points3d - middle, full_matrices=False)
+    if len(points3d) < 3 or extents[2] > FLAT * extents[1]:
+        return None
+    seen = rotation @ middle + translation
+    sight = seen / max(float(np.linalg.norm(seen)), 1e-300)
+    across, flipped = (np.eye(3) - 2 * np.outer(axis, axis) for axis in (sight, axes[2]))
+    turned = across @ rotation @ flipped
+    return turned, seen - turned @ middle
+
+
+def self_motions(
+    points3d: Array,
+    tolerance: float,
+    *,
+    sources: Indices | None = None,
+    labels3d: Indices | None = None,
+    normals3d: Array | None = None,
+    least: float = 0.3,
+    bases: int = BASES,
+) -> Motions:
+    """Find rigid motions that map a fraction of a scene's points onto its points.
+
+    Args:
+        points3d: (n, 3) scene points.
+        tolerance: distance within which a moved point lies on a scene point, in the unit of the scene.
+        sources: (k,) indices of the points that are moved, for example those that an image shows; all by default.
+        labels3d: (n,) a point only maps onto points of its own label; -1 fits any label.
+        normals3d: (n, 3) unit normals; a point only maps onto points with a normal within 60 degrees of its moved one.
+        least: smallest fraction of the sources that a motion maps.
+        bases: number of bases that are matched.
+
+    Returns:
+        Distinct motions without the identity, the largest fraction first.
+
+    Examples:
+        >>> import numpy as np
+        >>> part = np.random.default_rng(0).uniform(-1, 1, (20, 3))
+        >>> third = np.array([[-0.5, -(3**0.5) / 2, 0], [3**0.5 / 2, -0.5, 0], [0, 0, 1]])
+        >>> motions = self_motions(np.concatenate([part, part @ third.T, part @ third]), 0.02)
+        >>> np.degrees(np.arccos((np.trace(motions.rotation[0]) - 1) / 2)).round(), motions.fraction[:2]
+        (120.0, array([1., 1.]))
+    """
+    points = np.ascontiguousarray(points3d, np.float64)
+    moved = np.arange(len(points)) if sources is None else np.asarray(sources, np.int64)
+    if len(moved) < 4 or len(points) < 4 or not tolerance > 0:
+        return Motions.none()
+    count = min(_neighbours(points) + 1, len(points))
+    tree = cKDTree(points)
+    distance, index = tree.query(points, count)
+    labels = np.full(len(points), -1) if labels3d is None else np.asarray(labels3d, np.int64)
+    normals = np.empty((0, 3)) if normals3d is None else np.ascontiguousarray(normals3d, np.float64)
+    scene = Scene(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
+    chosen, sample = _bases(points, moved, bases), _sample(moved)
+    found = Found(np.zeros((MOST_FOUND, 3, 3)), np.zeros((MOST_FOUND, 3)), np.zeros(MOST_FOUND))
+    most = MOST_WORK // max(len(chosen), 1)
+    total = _register(
+        scene, chosen, sample, tolerance, math.ceil(0.7 * least * len(sample)), most, found, np.empty((4, 3, 3))
+    )
+    kept = min(total, MOST_FOUND)
+    rotation, shift, score = found.rotation[:kept], found.shift[:kept], found.score[:kept]
+    middle = np.median(points[moved], 0)
+    size = extent(points[moved])
+    offsets = rotation @ middle + shift
+    unique = distinct(rotation, offsets / size, score, REFINED, SAME_DEG, max(4 * tolerance / size, 1e-6))
+    refined = [_refine(points, tree, moved, rotation[k], shift[k], tolerance, labels, normals) for k in unique]
+    motions = [one for one in refined if one[2] >= least and _moves(one, points[moved], 3 * tolerance)]
+    if not motions:
+        return Motions.none()
+    motions.sort(key=lambda one: -one[2])
+    rotation, shift, fraction = (np.array(part) for part in zip(*motions, strict=True))
+    offsets = rotation @ middle + shift
+    unique = distinct(rotation, offsets / size, fraction, REFINED, SAME_DEG, max(4 * tolerance / size, 1e-6))
+    return Motions(rotation[unique], shift[unique], fraction[unique], total <= MOST_FOUND)
+
+
+def extent(points: Array) -> float:
+    """Return the median distance of points (n, 3) from their median: the size of a scene without its far points."""
+    return float(np.median(np.linalg.norm(points - np.median(points, 0), axis=-1)))
+
+
+def matching_tolerance(points3d: Array, sources: Indices, noise: float) -> float:
+    """Return the distance within which a moved point lies on a scene point.
+
+    Args:
+        points3d: (n, 3) scene points.
+        sources: (k,) indices of the points that are moved.
+        noise: standard deviation of a match, in the unit of the scene.
+
+    Returns:
+        Three standard deviations or `NEAR_SYMMETRY` of the extent, whichever is larger, rounded up to a power of two
+        of the latter; at most `SPACING` of the median distance of a source from its nearest neighbour, beyond which
+        points lie on others by chance.
+    """
+    least = NEAR_SYMMETRY * extent(points3d[sources])
+    if not least > 0:
+        return 0.0
+    steps = math.ceil(math.log2(max(3 * noise / least, 1.0)))
+    nearest = cKDTree(points3d).query(points3d[sources], 2)[0][:, 1]
+    spacing = float(np.median(nearest[nearest > 0])) if nearest.any() else 0.0
+    return min(2.0**steps * least, SPACING * spacing)
+
+
+class Scene(NamedTuple):
+    """What the compiled loops read: points (n, 3), a table of them, distances (n, c) and indices (n, c) of the nearest
+    points of each, labels (n,) and normals (n, 3) or (0, 3)."""
+
+    points: Array
+    table: HashedPoints
+    distance: Array
+    neighbours: Indices
+    labels: Indices
+    normals: Array
+
+
+class Found(NamedTuple):
+    """Motions that the compiled loops write: rotation (c, 3, 3), shift (c, 3) and number of confirming points (c,)."""
+
+    rotation: Array
+    shift: Array
+    score: Array
+
+
+def _bases(points: Array, moved: Indices, count: int) -> Indices:
+    """Return bases (b, 3) of source points: wide triangles, each of a neighbourhood."""
+    rng = np.random.default_rng(0)
+    tree = cKDTree(points[moved])
+    first = moved[rng.permutation(len(moved))[np.arange(count) % len(moved)]]
+    around = tree.query(points[first], min(_neighbours(points) + 1, len(moved)))[1]
+    bases = []
+    for a, near in zip(first.tolist(), np.atleast_2d(around), strict=True):
+        # Of several draws the widest: its motion is the most accurate.
+        draws = moved[near[rng.integers(1, len(near), (WIDEST, 2))]]
+        edges = points[draws] - points[a]
+        area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+        bases.append([a, *draws[area.argmax()]])
+    return np.array(bases, np.int64).reshape(-1, 3)
+
+
+def _neighbours(points: Array) -> int:
+    return NEIGHBOURS if len(points) <= MANY else MANY_NEIGHBOURS
+
+
+def _sample(moved: Indices) -> Indices:
+    """Return at most `CHECKED` sources that are spread evenly over their order."""
+    order = np.random.default_rng(1).permutation(len(moved))
+    return np.ascontiguousarray(moved[order[:CHECKED]])
+
+
+def _refine(
+    points: Array,
+    tree: Any,
+    moved: Indices,
+    rotation: Array,
+    shift: Array,
+    tolerance: float,
+    labels: Indices,
+    normals: Array,
+) -> tuple[Array, Array, float]:
+    """Return a motion that is fitted to the nearest scene points of the moved ones, and the fraction that it maps."""
+    own, near, reach = points[moved], np.zeros(len(moved), bool), 2 * tolerance
+    for step in range(ROUNDS + 1):
+        distance, target = tree.query(own @ rotation.T + shift, distance_upper_bound=reach)
+        near = np.isfinite(distance)
+        target = np.where(near, target, 0)
+        near &= (labels[moved] == labels[target]) | (labels[moved] < 0) | (labels[target] < 0)
+        if len(normals):
+            near &= ((normals[moved] @ rotation.T) * normals[target]).sum(-1) > 0.5
+        if step == ROUNDS or near.sum() < 3:
+            break
+        one, other = own[near], points[target[near]]
+        centre, onto = one.mean(0), other.mean(0)
+        left, _, right = np.linalg.svd((other - onto).T @ (one - centre))
+        sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(left @ right))])
+        rotation = left @ sign @ right
+        shift = onto - rotation @ centre
+        reach = tolerance if step else 1.5 * tolerance
+    return rotation, shift, float(near.mean())
+
+
+def _moves(motion: tuple[Array, Array, float], own: Array, least: float) -> bool:
+    """Return whether a motion is no identity: it moves the points (k, 3) by more than `least`, in root mean square."""
+    rotation, shift, _ = motion
+    return float(np.sqrt(((own @ rotation.T + shift - own) ** 2).sum(-1).mean())) > least
+
+
+@compiled
+def _register(
+    scene: Any, bases: Any, sample: Any, tolerance: float, least: int, most: int, found: Any, work: Any
+) -> Any:
+    """Write the motions that match a base with a congruent one and that at least `least` of the sample confirm; return
+    their number, which exceeds the room for them too where a base takes more work than `most`.
+
+    work: (4, 3, 3), overwritten."""
+    points, count = scene.points, 0
+    frame, target, rotation, shift = work[0], work[1], work[2], work[3, 0]
+    for base in range(len(bases)):
+        a, b, c = bases[base, 0], bases[base, 1], bases[base, 2]
+        ab, ac, bc = _between(points, a, b), _between(points, a, c), _between(points, b, c)
+        if not _frame(points, a, b, c, frame):
+            continue
+        work_done = 0
+        for i in range(len(points)):
+            if work_done > most:
+                count += len(found.score)
+                break
+            if not _fits(scene, a, i):
+                continue
+            row = scene.distance[i]
+            first_j, last_j = _first_above(row, ab - tolerance), _first_above(row, ab + tolerance)
+            first_l, last_l = _first_above(row, ac - tolerance), _first_above(row, ac + tolerance)
+            for at_j in range(first_j, last_j):
+                j = scene.neighbours[i, at_j]
+                if j == i or not _fits(scene, b, j):
+                    continue
+                for at_l in range(first_l, last_l):
+                    l = scene.neighbours[i, at_l]  # noqa: E741
+                    work_done += 1
+                    if l in (i, j) or not _fits(scene, c, l) or (i == a and j == b and l == c):
+                        continue
+                    if abs(_between(points, j, l) - bc) > tolerance:
+                        continue
+                    if not _frame(points, i, j, l, target):
+                        continue
+                    for p in range(3):
+                        for q in range(3):
+                            rotation[p, q] = (
+                                target[0, p] * frame[0, q] + target[1, p] * frame[1, q] + target[2, p] * frame[2, q]
+                            )
+                    for p in range(3):
+                        x = (points[a, 0] + points[b, 0] + points[c, 0]) / 3
+                        y = (points[a, 1] + points[b, 1] + points[c, 1]) / 3
+                        z = (points[a, 2] + points[b, 2] + points[c, 2]) / 3
+                        shift[p] = (points[i, p] + points[j, p] + points[l, p]) / 3 - (
+                            rotation[p, 0] * x + rotation[p, 1] * y + rotation[p, 2] * z
+                        )
+                    score, left = 0, len(sample)
+                    for s in range(len(sample)):
+                        if score + left < least or (score == 0 and s == FIRST):
+                            break
+                        left -= 1
+                        work_done += CONFIRMING
+                        score += _on(scene, rotation, shift, sample[s])
+                    if score >= least:
+                        place = count if count < len(found.score) else -1
+                        if place < 0:
+                            place = 0
+                            for e in range(1, len(found.score)):
+                                if found.score[e] < found.score[place]:
+                                    place = e
+                            if found.score[place] >= score:
+                                place = -1
+                        count += 1
+                        if place >= 0:
+                            found.score[place] = score
+                            for p in range(3):
+                                found.shift[place, p] = shift[p]
+                                for q in range(3):
+                                    found.rotation[place, p, q] = rotation[p, q]
+    return count
+
+
+@part
+def _fits(scene: Any, a: int, i: int) -> Any:
+    one, other = scene.labels[a], scene.labels[i]
+    return one < 0 or other < 0 or one == other
+
+
+@part
+def _between(points: Any, a: int, b: int) -> Any:
+    x, y, z = points[a, 0] - points[b, 0], points[a, 1] - points[b, 1], points[a, 2] - points[b, 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@part
+def _first_above(row: Any, value: float) -> Any:
+    """Return the index of the first of ascending distances that is not below the value."""
+    low, high = 0, len(row)
+    while low < high:
+        middle = (low + high) // 2
+        if row[middle] < value:
+            low = middle + 1
+        else:
+            high = middle
+    return low
+
+
+@part
+def _frame(points: Any, a: int, b: int, c: int, frame: Any) -> Any:
+    """Write the orthonormal frame of a triangle, row by row; return False where it is flat."""
+    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    vx, vy, vz = points[c, 0] - points[a, 0], points[c, 1] - points[a, 1], points[c, 2] - points[a, 2]
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    long, normal = math.sqrt(ux * ux + uy * uy + uz * uz), math.sqrt(nx * nx + ny * ny + nz * nz)
+    if not (long > 0 and normal > 1e-6 * long * long):
+        return False
+    ux, uy, uz, nx, ny, nz = ux / long, uy / long, uz / long, nx / normal, ny / normal, nz / normal
+    frame[0, 0], frame[0, 1], frame[0, 2] = ux, uy, uz
+    frame[1, 0], frame[1, 1], frame[1, 2] = nx, ny, nz
+    frame[2, 0], frame[2, 1], frame[2, 2] = uy * nz - uz * ny, uz * nx - ux * nz, ux * ny - uy * nx
+    return True
+
+
+@part
+def _on(scene: Any, rotation: Any, shift: Any, k: int) -> Any:
+    """Return whether the moved point lies near a scene point."""
+    points = scene.points
+    x, y, z = points[k, 0], points[k, 1], points[k, 2]
+    return lies_on(
+        scene.table,
+        rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + shift[0],
+        rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + shift[1],
+        rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + shift[2],
+    )
