@@ -27,7 +27,7 @@ from bpnp.search.scene import Scene, degenerate
 from bpnp.search.schedule import Proposals, only_proposed, turns
 from bpnp.search.settings import DEFAULT, SearchSettings
 from bpnp.search.starts import Prior
-from bpnp.search.verdict import SearchResult, judged, no_pose
+from bpnp.search.verdict import REFINED, SearchResult, judged, no_pose
 
 Progress = Callable[[int, float], None]  # batches so far, seconds
 WARMING = 8  # points of the problem that compiles the loops
@@ -86,8 +86,10 @@ def search_poses(
     if is_enumerable(sets) and not deadline.passed():
         found, exhaustive = search_by_enumeration(sets, deadline, settings)
         rule = settings.evidence
-        enumerated = judged(found, sets, batches=0, exhaustive=exhaustive, rule=rule)
-        enumerated = against_rivals(enumerated, sets, entered, rule, exhaustive=exhaustive)
+        enumerated = judged(found, sets, batches=0, looks=REFINED, exhaustive=exhaustive, rule=rule)
+        enumerated = against_rivals(
+            enumerated, sets, entered, rule, looks=REFINED, exhaustive=exhaustive, contested=True
+        )
         if matches is not None and enumerated.log10_false_alarms > 0:  # their residuals may exceed its radius
             return _of_known_matches(sets, *matches, entered, seed, settings)
         tell(0)

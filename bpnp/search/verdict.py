@@ -26,6 +26,7 @@ from bpnp.search.settings import DEFAULT
 
 Verdict = Literal["confident", "ambiguous", "failed"]
 HALF_TURN = 180.0  # degrees; a bound that is larger says nothing of a rotation
+REFINED = math.inf  # local searches that the exact refinement of an enumeration is worth
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,13 +93,14 @@ def match_count(candidates: Candidates, sets: PointSets) -> float:
     return float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
 
 
-def missed(candidates: Candidates, sets: PointSets, looks: int, rule: Evidence, *, independent: bool = True) -> float:
+def missed(candidates: Candidates, sets: PointSets, looks: float, rule: Evidence, *, independent: bool = True) -> float:
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
     Args:
         candidates: poses in the user's coordinates, best first.
         sets: the points of the problem.
-        looks: number of local searches around the first candidate that found nothing better.
+        looks: number of local searches around the first candidate that found nothing better; `REFINED` of an
+            enumeration, which leaves no better pose beside one.
         rule: constants of the verdict.
         independent: False to leave out the evidence of the matches.
 
@@ -113,7 +115,10 @@ def missed(candidates: Candidates, sets: PointSets, looks: int, rule: Evidence, 
     value = log10_missed(starts_met(candidates, sets, rule), decades, looks, rule)
     if value > rule.missed or not is_symmetric(candidates, sets, rule):
         return value
-    return log10_missed(starts_met(candidates, sets, rule, symmetric=True), 0.0, looks, rule, symmetric=True)
+    hits, share = starts_met(candidates, sets, rule, symmetric=True), 0.0
+    if sets.prior is not None:  # a better pose elsewhere is as unlikely as the prior makes it
+        share = sets.log10_share(candidates.rotation[0], candidates.translation[0])
+    return min(log10_missed(hits, 0.0, looks, rule, symmetric=True) + share, 0.0)
 
 
 def motions_of(candidates: Candidates, sets: PointSets, rule: Evidence) -> Motions:
@@ -164,7 +169,7 @@ def judged(
     sets: PointSets,
     *,
     batches: int,
-    looks: int = 0,
+    looks: float = 0,
     exhaustive: bool = False,
     rule: Evidence = DEFAULT.evidence,
     rig: Seen = (),
@@ -221,7 +226,9 @@ def is_certain(candidates: Candidates, sets: PointSets, rule: Evidence = DEFAULT
     if not len(candidates) or float(candidates.log10_false_alarms[0]) > rule.false_alarms:
         return False
     other = other_pose(candidates, sets, rule)
-    return (other is None or other.decades >= rule.lead) and rougher(candidates) is None
+    if (other is not None and other.decades < rule.lead) or rougher(candidates) is not None:
+        return False
+    return missed(candidates, sets, REFINED, rule) <= rule.missed
 
 
 def no_pose(reason: str, batches: int = 0, *, settled: bool = False) -> SearchResult:

@@ -36,6 +36,7 @@ def explore(
     """`sweep` with a budget, and without one `settle` the first pose in `work`: what both call is compiled once."""
     if budget > 0:
         return sweep(row, first, budget, stop, block, problem, kept, work)
+    kept.at[0] = -1
     settle(work.poses[0], reach, problem, kept, work)
     return row, first, 0
 
@@ -59,6 +60,7 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
         if place < block.old_image and t < block.old_scene:
             t = block.old_scene
         chords, hand = chords_between(rays, i, j, k), 3
+        kept.at[0] = place
         if block.size == 3:
             hand = 1 if _determinant(rays[i], rays[j], rays[k]) > 0 else 2
         while t < len(triangles.triples):
@@ -73,7 +75,8 @@ def sweep(row: int, first: int, budget: int, stop: float, block: Any, problem: A
             ):
                 continue
             known = kept.point[best[0]]
-            if kept.counts[best[0]] >= RULES.skipped and known[i] == a and known[j] == b and known[k] == c:
+            own = known[i] == a and known[j] == b and known[k] == c
+            if own and kept.counts[best[0]] >= RULES.skipped and kept.hits[best[0]] >= RULES.counted:
                 continue
             solved += 1
             if block.size == 2:
@@ -135,7 +138,11 @@ def witnessed(pose: Any, points: Any, seen: Any, block: Any, problem: Any) -> bo
 
 class Kept(NamedTuple):
     """Distinct poses (c, 4, 3), their evidence (c,), numbers of matches (c,), matches (c, m) and squared distances
-    (c, m). best: (1,) the place of the best. most: (1,) matches that any hypothesis of the stage had."""
+    (c, m).
+
+    best: (1,) the index of the best. most: (1,) matches that any hypothesis of the stage had. hits: (c,) basin counts,
+    the number of image sets of which a hypothesis ended at the pose. last: (c,) the image set that was counted last,
+    at: (1,) the one that is tried, -1 for a pose that does not come from one."""
 
     poses: Array
     evidence: Array
@@ -144,6 +151,9 @@ class Kept(NamedTuple):
     distance2: Array
     best: Places
     most: Array
+    hits: Places
+    last: Places
+    at: Places
 
 
 class Work(NamedTuple):
@@ -223,23 +233,28 @@ def allowed(pose: Any, prior: Any) -> bool:
 @part
 def keep(pose: Any, value: float, count: int, matches: Any, kept: Any) -> None:
     """Put a pose among the kept ones: in the place of the same pose, of an empty one, or of the worst."""
-    values, best, place = kept.evidence, kept.best, -1
+    values, best, place, is_new = kept.evidence, kept.best, -1, False
     for c in range(len(values)):
         if values[c] > -math.inf and _same(pose, kept.poses[c]):
+            if kept.at[0] >= 0 and kept.last[c] != kept.at[0]:
+                kept.hits[c], kept.last[c] = kept.hits[c] + 1, kept.at[0]
             if values[c] >= value:
                 return
             if place >= 0:
                 values[c] = -math.inf  # both are this pose
+                kept.hits[place] = max(kept.hits[place], kept.hits[c])
             else:
                 place = c
     if place < 0:
-        place = 0
+        place, is_new = 0, True
         for c in range(1, len(values)):
             if values[c] < values[place]:
                 place = c
     if values[place] >= value:
         return
     values[place], kept.counts[place] = value, count
+    if is_new:
+        kept.hits[place], kept.last[place] = kept.at[0] >= 0, kept.at[0]
     copy_pose(pose, pose[3], kept.poses[place], kept.poses[place, 3])
     copy(matches.point, kept.point[place])
     copy(matches.distance2, kept.distance2[place])

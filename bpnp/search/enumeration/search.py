@@ -29,6 +29,7 @@ from bpnp.search.enumeration.points import (
 )
 from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.evidence.partners import explained
+from bpnp.search.evidence.repetitions import repeated_poses
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -50,8 +51,9 @@ class EnumeratedPoses(NamedTuple):
 
     rotation: (c, 3, 3). translation: (c, 3). evidence: (c,) nats beyond chance, before the number of tests counts.
     match: (c, m) the scene point that each image point is, -1 for none. residual: (c, m) its angle, radians, infinite
-    where there is none. fixing, tests: of `Enumeration`. ended: why; "exhausted" where every hypothesis was
-    tried, "safe" where `is_safe` said so, "interrupted" by the deadline, "most" after as many as are allowed.
+    where there is none. hits: (c,) basin counts: image sets of which a hypothesis ended at the pose. fixing, tests: of
+    `Enumeration`. ended: why; "exhausted" where every hypothesis was tried, "safe" where `is_safe` returned True,
+    "interrupted" by the deadline, "most" after as many as are allowed.
     """
 
     rotation: Array
@@ -59,9 +61,20 @@ class EnumeratedPoses(NamedTuple):
     evidence: Array
     match: Places
     residual: Array
+    hits: Places
     fixing: int
     tests: float
     ended: Ended
+
+    @property
+    def scale(self) -> Array:
+        """(c,) standard deviations of the residuals, radians."""
+        matched = np.isfinite(self.residual)
+        free = np.maximum(2 * matched.sum(-1) - 2 * self.fixing, 1)  # numbers that were measured, less those fitted
+        return np.asarray(np.sqrt((np.where(matched, self.residual, 0.0) ** 2).sum(-1) / free))
+
+
+Competitors = Callable[[EnumeratedPoses], tuple[Array, Array]]
 
 
 class Enumeration:
@@ -78,6 +91,7 @@ class Enumeration:
         (prior, heading, log_share), fixing = prior_arrays(sets, scene, image, settings), sets.pairs_that_fix
         self.scene, self.image, self.settings = scene, image, settings
         self.fixing, self.solved, self._pace = fixing, 0, SLOWEST
+        self.contested: list[Array] = []  # rotations (3, 3) of poses whose competitors were proposed
         m, n, kept = len(image.arrays.rays), len(scene.arrays.points), settings.kept
         self.problem = Problem(scene.arrays, image.arrays, prior, heading, fixing, image.density)
         self.kept = Kept(
@@ -88,6 +102,9 @@ class Enumeration:
             np.zeros((kept, m)),
             np.zeros(1, np.int64),
             np.zeros(1),
+            np.zeros(kept, np.int64),
+            np.full(kept, -1),
+            np.zeros(1, np.int64),
         )
         matches = Matches(np.empty(m, np.int64), np.empty(m))
         self.work = Work(np.empty((4, 4, 3)), matches, np.empty((8, 6)))
@@ -147,6 +164,11 @@ class Enumeration:
         if solved >= most:
             self._pace = (Clock.now() - start) / solved
 
+    def propose(self, rotation: Array, translation: Array, reach: float) -> None:
+        """Refine a pose (3, 3), (3,) of the user from matches within `reach` radii, and keep it."""
+        turn, middle = self.image.turn, rotation @ self.scene.centre + translation
+        self.refine(np.vstack([turn @ rotation, turn @ middle / self.scene.size]), reach)
+
     def refine(self, pose: Array, reach: float) -> None:
         """Refine a pose (4, 3) of these frames from matches within `reach` radii, and keep it."""
         self.work.poses[0] = pose
@@ -162,12 +184,14 @@ def enumerate_poses(
     radius: float | None = None,
     deadline: float = math.inf,
     is_safe: Callable[[EnumeratedPoses], bool] | None = None,
+    competitors: Competitors | None = None,
     settings: EnumerationSettings = DEFAULT,
 ) -> EnumeratedPoses:
     """Poses under which image points see scene points, one-to-one within `radius`.
 
-    radius: radians, the largest residual of a match, a few standard deviations of the noise; None for
-        `sets.match_radius`. deadline: of `Clock`.
+        poses = enumerate_poses(
+            sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule
+        )
     is_safe: asked whether to stop, once the best pose exceeds chance and every other pose; None for always. Where
     gravity is known, or the rotation to a few degrees, two matches fix a pose; where a whole pose is known, it is tried
     first.
@@ -187,6 +211,8 @@ def enumerate_poses(
         if run.best < run.tests:
             return None
         poses = _poses(run, "safe")
+        if competitors is not None:
+            poses = _with_competitors(run, poses, competitors)
         if margin(poses, settings) >= safe * (1 - run.solved / settings.patience) and (
             is_safe is None or is_safe(poses)
         ):
@@ -195,8 +221,7 @@ def enumerate_poses(
 
     complete = False
     if (predicted := predicted_pose(sets.prior)) is not None:
-        turn, middle = run.image.turn, predicted[0] @ run.scene.centre + predicted[1]
-        run.refine(np.vstack([turn @ predicted[0], turn @ middle / run.scene.size]), run.reach)
+        run.propose(*predicted, run.reach)
         if (poses := enough(0.0)) is not None:
             return poses
     for stage in settings.stages:
@@ -216,6 +241,18 @@ def enumerate_poses(
         if complete and stage.matches == 3 and stage.reach == settings.stages[-1].reach:
             break
     return _poses(run, "exhausted" if complete else "most")
+
+
+def _with_competitors(run: Enumeration, poses: EnumeratedPoses, competitors: Competitors) -> EnumeratedPoses:
+    """Propose the competitors of the best pose, and of the better pose that one of them leads to; each pose once."""
+    while True:
+        best = poses.rotation[0]
+        if any(np.trace(known.T @ best) > RULES.same_trace for known in run.contested):
+            return poses
+        run.contested.append(best)
+        for pose in zip(*competitors(poses), strict=True):
+            run.propose(*pose, run.reach)
+        poses = _poses(run, poses.ended)
 
 
 def _reach(sets: PointSets, scene: SceneSide, radius: float, settings: EnumerationSettings) -> float:
@@ -241,7 +278,9 @@ def _poses(run: Enumeration, ended: Ended) -> EnumeratedPoses:
     match, radii = kept.point[order], np.sqrt(kept.distance2[order])
     residual = np.where(match >= 0, radii / run.image.arrays.per_radian, math.inf)
     evidence = kept.evidence[order]
-    return EnumeratedPoses(rotation, translation, evidence, match, residual, run.fixing, run.tests, ended)
+    return EnumeratedPoses(
+        rotation, translation, evidence, match, residual, kept.hits[order], run.fixing, run.tests, ended
+    )
 
 
 def margin(poses: EnumeratedPoses, settings: EnumerationSettings = DEFAULT) -> float:
@@ -270,8 +309,7 @@ def exceeds_enumeration(sets: PointSets) -> bool:
 
 
 def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchSettings) -> tuple[Candidates, bool]:
-    """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried, or none
-    needs to be, since the best pose is certain.
+    """The poses of few points in the user's coordinates, best first; and whether every hypothesis was tried.
 
     Where the whole pose is known closely, as when a device is tracked, it is tried, and if it does not hold the search
     goes everywhere; where it is known roughly, the search goes everywhere if no pose near it exceeds chance. Where
@@ -289,8 +327,15 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
         certain = candidates if is_certain(candidates, sets, settings.evidence) else None
         return certain is not None
 
+    def competitors(poses: EnumeratedPoses) -> tuple[Array, Array]:
+        pose = poses.rotation[0], poses.translation[0]
+        scale = max(float(poses.scale[0]), sets.floor or 1e-5)
+        return repeated_poses(annotated, *pose, scale, settings.evidence)[0]
+
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        poses = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, settings=rule)
+        poses = enumerate_poses(
+            sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule
+        )
         return poses, _candidates(poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None
@@ -306,19 +351,17 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
         poses, others = enumerated(replace(sets, prior=None), DEFAULT)
         candidates = Candidates.concatenated([candidates, others])
         candidates = candidates[np.argsort(-candidates.score, kind="stable")[: settings.kept]]
-    return candidates, certain is not None or poses.ended == "exhausted"
+    return candidates, poses.ended == "exhausted"
 
 
 def _candidates(poses: EnumeratedPoses, sets: PointSets, settings: SearchSettings) -> Candidates:
     """The poses that are not far less likely than the best one; scale and likelihood as the annealing defines them."""
     rivals = poses.evidence >= (poses.evidence.max() if len(poses.evidence) else 0.0) - DEFAULT.near_nats
     rivals &= np.arange(len(rivals)) < settings.kept
-    rotation, translation, residual = (x[rivals] for x in (poses.rotation, poses.translation, poses.residual))
-    matched = np.isfinite(residual)
-    count = matched.sum(-1)
-    free = np.maximum(2 * count - 2 * poses.fixing, 1)  # numbers that were measured, less those that were fitted
-    scale = np.sqrt((np.where(matched, residual, 0.0) ** 2).sum(-1) / free)
-    scale = np.maximum(scale, sets.floor or 1e-5)
+    rotation, translation = poses.rotation[rivals], poses.translation[rivals]
+    count = np.isfinite(poses.residual[rivals]).sum(-1)
+    scale = np.maximum(poses.scale[rivals], sets.floor or 1e-5)
     score = np.array([explained(sets, *each)[0] for each in zip(rotation, translation, scale, strict=True)])
     share = count / min(len(sets.bearings), len(sets.points3d))
-    return replace(Candidates.unscored(rotation, translation), score=score, matched=share, scale=scale)
+    unscored = Candidates.unscored(rotation, translation)
+    return replace(unscored, score=score, matched=share, scale=scale, hits=poses.hits[rivals])

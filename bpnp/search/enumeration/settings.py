@@ -26,7 +26,7 @@ class Rules(NamedTuple):
     expected_cosine: up to this angle a point is expected to be seen. ladder: radii 1, 1/2, 1/4 ... at which matches are
     counted. missed: nats that an expected but missing point costs: one in five is missed. lacking: matches that it
     takes away from a hypothesis. behind: matches that a hypothesis may have less than any other had, to be refined.
-    skipped: matches of the best pose from which its own triples are not solved again.
+    skipped: matches of the best pose from which its own triples are not solved again, counted: its basin count then.
     tighter, final: factor of the radius from one step of a refinement to the next, and steps at the last one.
     same_trace, same_shift, same_depth: poses are the same if the trace of the turn between them is larger and the shift
     smaller than the sum of these shares of the scene's extent and of its distance.
@@ -40,6 +40,7 @@ class Rules(NamedTuple):
     lacking: float = 0.25
     behind: float = 1.0
     skipped: int = 5
+    counted: int = 12
     tighter: float = 0.55
     final: int = 3
     same_trace: float = 1 + 2 * math.cos(math.radians(2.0))

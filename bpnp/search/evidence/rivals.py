@@ -31,15 +31,18 @@ def against_rivals(
     entered: Callable[[], Scene],
     rule: Evidence,
     *,
-    looks: int = 0,
+    looks: float = 0,
     exhaustive: bool = False,
+    contested: bool = False,
 ) -> SearchResult:
     """A confident result once more, beside the poses that a repeated structure would confuse with it, and beside those
     at other focal lengths; if one of the former is better, so is that one.
 
-    The camera is believed as it was given unless another focal length, which is paid for as an unknown, has fewer false
+    contested: whether the poses of a repeated structure were proposed before. The camera is believed as it was given
+    unless another focal length, which is paid for as an unknown, has fewer false
     alarms by the factor `rule.focal_chance`."""
-    result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
+    if not contested:
+        result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
     if result.verdict != "confident":
         return result
     other = other_camera(result, sets, entered, rule)
@@ -146,7 +149,7 @@ def _against_repetitions(
     sets: PointSets,
     entered: Callable[[], Scene],
     rule: Evidence,
-    looks: int,
+    looks: float,
     exhaustive: bool,
 ) -> SearchResult:
     """A confident result beside the poses that a repeated structure would confuse with it; the best of them first."""

@@ -93,7 +93,8 @@ class Evidence:
         other_shift: poses with rotations farther apart, or translations by this share of their length, are different.
     missed: of the probability that a better optimum was not met, at most (`bpnp.search.evidence.alternatives`).
     independent: matches that have to be coincidences for it, as many as fix a pose. another: probability that there is
-        a better optimum though several starts ended at a pose that exceeds chance. look_fails: that starts around a
+        a better optimum though several starts ended at a pose that exceeds chance. uncompared: probability that a
+        better pose of a symmetric scene is not among those that its motions give. look_fails: that starts around a
         wrong pose miss a better one beside it, as 40 of 922 did; again_fails: that others miss it after these, as 8 of
         29 did.
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
@@ -109,6 +110,7 @@ class Evidence:
     missed: float = -3.0
     independent: int = 3
     another: float = 0.01
+    uncompared: float = 1e-3
     look_fails: float = 1 / 20
     again_fails: float = 1 / 3
     focal_chance: float = 0.01
