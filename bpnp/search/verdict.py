@@ -93,7 +93,7 @@ def match_count(candidates: Candidates, sets: PointSets) -> float:
     return float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
 
 
-def missed(candidates: Candidates, sets: PointSets, looks: float, rule: Evidence, *, independent: bool = True) -> float:
+def missed(candidates: Candidates, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True) -> float:
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
     Args:
@@ -169,7 +169,7 @@ def judged(
     sets: PointSets,
     *,
     batches: int,
-    looks: float = 0,
+    looks: float | int = 0,
     exhaustive: bool = False,
     rule: Evidence = DEFAULT.evidence,
     rig: Seen = (),

@@ -330,7 +330,8 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
     def competitors(poses: EnumeratedPoses) -> tuple[Array, Array]:
         pose = poses.rotation[0], poses.translation[0]
         scale = max(float(poses.scale[0]), sets.floor or 1e-5)
-        return repeated_poses(annotated, *pose, scale, settings.evidence)[0]
+        repeated = repeated_poses(annotated, *pose, scale, settings.evidence)
+        return repeated.rotation, repeated.translation
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
         poses = enumerate_poses(

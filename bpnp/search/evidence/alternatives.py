@@ -176,7 +176,7 @@ def _partners(near: float, sets: PointSets, rotation: Array, translation: Array,
     return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
 
 
-def log10_missed(hits: int, decades_a_match: float, looks: float, rule: Evidence, *, symmetric: bool = False) -> float:
+def log10_missed(hits: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False) -> float:
     """log10 of the probability that a better optimum than the best pose exists and was not met.
 
     It lies near the best pose or far from it, and what the matches say counts against both:
@@ -211,7 +211,7 @@ def log10_missed(hits: int, decades_a_match: float, looks: float, rule: Evidence
     return min(math.log10(unseen) - rule.independent * max(decades_a_match, 0.0), 0.0)
 
 
-def near_missed(hits: int, looks: float, rule: Evidence) -> float:
+def near_missed(hits: int, looks: float | int, rule: Evidence) -> float:
     """Probability that a better optimum beside the best pose was not met."""
     overlooked = rule.look_fails * rule.again_fails ** (looks - 1) if looks else 1.0
     return max(0.5**hits, rule.another) * overlooked

@@ -2,7 +2,7 @@
 
 import math
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,9 +80,23 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
     return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least)
 
 
-def repeated_poses(
-    sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence
-) -> tuple[Pose, bool]:
+class RepeatedPoses(NamedTuple):
+    """Poses that the scene's own motions confuse with one.
+
+    Attributes:
+        rotation: (c, 3, 3).
+        translation: (c, 3).
+        fraction: smallest fraction of the matched points that one of the motions maps; 1 without a motion.
+        complete: whether there are so few motions that these poses stand for all.
+    """
+
+    rotation: Array
+    translation: Array
+    fraction: float
+    complete: bool
+
+
+def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: float, rule: Evidence) -> RepeatedPoses:
     """Return the poses that the scene's own motions confuse with one.
 
     Args:
@@ -92,9 +106,8 @@ def repeated_poses(
         rule: constants of the verdict.
 
     Returns:
-        Rotations (c, 3, 3) and translations (c, 3): those that a verdict takes for different from the pose
-        (`Evidence.other_deg`), at most `Repetitions.kept`, with the fewest false alarms; and whether there are so few
-        motions that these stand for all.
+        Those poses that a verdict takes for different from the given one (`Evidence.other_deg`), at most
+        `Repetitions.kept`, with the fewest false alarms; of a flat scene also its mirror image.
 
     Examples:
         >>> import numpy as np
@@ -102,8 +115,8 @@ def repeated_poses(
         >>> scene = np.concatenate([motif + [2 * k, 0, 6] for k in range(3)])
         >>> image = motif + [0, 0, 6]  # the first of three equal things
         >>> sets = PointSets(image / np.linalg.norm(image, axis=1, keepdims=True), scene)
-        >>> (_, translations), _ = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
-        >>> sorted(translations[:, 0].round(6).tolist())
+        >>> repeated = repeated_poses(sets, np.eye(3), np.zeros(3), 1e-3, Evidence())
+        >>> sorted(repeated.translation[:, 0].round(6).tolist())
         [-4.0, -2.0]
     """
     limits = rule.repetitions
@@ -116,11 +129,19 @@ def repeated_poses(
     rotations, translations = every[0][other], every[1][other]
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
     best = np.argsort(alarms, kind="stable")[: limits.kept]
-    return (rotations[best], translations[best]), motions.complete
+    fraction = float(motions.fraction.min(initial=1.0))
+    return RepeatedPoses(rotations[best], translations[best], fraction, motions.complete)
 
 
 def decades_behind(
-    sets: PointSets, best: Pose, repeated: Pose, rivals: Pose, scale: float, limits: Repetitions = DEFAULT
+    sets: PointSets,
+    best: Pose,
+    repeated: Pose,
+    rivals: Pose,
+    scale: float,
+    limits: Repetitions = DEFAULT,
+    *,
+    fraction: float = 0.0,
 ) -> Array:
     """Decades (c,) by which the poses `rivals` (c, 3, 3), (c, 3) explain the image points worse than the best one.
 
@@ -132,7 +153,9 @@ def decades_behind(
     """
     seen = [directions_of(sets, *best), *(directions_of(sets, r, t) for r, t in zip(*rivals, strict=True))]
     logs = np.stack([point_evidence(sets, one, np.array([scale]), SHARES[-1:], even=True)[:, 0, 0] for one in seen])
-    missing = min((int((logs[0] < 0).sum()) + 1) / (logs.shape[1] + 2), limits.most_missing)
+    count = logs.shape[1]
+    missing = min((int((logs[0] < 0).sum()) + 1) / (count + 2), (count * (1 - fraction) + 1) / (count + 2))
+    missing = min(missing, limits.most_missing)
     most = math.log((1 - missing) / missing)
     is_repeated = _is_repeated(sets, best, repeated, limits.near * scale)
     counted = np.stack([_among(sets, one) for one in seen[1:]]) | ~is_repeated

@@ -31,7 +31,7 @@ def against_rivals(
     entered: Callable[[], Scene],
     rule: Evidence,
     *,
-    looks: float = 0,
+    looks: float | int = 0,
     exhaustive: bool = False,
     contested: bool = False,
 ) -> SearchResult:
@@ -149,19 +149,21 @@ def _against_repetitions(
     sets: PointSets,
     entered: Callable[[], Scene],
     rule: Evidence,
-    looks: float,
+    looks: float | int,
     exhaustive: bool,
 ) -> SearchResult:
     """A confident result beside the poses that a repeated structure would confuse with it; the best of them first."""
     if result.verdict != "confident":
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
-    repeated, compared = repeated_poses(sets, *best, scale, rule)
-    if not len(repeated[0]):
+    repeated = repeated_poses(sets, *best, scale, rule)
+    if not len(repeated.rotation):
         return result
-    rivals = with_false_alarms(polished(entered(), *repeated, scale), sets)
-    behind = decades_behind(sets, best, repeated, (rivals.rotation, rivals.translation), scale, rule.repetitions)
-    behind = np.maximum(behind, 0) if compared else np.zeros(len(rivals))
+    poses = repeated.rotation, repeated.translation
+    rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
+    others, limits = (rivals.rotation, rivals.translation), rule.repetitions
+    behind = decades_behind(sets, best, poses, others, scale, limits, fraction=repeated.fraction)
+    behind = np.maximum(behind, 0) if repeated.complete else np.zeros(len(rivals))
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
     candidates = Candidates.concatenated([result.candidates, replace(rivals, log10_false_alarms=alarms)])
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)

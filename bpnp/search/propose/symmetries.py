@@ -30,7 +30,9 @@ Indices = NDArray[np.int64]
 # Points of the neighbourhood in which a base and its matches lie, of scenes up to so many points and of larger ones.
 NEIGHBOURS, MANY_NEIGHBOURS, MANY = 96, 48, 500
 BASES = 32  # a motion of half of the points is missed by (1 - 1/8)^32 = 1.4 % of the registrations, at most
+COMPACT = 4  # part of a neighbourhood, from which every other base is drawn
 WIDEST = 4  # triangles of which a base is the largest
+FEWEST = 5  # moved points that lie on others: three fix a motion and are no evidence of it
 FIRST = 7  # sampled points of which at least one confirms: one of 12 motions of a third of the points fails
 CHECKED = 32  # sampled points that confirm a motion before all points do
 MOST_WORK = 30_000_000  # pairs of points that are compared for all bases together: some 0.1 s
@@ -145,6 +147,7 @@ def self_motions(
     labels = np.full(len(points), -1) if labels3d is None else np.asarray(labels3d, np.int64)
     normals = np.empty((0, 3)) if normals3d is None else np.ascontiguousarray(normals3d, np.float64)
     scene = Scene(points, hashed(points, 2 * tolerance), distance, index.astype(np.int64), labels, normals)
+    least = max(least, FEWEST / len(moved))
     chosen, sample = _bases(points, moved, bases), _sample(moved)
     found = Found(np.zeros((MOST_FOUND, 3, 3)), np.zeros((MOST_FOUND, 3)), np.zeros(MOST_FOUND))
     most = MOST_WORK // max(len(chosen), 1)
@@ -222,9 +225,10 @@ def _bases(points: Array, moved: Indices, count: int) -> Indices:
     first = moved[rng.permutation(len(moved))[np.arange(count) % len(moved)]]
     around = tree.query(points[first], min(_neighbours(points) + 1, len(moved)))[1]
     bases = []
-    for a, near in zip(first.tolist(), np.atleast_2d(around), strict=True):
-        # Of several draws the widest: its motion is the most accurate.
-        draws = moved[near[rng.integers(1, len(near), (WIDEST, 2))]]
+    for k, (a, near) in enumerate(zip(first.tolist(), np.atleast_2d(around), strict=True)):
+        # The widest of several draws has the most accurate motion; but a part may be small, and one base of two is too.
+        last = len(near) if k % 2 else max(len(near) // COMPACT, min(len(near), 4))
+        draws = moved[near[rng.integers(1, last, (WIDEST, 2))]]
         edges = points[draws] - points[a]
         area = np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=-1)
         bases.append([a, *draws[area.argmax()]])

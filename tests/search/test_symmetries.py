@@ -1,0 +1,137 @@
+"""Motions of a scene onto itself, against planted symmetries; and what a search concludes from them."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+import bpnp
+from bpnp.search.propose.symmetries import Motions, mirror_pose, self_motions
+
+Array = NDArray[np.float64]
+
+
+def parts(fold: int, each: int, unique: int, seed: int, axis: tuple[float, float, float] = (0, 0, 1)) -> Array:
+    """`fold` copies of random points, turned about an axis, and unique points, in that order."""
+    rng = np.random.default_rng(seed)
+    base = rng.uniform(-1, 1, (each, 3))
+    unit = np.array(axis) / np.linalg.norm(axis)
+    turns = Rotation.from_rotvec([2 * np.pi * k / fold * unit for k in range(fold)]).as_matrix()
+    return np.concatenate([*(base @ turn.T for turn in turns), rng.uniform(-1, 1, (unique, 3))])
+
+
+def angles(motions: Motions) -> list[int]:
+    return sorted(np.degrees(Rotation.from_matrix(motions.rotation).magnitude()).round().astype(int).tolist())
+
+
+@pytest.mark.parametrize(
+    ("fold", "expected"), [(2, [180]), (3, [120] * 2), (5, [72, 72, 144, 144]), (6, [60, 60, 120, 120, 180])]
+)
+@pytest.mark.parametrize("axis", [(0, 0, 1), (0.3, -0.5, 0.8)])
+def test_all_turns_of_a_symmetric_object_are_found(
+    fold: int, expected: list[int], axis: tuple[float, float, float]
+) -> None:
+    points = parts(fold, 90 // fold, 8, 1, axis)
+    motions = self_motions(points, 0.02)
+    assert angles(motions) == expected
+    np.testing.assert_allclose(motions.fraction, 90 / 98, atol=0.05)
+    moved = points[:90] @ motions.rotation[0].T + motions.shift[0]
+    nearest = np.linalg.norm(moved[:, None] - points, axis=-1).min(1)
+    assert nearest.max() < 1e-9
+    assert motions.complete
+
+
+def test_a_motion_has_an_inverse_and_a_shift_too() -> None:
+    base = np.random.default_rng(3).uniform(0, 1, (30, 3))
+    motions = self_motions(np.concatenate([base, base + [5, 0, 0]]), 0.02)
+    assert len(motions.shift) == 2
+    np.testing.assert_allclose(np.sort(motions.shift[:, 0]), [-5, 5], atol=1e-6)
+    np.testing.assert_allclose(motions.fraction, 0.5)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_part_of_half_of_the_points_is_found(seed: int) -> None:
+    assert 180 in angles(self_motions(parts(2, 25, 50, seed), 0.02))
+
+
+def test_points_off_by_less_than_the_tolerance_are_mapped() -> None:
+    rng = np.random.default_rng(5)
+    points = parts(2, 20, 3, 5) + 0.006 * rng.normal(size=(43, 3))
+    assert angles(self_motions(points, 0.04))[-1] == 180
+    assert 180 not in angles(self_motions(points, 0.002))
+
+
+@pytest.mark.parametrize("count", [10, 40, 300, 2000])
+def test_random_points_have_no_motion(count: int) -> None:
+    points = np.random.default_rng(count).uniform(-1, 1, (count, 3))
+    spacing = count ** (-1 / 3)
+    assert not len(self_motions(points, 0.1 * spacing).fraction)
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e7])
+def test_motions_do_not_depend_on_the_unit(unit: float) -> None:
+    points = parts(3, 20, 5, 2)
+    one, other = self_motions(points, 0.02), self_motions(unit * points, 0.02 * unit)
+    np.testing.assert_allclose(other.rotation, one.rotation, atol=1e-6)
+    np.testing.assert_allclose(other.shift / unit, one.shift, atol=1e-6)
+
+
+def test_labels_and_normals_break_a_symmetry() -> None:
+    points = parts(2, 25, 0, 4)
+    labels = np.repeat([0, 1], 25)
+    assert not len(self_motions(points, 0.02, labels3d=labels).fraction)
+    assert len(self_motions(points, 0.02, labels3d=np.tile(np.arange(25), 2)).fraction) == 1
+    outward = np.random.default_rng(1).normal(size=(25, 3))
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    turned = outward * (-1, -1, 1)
+    assert len(self_motions(points, 0.02, normals3d=np.concatenate([outward, turned])).fraction) == 1
+    assert not len(self_motions(points, 0.02, normals3d=np.concatenate([outward, -turned])).fraction)
+
+
+def test_sources_are_the_points_that_are_moved() -> None:
+    points = parts(2, 20, 60, 6)
+    whole, part = self_motions(points, 0.02), self_motions(points, 0.02, sources=np.arange(20))
+    assert max(whole.fraction) < 0.5
+    assert part.fraction[0] == 1
+
+
+def test_a_lattice_has_more_motions_than_are_ranked() -> None:
+    lattice = np.stack(np.meshgrid(*[np.arange(8.0)] * 3), -1).reshape(-1, 3)
+    assert not self_motions(lattice, 0.05).complete
+
+
+def test_the_mirror_image_of_a_plane_projects_to_the_same_points_from_afar() -> None:
+    rng = np.random.default_rng(0)
+    board = np.c_[rng.uniform(-1, 1, (20, 2)), np.zeros(20)]
+    rotation, translation = Rotation.from_euler("xyz", [0.5, 0.2, 0.1]).as_matrix(), np.array([0.0, 0.0, 200.0])
+    mirrored = mirror_pose(board, rotation, translation)
+    assert mirrored is not None
+    one, other = (board @ turn.T + shift for turn, shift in ((rotation, translation), mirrored))
+    np.testing.assert_allclose(one[:, :2] / one[:, 2:], other[:, :2] / other[:, 2:], atol=5e-5)
+    assert np.degrees(Rotation.from_matrix(rotation.T @ mirrored[0]).magnitude()) > 20
+    assert mirror_pose(rng.uniform(-1, 1, (20, 3)), rotation, translation) is None
+
+
+def solved(points: Array, seed: int) -> tuple[bpnp.Solution, float]:
+    rng = np.random.default_rng([seed, 7])
+    rotation = Rotation.random(random_state=rng).as_matrix()
+    camera = points @ rotation.T + [0.1, 0, 5]
+    image = camera[:, :2] / camera[:, 2:] + 1e-3 * rng.normal(size=(len(points), 2))
+    found = bpnp.solve(rng.permutation(image), rng.permutation(points), seed=seed, time_limit=30)
+    return found, float(np.degrees(Rotation.from_matrix(rotation @ found.rotation.T).magnitude()))
+
+
+@pytest.mark.parametrize(("fold", "each", "unique"), [(3, 30, 8), (5, 18, 8), (2, 45, 8), (3, 7, 4), (5, 6, 4)])
+@pytest.mark.parametrize("seed", range(2))
+def test_unique_points_decide_between_the_turns_of_an_object(fold: int, each: int, unique: int, seed: int) -> None:
+    found, error = solved(parts(fold, each, unique, seed), seed)
+    assert found.verdict == "confident"
+    assert error < 2
+
+
+@pytest.mark.parametrize(("fold", "each"), [(3, 30), (2, 45), (3, 7), (5, 6)])
+def test_an_exactly_symmetric_object_is_ambiguous(fold: int, each: int) -> None:
+    found, error = solved(parts(fold, each, 0, 11), 0)
+    assert found.verdict == "ambiguous"
+    assert abs(error - 360 / fold * round(error * fold / 360)) < 3
+    assert f"{360 // fold} deg" in found.reason or f"{720 // fold} deg" in found.reason
