@@ -93,7 +93,9 @@ def match_count(candidates: Candidates, sets: PointSets) -> float:
     return float(candidates.matched[0]) * min(len(sets.bearings), len(sets.points3d))
 
 
-def missed(candidates: Candidates, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True) -> float:
+def missed(
+    candidates: Candidates, sets: PointSets, looks: float | int, rule: Evidence, *, independent: bool = True
+) -> float:
     """Return log10 of the probability that weighed candidates lack a better optimum.
 
     Args:

@@ -176,7 +176,9 @@ def _partners(near: float, sets: PointSets, rotation: Array, translation: Array,
     return _Partners(points, sets.points3d[points] @ rotation.T + translation, np.isfinite(chord))
 
 
-def log10_missed(hits: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False) -> float:
+def log10_missed(
+    hits: int, decades_a_match: float, looks: float | int, rule: Evidence, *, symmetric: bool = False
+) -> float:
     """log10 of the probability that a better optimum than the best pose exists and was not met.
 
     It lies near the best pose or far from it, and what the matches say counts against both:
