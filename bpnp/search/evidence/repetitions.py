@@ -86,12 +86,14 @@ class RepeatedPoses(NamedTuple):
     Attributes:
         rotation: (c, 3, 3).
         translation: (c, 3).
+        log10_false_alarms: (c,) of these poses as they are, not refined.
         fraction: smallest fraction of the matched points that one of the motions maps; 1 without a motion.
         complete: whether there are so few motions that these poses stand for all.
     """
 
     rotation: Array
     translation: Array
+    log10_false_alarms: Array
     fraction: float
     complete: bool
 
@@ -130,7 +132,7 @@ def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: 
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
     best = np.argsort(alarms, kind="stable")[: limits.kept]
     fraction = float(motions.fraction.min(initial=1.0))
-    return RepeatedPoses(rotations[best], translations[best], fraction, motions.complete)
+    return RepeatedPoses(rotations[best], translations[best], alarms[best], fraction, motions.complete)
 
 
 def decades_behind(

@@ -41,8 +41,7 @@ def against_rivals(
     contested: whether the poses of a repeated structure were proposed before. The camera is believed as it was given
     unless another focal length, which is paid for as an unknown, has fewer false
     alarms by the factor `rule.focal_chance`."""
-    if not contested:
-        result = _against_repetitions(result, sets, entered, rule, looks, exhaustive)
+    result = _against_repetitions(result, sets, entered, rule, looks, exhaustive, contested)
     if result.verdict != "confident":
         return result
     other = other_camera(result, sets, entered, rule)
@@ -151,17 +150,27 @@ def _against_repetitions(
     rule: Evidence,
     looks: float | int,
     exhaustive: bool,
+    contested: bool,
 ) -> SearchResult:
-    """A confident result beside the poses that a repeated structure would confuse with it; the best of them first."""
+    """Judge a confident result again with the poses that a repeated structure confuses with it; return the best first.
+
+    Those of an enumeration were refined and are among its candidates. They are judged once more as if the map ended
+    somewhere, which makes them likelier.
+    """
     if result.verdict != "confident":
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
     repeated = repeated_poses(sets, *best, scale, rule)
     if not len(repeated.rotation):
         return result
-    poses = repeated.rotation, repeated.translation
-    rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
-    others, limits = (rivals.rotation, rivals.translation), rule.repetitions
+    poses, limits = (repeated.rotation, repeated.translation), rule.repetitions
+    if contested:
+        scales, alarms = np.full(len(poses[0]), scale), repeated.log10_false_alarms
+        rivals = replace(Candidates.unscored(*poses), scale=scales, log10_false_alarms=alarms, log10_rough=alarms)
+        limits = replace(limits, most_missing=1e-12)
+    else:
+        rivals = with_false_alarms(polished(entered(), *poses, scale), sets)
+    others = rivals.rotation, rivals.translation
     behind = decades_behind(sets, best, poses, others, scale, limits, fraction=repeated.fraction)
     behind = np.maximum(behind, 0) if repeated.complete else np.zeros(len(rivals))
     alarms = np.minimum(rivals.log10_false_alarms, result.log10_false_alarms + behind)
@@ -169,4 +178,4 @@ def _against_repetitions(
     beside = judged(candidates, sets, batches=result.batches, looks=looks, exhaustive=exhaustive, rule=rule)
     if np.array_equal(beside.best[1], best[1]):
         return beside
-    return _against_repetitions(beside, sets, entered, rule, looks, exhaustive)
+    return _against_repetitions(beside, sets, entered, rule, looks, exhaustive, contested)
