@@ -29,7 +29,7 @@ from bpnp.search.enumeration.points import (
 )
 from bpnp.search.enumeration.settings import DEFAULT, RULES, EnumerationSettings, Stage
 from bpnp.search.evidence.partners import explained
-from bpnp.search.evidence.repetitions import repeated_poses
+from bpnp.search.evidence.repetitions import competing_poses, registered
 from bpnp.search.point_sets import PointSets
 from bpnp.search.settings import SearchSettings
 from bpnp.search.starts import GravityPrior, PosePrior
@@ -330,8 +330,8 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
     def competitors(poses: EnumeratedPoses) -> tuple[Array, Array]:
         pose = poses.rotation[0], poses.translation[0]
         scale = max(float(poses.scale[0]), sets.floor or 1e-5)
-        repeated = repeated_poses(annotated, *pose, scale, settings.evidence)
-        return repeated.rotation, repeated.translation
+        motions = registered(annotated, *pose, scale, settings.evidence)
+        return competing_poses(annotated, *pose, motions, settings.evidence)
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
         poses = enumerate_poses(

@@ -80,6 +80,19 @@ def _of_scene(points: Frozen, labels: Frozen, normals: Frozen, tolerance: float)
     return self_motions(arrays[0], tolerance, labels3d=arrays[1], normals3d=arrays[2], least=least)
 
 
+def competing_poses(sets: PointSets, rotation: Array, translation: Array, motions: Motions, rule: Evidence) -> Pose:
+    """Return the poses (c, 3, 3), (c, 3) that motions, and the mirror image of a flat scene, confuse with a pose; those
+    that a verdict takes for different from it."""
+    poses = motions.competitors(rotation, translation)
+    every = [rotation[None], poses[0]], [translation[None], poses[1]]
+    if (mirrored := mirror_pose(sets.points3d, rotation, translation)) is not None:
+        for parts, one in zip(every, mirrored, strict=True):
+            parts.append(one[None])
+    rotations, translations = (np.concatenate(parts) for parts in every)
+    other = np.flatnonzero(~sets.same_pose(rotations, translations, rule.other_deg, rule.other_shift))
+    return rotations[other], translations[other]
+
+
 class RepeatedPoses(NamedTuple):
     """Poses that the scene's own motions confuse with one.
 
@@ -121,16 +134,10 @@ def repeated_poses(sets: PointSets, rotation: Array, translation: Array, scale: 
         >>> sorted(repeated.translation[:, 0].round(6).tolist())
         [-4.0, -2.0]
     """
-    limits = rule.repetitions
     motions = registered(sets, rotation, translation, scale, rule)
-    rotations, translations = motions.competitors(rotation, translation)
-    if (mirrored := mirror_pose(sets.points3d, rotation, translation)) is not None:
-        rotations, translations = np.concatenate([rotations, mirrored[0][None]]), np.vstack([translations, mirrored[1]])
-    every = np.concatenate([rotation[None], rotations]), np.vstack([translation, translations])
-    other = np.flatnonzero(~sets.same_pose(*every, rule.other_deg, rule.other_shift))
-    rotations, translations = every[0][other], every[1][other]
+    rotations, translations = competing_poses(sets, rotation, translation, motions, rule)
     alarms = alarms_of(sets, rotations, translations, np.full(len(rotations), scale)).own
-    best = np.argsort(alarms, kind="stable")[: limits.kept]
+    best = np.argsort(alarms, kind="stable")[: rule.repetitions.kept]
     fraction = float(motions.fraction.min(initial=1.0))
     return RepeatedPoses(rotations[best], translations[best], alarms[best], fraction, motions.complete)
 

@@ -20,7 +20,7 @@ from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
-from bpnp.search.verdict import SearchResult, judged, match_count, with_false_alarms
+from bpnp.search.verdict import SearchResult, is_symmetric, judged, match_count, with_false_alarms
 
 Array = NDArray[np.float64]
 
@@ -158,6 +158,8 @@ def _against_repetitions(
     somewhere, which makes them likelier.
     """
     if result.verdict != "confident":
+        return result
+    if contested and not is_symmetric(result.candidates, sets, rule):
         return result
     best, scale = result.best, max(result.residual, sets.image.scales[0])
     repeated = repeated_poses(sets, *best, scale, rule)
