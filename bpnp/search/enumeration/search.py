@@ -334,9 +334,7 @@ def search_by_enumeration(sets: PointSets, deadline: Deadline, settings: SearchS
         return competing_poses(annotated, *pose, motions, settings.evidence)
 
     def enumerated(sets: PointSets, rule: EnumerationSettings) -> tuple[EnumeratedPoses, Candidates]:
-        poses = enumerate_poses(
-            sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule
-        )
+        poses = enumerate_poses(sets, deadline=deadline.at, is_safe=is_safe, competitors=competitors, settings=rule)
         return poses, _candidates(poses, annotated, settings) if certain is None else certain
 
     tracked = predicted_pose(sets.prior) is not None
