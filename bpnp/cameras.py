@@ -211,6 +211,26 @@ def zoomed_camera(camera: Camera, zoom: float) -> Camera:
     return zoomed
 
 
+def is_pinhole(camera: Camera) -> bool:
+    """Whether a camera is a pinhole camera without skew, to which `bent_camera` can add distortion."""
+    if isinstance(camera, Pinhole):
+        return bool(camera.matrix[0, 1] == camera.matrix[1, 0] == 0)
+    return camera.camera.model.name in ("SIMPLE_PINHOLE", "PINHOLE")
+
+
+def bent_camera(camera: Camera, radial: float) -> Lens:
+    """Return a pinhole camera with a radial coefficient: SIMPLE_RADIAL, or OPENCV with two focal lengths.
+
+    >>> bent_camera(camera_from(("SIMPLE_PINHOLE", 1000, 800, [900, 500, 400])), 0.1).camera.params.tolist()
+    [900.0, 500.0, 400.0, 0.1]
+    """
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    size = image_size(camera) or (0, 0)
+    if fx == fy:
+        return colmap_camera("SIMPLE_RADIAL", [fx, cx, cy, radial], size)
+    return colmap_camera("OPENCV", [fx, fy, cx, cy, radial, 0.0, 0.0, 0.0], size)
+
+
 def plain_camera(camera: Camera) -> list[list[float]] | dict[str, Any]:
     """A camera as JSON can hold it, which `camera_from` reads again."""
     if isinstance(camera, Pinhole):

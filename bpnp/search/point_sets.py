@@ -80,15 +80,25 @@ def _weights(together: NDArray[np.int64], expected: Array, crowded_sigmas: float
 
 
 class UnknownFocal(NamedTuple):
-    """What is known of a focal length that is fitted with the pose.
+    """What is known of a lens whose focal length is fitted with the pose.
 
-    log_range: logarithm of the largest over the smallest that was possible. sigma: standard deviation of its logarithm,
-    infinite where nothing is expected. offset: logarithm of that of these bearings over the expected one.
+    Attributes:
+        log_range: Logarithm of the largest over the smallest focal length that was possible.
+        sigma: Standard deviation of the logarithm of the focal length; infinite if nothing is known of it.
+        offset: Logarithm of the focal length of these bearings over the expected one.
+        radial: Radial coefficient k of the lens with which the bearings were undistorted.
+        radial_sigma: Standard deviation of k; 0 if the distortion is known, infinite if k is fitted.
+        radial_range: Range of k that was possible; 0 if k is not fitted.
+        centre_sigma: Standard deviation of the principal point, in focal lengths. It is not fitted.
     """
 
     log_range: float
     sigma: float = math.inf
     offset: float = 0.0
+    radial: float = 0.0
+    radial_sigma: float = 0.0
+    radial_range: float = 0.0
+    centre_sigma: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,7 +213,8 @@ class PointSets:
     @property
     def fitted(self) -> int:
         """Numbers that are fitted to the image points."""
-        return 2 * self.pairs_that_fix + (self.focal is not None)
+        lens = 0 if self.focal is None else 1 + (self.focal.radial_range > 0)
+        return 2 * self.pairs_that_fix + lens
 
     def log10_share(self, rotation: Array, translation: Array) -> float:
         """log10 of the share of all poses that are as near to the prior as this one, or within two standard deviations.

@@ -204,9 +204,8 @@ def judged(
             reason = f"{chance}, but its {count:.0f} matches do not fix the rotation"
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         if sets.focal is not None and (share := focal_bound(sets, linear, count)) > rule.focal:
-            reason = (
-                f"{chance}, but focal length and distance cannot be told apart: both may be {100 * share:.0f} % off"
-            )
+            off_by = f"{100 * share:.0f} % off" if share < 10 else "anything"
+            reason = f"{chance}, but the points do not fix the focal length: it and the distance may be {off_by}"
             return SearchResult(candidates, "ambiguous", reason, batches, settled)
         bound = f"{off:.1g}" if off < 9.5 else f"{off:.0f}"
         known = f"; its rotation is known to {bound} deg, but for one case in a thousand"

@@ -7,34 +7,34 @@ the focal length to be known (`Evidence.focal`), and what the other focal length
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import least_squares
-from scipy.spatial.transform import Rotation
 
-from bpnp.cameras import Camera, camera_from, plain_camera, zoomed_camera
+from bpnp.cameras import Camera, Lens, bent_camera, camera_from, is_pinhole, plain_camera, zoomed_camera
 from bpnp.geometry import same_pose, turned_by
 from bpnp.loops.parallel import Clock, one_blas_thread
 from bpnp.search.annealing import polished
+from bpnp.search.candidates import Candidates
 from bpnp.search.enumeration.search import is_enumerable
 from bpnp.search.evidence.alternatives import number
-from bpnp.search.evidence.partners import with_focal_length
+from bpnp.search.evidence.settings import OtherFocal
 from bpnp.search.point_sets import UnknownFocal
+from bpnp.search.propose.lens import fit_lens
 from bpnp.search.scene import Scene
 from bpnp.search.settings import DEFAULT as SEARCH
-from bpnp.search.verdict import weighed
+from bpnp.search.verdict import match_count, weighed
 from bpnp.solving.arguments import Array, checked_size
-from bpnp.solving.matches import SCALES, mutual_nearest
 from bpnp.solving.problem import Problem
 from bpnp.solving.solution import Solution
 from bpnp.solving.sources import Options, solutions_of
 
-LEAST_BEND = 1e-3  # change of the coefficient that makes another camera
-FEWEST_BENT = 30  # matches from which a radial coefficient is looked for
-SIGNIFICANT_BEND = 10.8  # chi-squared with one degree of freedom, one in a thousand
+ProblemAt = Callable[[Camera, UnknownFocal], Problem]
+RADIAL_PLACES = {"SIMPLE_RADIAL": 3, "OPENCV": 4}  # of the coefficient among the parameters of a bent camera
+LEAST_REACH = 1e-3  # focal lengths
+AROUND = (1.0, OtherFocal.step, 1 / OtherFocal.step)  # focal lengths around one that has converged
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,10 @@ class FocalSettings:
     sigmas: of the error of a rough focal length within which it is looked for.
     turns: of the first search with each. alternations: searches and refinements, in turns, from each. rounds: of a
     refinement, until the logarithm moves by less than `same`.
+    bend_sigma: standard deviation of what an unknown radial distortion moves the outermost image point by, a share of
+    its distance from the principal point; most_bend: the largest. fewest_bent: matches from which it is fitted.
+    centre_sigma: standard deviation of the principal point, a share of the same distance: about a quarter of a per
+    cent of the larger side of the image.
     """
 
     smallest: float = 0.5
@@ -58,17 +62,29 @@ class FocalSettings:
     alternations: int = 3
     rounds: int = 12
     same: float = 5e-4
+    bend_sigma: float = 0.05
+    most_bend: float = 0.5
+    fewest_bent: int = 24
+    centre_sigma: float = 0.004
 
 
 RULE = FocalSettings()
 
 
 class UnknownCamera(NamedTuple):
-    """A camera whose focal length is `smallest` to `largest` times that of `reference`, most likely `usual` times.
+    """A camera whose focal length is unknown, and its distortion where the reference has none.
 
-    sigma: standard deviation of the logarithm of the factor, infinite where nothing is expected of it. radial: whether
-    the coefficient of a SIMPLE_RADIAL `reference` is looked for too. alone: whether to begin with no other than
-    the usual one.
+    Attributes:
+        reference: Camera of which the others are variants.
+        smallest: Least focal length, over that of the reference.
+        largest: Largest focal length, over that of the reference.
+        usual: Focal length to try first, over that of the reference.
+        sigma: Standard deviation of the logarithm of the focal length; infinite if nothing is known of it.
+        bends: Whether radial distortion is a competitor. The reference is then a pinhole camera.
+        distorted: Whether a radial coefficient is fitted even where it is not significantly better.
+        radial: Radial coefficient to start with; None to start without distortion.
+        alone: Whether to start with no other focal length than the usual one.
+        reach: Distance of the outermost image point from the principal point, in focal lengths of the reference.
     """
 
     reference: Camera
@@ -76,36 +92,74 @@ class UnknownCamera(NamedTuple):
     largest: float
     usual: float
     sigma: float = math.inf
-    radial: bool = False
+    bends: bool = False
+    distorted: bool = False
+    radial: float | None = None
     alone: bool = False
+    reach: float = 1.0
+
+    def at(self, zoom: float, radial: float | None = None) -> Camera:
+        """Return the camera with `zoom` times the focal length of the reference and a radial coefficient."""
+        camera = zoomed_camera(self.reference, zoom)
+        return camera if radial is None else bent_camera(camera, radial)
+
+    def parts(self, camera: Camera) -> tuple[float, float | None]:
+        """Return the zoom and the radial coefficient, None for none, of one of these cameras."""
+        zoom = camera.focal / self.reference.focal
+        if not self.bends or is_pinhole(camera) or not isinstance(camera, Lens):
+            return zoom, None
+        return zoom, float(camera.camera.params[RADIAL_PLACES[camera.camera.model.name]])
+
+    def outermost(self, zoom: float) -> float:
+        """Return the distance of the outermost image point from the principal point, in focal lengths."""
+        return max(self.reach / zoom, LEAST_REACH)
 
     def focal(self, camera: Camera) -> UnknownFocal:
-        """What is known of the focal length of one of these cameras."""
-        offset = math.log(camera.focal / self.reference.focal)
-        return UnknownFocal(math.log(self.largest / self.smallest), self.sigma, offset)
+        """Return what is known of the lens of one of these cameras."""
+        zoom, radial = self.parts(camera)
+        sigma = math.inf if radial is not None else RULE.bend_sigma if self.bends else 0.0
+        return UnknownFocal(
+            math.log(self.largest / self.smallest),
+            self.sigma,
+            math.log(zoom),
+            radial or 0.0,
+            radial_sigma=sigma / self.outermost(zoom) ** 2,
+            radial_range=0.0 if radial is None else 2 * RULE.most_bend / self.outermost(zoom) ** 2,
+            centre_sigma=RULE.centre_sigma * self.outermost(zoom),
+        )
 
     def ladder(self, step: float) -> list[Camera]:
-        """Cameras with focal lengths no more than `step` apart that cover the range, the usual ones first."""
+        """Return cameras with focal lengths at most a factor `step` apart that cover the range, the usual one first."""
         below, above = (math.log(end / self.usual) / math.log(step) for end in (self.smallest, self.largest))
         steps = [0] if self.alone else sorted(range(math.ceil(below - 0.51), math.floor(above + 0.51) + 1), key=abs)
-        return [zoomed_camera(self.reference, self.usual * step**k) for k in steps]
+        return [self.at(self.usual * step**k, self.radial) for k in steps]
 
     def near(self, camera: Camera) -> "UnknownCamera":
-        """The same with one of these cameras as the usual one, to begin with alone."""
-        zoom = camera.focal / self.reference.focal
-        reference = zoomed_camera(camera, self.reference.focal / camera.focal)
-        return self._replace(reference=reference, usual=zoom, alone=True)
+        """Return the same with one of these cameras to start with alone."""
+        zoom, radial = self.parts(camera)
+        return self._replace(usual=zoom, radial=radial, alone=True)
+
+    def seen_by(self, problem: Problem) -> "UnknownCamera":
+        """Return the same with the reach of the image points of a problem, whose camera is the reference."""
+        return self._replace(reach=float(np.linalg.norm(problem.points2d[problem.usable], axis=-1).max()))
 
 
 def unknown_camera(
     camera: Any, image_size: Any, focal_error: float | int | None, distortion: bool = False
 ) -> UnknownCamera:
-    """The camera of images of a size in pixels, or one with about the focal length of `camera`.
+    """Return the camera of images of a size in pixels, or one with about the focal length of `camera`.
 
-    Raises ValueError for a size that is none, for both a camera and a size, and for an error without a camera.
+    Radial distortion is unknown too, unless `camera` has a model with distortion.
+
+    Raises:
+        ValueError: The size is none, there are both a camera and a size, an error without a camera, or `distortion`
+            without an unknown lens.
     """
-    if distortion and image_size is None:
-        raise ValueError("expected `distortion=True` beside an `image_size`, got none; a camera has its distortion")
+    if distortion and image_size is None and focal_error is None:
+        raise ValueError(
+            "`distortion=True` needs an `image_size`, or a `focal_error` beside the `camera`; a camera that is known "
+            "has its distortion"
+        )
     if image_size is not None:
         if camera is not None:
             raise ValueError(
@@ -115,27 +169,27 @@ def unknown_camera(
         if focal_error is not None:
             raise ValueError("expected `focal_error` beside a `camera`, got it beside `image_size`; try without")
         width, height = checked_size(image_size)
-        side = max(width, height)
-        model, radial = ("SIMPLE_RADIAL", (0.0,)) if distortion else ("SIMPLE_PINHOLE", ())
-        reference = camera_from((model, width, height, (side, width / 2, height / 2, *radial)))
-        return UnknownCamera(reference, RULE.smallest, RULE.largest, RULE.usual, radial=distortion)
+        reference = camera_from(("SIMPLE_PINHOLE", width, height, (max(width, height), width / 2, height / 2)))
+        return UnknownCamera(reference, RULE.smallest, RULE.largest, RULE.usual, bends=True, distorted=bool(distortion))
     if camera is None:
         raise ValueError("expected a `camera` whose focal length has the `focal_error`, got none; try image_size")
     if focal_error is None or not 0 < focal_error < 1:
         raise ValueError(f"expected `focal_error` above 0 and below 1, a share of the focal length, got {focal_error}")
-    widest = math.exp(RULE.sigmas * focal_error)
-    return UnknownCamera(camera_from(camera), 1 / widest, widest, 1.0, focal_error)
+    widest, lens = math.exp(RULE.sigmas * focal_error), camera_from(camera)
+    if distortion and not is_pinhole(lens):
+        raise ValueError(f"`distortion=True` needs a pinhole `camera`; the distortion of {plain_camera(lens)} is known")
+    bends = is_pinhole(lens)
+    return UnknownCamera(lens, 1 / widest, widest, 1.0, focal_error, bends=bends, distorted=bool(distortion))
 
 
 @one_blas_thread
-def solved_with_focal_length(
-    problem_at: Callable[[Camera, UnknownFocal], Problem], unknown: UnknownCamera, options: Options
-) -> Solution:
+def solved_with_focal_length(problem_at: ProblemAt, unknown: UnknownCamera, options: Options) -> Solution:
     """The solution with the fewest false alarms, pose and focal length, of what `problem_at` makes of a camera."""
-    search = _Ladder(problem_at, unknown, options)
-    problem = search.problem(unknown.reference)
+    problem = problem_at(unknown.reference, unknown.focal(unknown.reference))
     if problem.degenerate is not None:
         return solutions_of({0: problem}, options)[0]
+    unknown = unknown.seen_by(problem)
+    search = _Ladder(problem_at, unknown, options)
     few, most = is_enumerable(problem.sets), options.settings.schedule.turns
     for camera in (ladder := unknown.ladder(RULE.step_few if few else RULE.step)):
         search.climb(camera, min(RULE.turns, most), len(ladder))
@@ -150,7 +204,7 @@ def solved_with_focal_length(
 class _Ladder:
     """Searches with several focal lengths, and the solutions `ends` that each of them led to."""
 
-    problem_at: Callable[[Camera, UnknownFocal], Problem]
+    problem_at: ProblemAt
     unknown: UnknownCamera
     options: Options
     begun: float = field(default_factory=Clock.now)
@@ -170,6 +224,8 @@ class _Ladder:
             if found.verdict == "failed":
                 break
             better, settled = self._refined(found, camera)
+            if settled:  # a better optimum may lie at a slightly different focal length
+                better, settled = self._refined(found, camera, AROUND)
             if settled:
                 break
             again = self._search(better, turns, rungs)
@@ -186,29 +242,13 @@ class _Ladder:
         options = self.options._replace(settings=self.options.settings.limited(turns), time_limit=limit)
         return solutions_of({0: self.problem(camera)}, options)[0]
 
-    def _refined(self, solution: Solution, camera: Camera) -> tuple[Camera, bool]:
-        """The camera that fits best near a pose, and whether it is the one that was given."""
-        given, moved = camera.focal, False
-        rotation, translation, scale = solution.rotation, solution.translation, solution.stats.residual
-        problem = self.problem(camera)
-        for _ in range(RULE.rounds):
-            middle = rotation @ (problem.sets.middle + problem.origin) + translation
-            fitted = with_focal_length(problem.sets, rotation, middle, scale)
-            if fitted is None or not 1 / RULE.step < camera.focal * fitted.zoom / given < RULE.step:
-                break
-            camera = zoomed_camera(camera, fitted.zoom)
-            problem = self.problem(camera)
-            start = fitted.rotation, fitted.middle - fitted.rotation @ problem.sets.middle
-            if self.unknown.radial:
-                camera, bent = with_radial(problem, camera, *start, scale)
-                problem, moved = self.problem(camera) if bent else problem, moved or bent
-            scene = Scene(problem.sets, self.options.seed, SEARCH)
-            end = weighed(polished(scene, start[0][None], start[1][None], scale), problem.sets)
-            rotation, translation, scale = end.rotation[0], end.translation[0], min(scale, float(end.scale[0]))
-            translation = translation - rotation @ problem.origin
-            if abs(math.log(fitted.zoom)) < RULE.same:
-                break
-        return camera, not moved and abs(math.log(camera.focal / given)) < RULE.same
+    def _refined(self, solution: Solution, camera: Camera, zooms: Sequence[float] = (1.0,)) -> tuple[Camera, bool]:
+        """Return the camera that fits best near a pose, and whether it is the one that was given."""
+        pose, scale = (solution.rotation, solution.translation), solution.stats.residual
+        fitted = fit_camera(self.problem_at, self.unknown, camera, pose, scale, self.options.seed, zooms)
+        (zoom, radial), (before, old) = self.unknown.parts(fitted.camera), self.unknown.parts(camera)
+        bend = abs((radial or 0.0) - (old or 0.0)) * self.unknown.outermost(zoom) ** 2
+        return fitted.camera, max(abs(math.log(zoom / before)), bend) < RULE.same
 
     def contested(self) -> Solution:
         """The best solution, ambiguous where another focal length led to a different pose that fits about as well."""
@@ -230,29 +270,98 @@ class _Ladder:
         return best
 
 
-def with_radial(
-    problem: Problem, camera: Camera, rotation: Array, translation: Array, scale: float
-) -> tuple[Camera, bool]:
-    """The SIMPLE_RADIAL camera whose coefficient, fitted to the matches of a pose with pose and focal length, explains
-    them significantly better; itself where that is so of none. And whether it is another."""
-    radius = SCALES * scale * problem.per_radian
-    i, j = mutual_nearest(problem.image, problem.view(rotation, translation), radius, problem.allowed).T
-    if len(i) < FEWEST_BENT:
-        return camera, False
-    plain = cast(dict[str, Any], plain_camera(camera))
-    unit = np.r_[np.ones(3), np.full(3, np.linalg.norm(translation)), 1.0, 1.0]
+class FittedCamera(NamedTuple):
+    """A camera that is fitted to a pose, its problem, and the poses (1,) there, in the frame of the problem."""
 
-    def at(step: Array) -> Camera:
-        focal, *centre, radial = plain["params"]
-        return camera_from(plain | {"params": [focal * math.exp(step[6]), *centre, radial + step[7]]})
+    camera: Camera
+    problem: Problem
+    poses: Candidates
 
-    def residuals(step: Array) -> Array:
-        step = unit * np.pad(step, (0, 8 - len(step)))
-        points = problem.sets.points3d[j] @ (Rotation.from_rotvec(step[:3]).as_matrix() @ rotation).T
-        seen = at(step).project(points + translation + step[3:6])
-        return np.nan_to_num(seen - problem.image[i], nan=1e3 * radius).ravel() / radius
+    @property
+    def log10_false_alarms(self) -> float:
+        return float(self.poses.log10_false_alarms[0])
 
-    without, bent = (least_squares(residuals, np.zeros(count), method="lm") for count in (7, 8))
-    if 2 * len(i) * math.log(max(without.cost, 1e-300) / max(bent.cost, 1e-300)) < SIGNIFICANT_BEND:
-        return camera, False
-    return at(np.r_[np.zeros(6), 0.0, bent.x[7]]), bool(abs(bent.x[7]) > LEAST_BEND)
+
+def fit_camera(
+    problem_at: ProblemAt,
+    unknown: UnknownCamera,
+    camera: Camera,
+    pose: tuple[Array, Array],
+    scale: float,
+    seed: int,
+    zooms: Sequence[float] = (1.0,),
+) -> FittedCamera:
+    """Fit focal length, distortion and pose to the points, beside a pose and a camera.
+
+    Radial distortion is a competitor of the same camera without it. It is taken if its number of false alarms, which
+    counts the additional unknown, is smaller by the factor `Evidence.focal_chance`.
+
+    Args:
+        problem_at: Returns the problem of a camera.
+        unknown: What is known of the camera.
+        camera: Camera to start from.
+        pose: Rotation (3, 3) and translation (3,), in the user's frame.
+        scale: Scale of the residuals, radians.
+        seed: Of the refinement.
+        zooms: Factors of the focal length, and of the distance, to start from; the fit with the fewest false alarms
+            counts.
+    """
+    zoom, radial = unknown.parts(camera)
+
+    def fit(start: float | None) -> FittedCamera:
+        fits = (_fit_track(problem_at, unknown, (zoom * each, start), pose, scale, seed, each) for each in zooms)
+        return min(fits, key=lambda one: one.log10_false_alarms)
+
+    plain = fit(None)
+    if unknown.bends:
+        bent = fit(radial or 0.0)
+        matches = match_count(bent.poses, bent.problem.sets)
+        lead = math.inf if unknown.distorted else math.log10(SEARCH.evidence.focal_chance)
+        if matches >= RULE.fewest_bent and bent.log10_false_alarms < plain.log10_false_alarms + lead:
+            return bent
+    return plain
+
+
+def _fit_track(
+    problem_at: ProblemAt,
+    unknown: UnknownCamera,
+    start: tuple[float, float | None],
+    pose: tuple[Array, Array],
+    scale: float,
+    seed: int,
+    farther: float,
+) -> FittedCamera:
+    """Fit the lens and anneal the pose in turns, with a radial coefficient or without one.
+
+    farther: Factor of the distance of the scene to start with.
+    """
+    (first, radial), (rotation, translation) = start, pose
+    zoom, camera = first, unknown.at(*start)
+    problem = problem_at(camera, unknown.focal(camera))
+    middle = (rotation @ (problem.sets.middle + problem.origin) + translation) * (1, 1, farther)
+    translation = middle - rotation @ (problem.sets.middle + problem.origin)
+    end = _anneal_pose(problem, rotation, translation + rotation @ problem.origin, scale, seed)
+    for _ in range(RULE.rounds):
+        pinhole = unknown.at(zoom)
+        flat = problem if radial is None else problem_at(pinhole, unknown.focal(pinhole))
+        middle = rotation @ (flat.sets.middle + flat.origin) + translation
+        fitted = fit_lens(flat.sets, rotation, middle, scale, radial)
+        if fitted is None or not 1 / RULE.step < zoom * fitted.zoom / first < RULE.step:
+            break
+        bend = abs((fitted.radial or 0.0) - (radial or 0.0)) * unknown.outermost(zoom) ** 2
+        if bend > RULE.most_bend:
+            break
+        zoom, radial, camera = zoom * fitted.zoom, fitted.radial, unknown.at(zoom * fitted.zoom, fitted.radial)
+        problem = problem_at(camera, unknown.focal(camera))
+        rotation = fitted.rotation
+        end = _anneal_pose(problem, rotation, fitted.middle - rotation @ problem.sets.middle, scale, seed)
+        rotation, scale = end.rotation[0], min(scale, float(end.scale[0]))
+        translation = end.translation[0] - rotation @ problem.origin
+        if max(abs(math.log(fitted.zoom)), bend) < RULE.same:
+            break
+    return FittedCamera(camera, problem, end)
+
+
+def _anneal_pose(problem: Problem, rotation: Array, translation: Array, scale: float, seed: int) -> Candidates:
+    scene = Scene(problem.sets, seed, SEARCH)
+    return weighed(polished(scene, rotation[None], translation[None], scale), problem.sets)[:1]

@@ -90,14 +90,43 @@ def test_a_rough_focal_length_is_a_prior() -> None:
     assert stds[1] > stds[0]
 
 
-def test_a_radial_coefficient_is_found_where_the_points_support_one() -> None:
-    for radial in (-0.3, 0.0):
-        pixels, scene, rotation = planted(600.0, points=150, radial=radial, distance=3.0)
-        solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
-        assert degrees_between(solution.rotation, rotation) < 1
-        coefficient = json.loads(solution.to_json())["camera"]["params"][3]
-        assert coefficient == pytest.approx(radial, abs=0.1)
-        assert (coefficient == 0) == (radial == 0)
+@pytest.mark.parametrize("radial", [-0.3, 0.25, 0.0])
+def test_distortion_is_found_where_it_is_significantly_better(radial: float) -> None:
+    """Nobody says that the lens is distorted. Without its coefficient the focal length would be wrong by many sigma."""
+    pixels, scene, rotation = planted(600.0, points=150, radial=radial, distance=3.0)
+    solution = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
+    camera = json.loads(solution.to_json())["camera"]
+    assert camera["model"] == ("SIMPLE_PINHOLE" if radial == 0 else "SIMPLE_RADIAL")
+    assert radial == 0 or camera["params"][3] == pytest.approx(radial, abs=0.05)
+    assert degrees_between(solution.rotation, rotation) < 0.5
+    assert abs(solution.focal_length - 600) < 3 * solution.focal_length_std < 30
+    assert solution.verdict == "confident"
+
+
+def test_distortion_that_is_asked_for_is_always_fitted() -> None:
+    pixels, scene, _ = planted(600.0, points=150, distance=3.0)
+    solution = solve(pixels, scene, image_size=SIZE, distortion=True, solver="search", time_limit=LIMIT)
+    camera = json.loads(solution.to_json())["camera"]
+    assert camera["model"] == "SIMPLE_RADIAL"
+    assert camera["params"][3] == pytest.approx(0, abs=0.05)
+    without = solve(pixels, scene, image_size=SIZE, solver="search", time_limit=LIMIT)
+    assert without.log10_false_alarms < solution.log10_false_alarms  # which counts one unknown less
+
+
+def test_a_rough_pinhole_camera_may_be_distorted_and_one_with_distortion_keeps_it() -> None:
+    pixels, scene, rotation = planted(600.0, points=150, radial=-0.3, distance=3.0)
+    known = {"focal_error": 0.1, "solver": "search", "time_limit": LIMIT}
+    solution = solve(pixels, scene, ("PINHOLE", (630.0, 630.0, 320.0, 240.0)), **known)
+    assert degrees_between(solution.rotation, rotation) < 0.5
+    assert json.loads(solution.to_json())["camera"]["params"][-1] == pytest.approx(-0.3, abs=0.05)
+    assert abs(solution.focal_length - 600) < 3 * solution.focal_length_std
+    kept = solve(pixels, scene, ("SIMPLE_RADIAL", (630.0, 320.0, 240.0, -0.3)), **known)
+    assert json.loads(kept.to_json())["camera"]["params"][3] == -0.3
+    assert degrees_between(kept.rotation, rotation) < 0.5
+    with pytest.raises(ValueError, match="`distortion=True` needs a pinhole `camera`"):
+        solve(pixels, scene, ("SIMPLE_RADIAL", (630.0, 320.0, 240.0, -0.3)), distortion=True, **known)
+    with pytest.raises(ValueError, match="`distortion=True` needs an `image_size`, or a `focal_error`"):
+        solve(pixels, scene, ("SIMPLE_PINHOLE", (630.0, 320.0, 240.0)), distortion=True)
 
 
 def test_a_photo_is_localised_without_its_focal_length(tmp_path: Path) -> None:

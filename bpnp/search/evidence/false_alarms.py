@@ -22,8 +22,9 @@ from one scale to the next finer one s' counts with 1 / c_i(s'), over its expect
 2 s' than an even spread explains (`ImageStatistics.weights`). The mean over a fixed set of (s, w) counts what was
 looked at. A prior reduces T to the share of the poses that it allows.
 
-Where the focal length is fitted too, four matches fix the seven unknowns: T = 2 (m)_4 (n)_4 / 4!, or that of a pose
-times the focal lengths that can be told apart, if these are fewer; and the four largest x_i are left out.
+Where the focal length is fitted too, four matches fix the seven unknowns, and an eighth, a radial coefficient:
+T = 2 (m)_4 (n)_4 / 4!, or that of a pose times the number of lenses that can be told apart, if that is smaller; and
+the four largest x_i are left out.
 
 A pose claims that its points agree with it at the scale of its residuals. Where that is known, only the s within a
 factor of two of it count; the terms from four times it on say how well a rougher alignment explains the image.
@@ -76,7 +77,7 @@ def alarms_of(sets: PointSets, rotations: Array, translations: Array, scales: Ar
     (True, True)
     """
     tests = log10_tests(sets)
-    cells = np.minimum(log10_cells(sets.image) + log10_focal_lengths(sets), tests)
+    cells = np.minimum(log10_cells(sets.image) + log10_lenses(sets), tests)
     share = [sets.log10_share(r, t) for r, t in zip(rotations, translations, strict=True)]
     none = np.array([max(tests + one, 0.0) for one in share])
     result = Alarms(none, none.copy())
@@ -101,7 +102,7 @@ def log10_tests(sets: PointSets) -> float:
     tests = _log10_choices(sets, FIXING)
     if sets.focal is None:
         return tests
-    return min(_log10_choices(sets, FIXING + 1), tests + float(log10_focal_lengths(sets)[0]))
+    return min(_log10_choices(sets, FIXING + 1), tests + float(log10_lenses(sets)[0]))
 
 
 def _log10_choices(sets: PointSets, pairs: int) -> float:
@@ -118,12 +119,16 @@ def _fixing(sets: PointSets) -> int:
     return FIXING + (sets.focal is not None)
 
 
-def log10_focal_lengths(sets: PointSets) -> Array:
-    """log10 (S,) of the number of focal lengths that differ at each scale of the image: steps of s / h; 0 of a known
-    one."""
+def log10_lenses(sets: PointSets) -> Array:
+    """Return log10 (S,) of the number of lenses that differ at each scale s of the image, 0 for a known lens.
+
+    A focal length moves points at the spread h by h d log f, a radial coefficient by h^3 dk.
+    """
     if sets.focal is None:
         return np.zeros(len(sets.image.scales))
-    return np.asarray(np.log10(np.maximum(sets.focal.log_range * sets.image.spread / sets.image.scales, 1.0)))
+    h, scales = sets.image.spread, sets.image.scales
+    moved = sets.focal.log_range * h, sets.focal.radial_range * h**3
+    return np.asarray(sum(np.log10(np.maximum(each / scales, 1.0)) for each in moved))
 
 
 def log10_cells(image: ImageStatistics) -> Array:

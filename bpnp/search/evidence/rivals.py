@@ -13,11 +13,11 @@ from bpnp.search.annealing import polished
 from bpnp.search.candidates import Candidates, in_user_frame
 from bpnp.search.evidence.alternatives import Alternative, of_misfit
 from bpnp.search.evidence.false_alarms import alarms_of
-from bpnp.search.evidence.partners import Zoomed, with_focal_length
 from bpnp.search.evidence.repetitions import decades_behind, repeated_poses
 from bpnp.search.evidence.settings import Evidence, OtherFocal
 from bpnp.search.evidence.uncertainty import misfit_of
 from bpnp.search.point_sets import PointSets, UnknownFocal
+from bpnp.search.propose.lens import LensFit, fit_lens
 from bpnp.search.raster_search import search_beside
 from bpnp.search.scene import Scene
 from bpnp.search.verdict import SearchResult, is_symmetric, judged, match_count, with_false_alarms
@@ -71,7 +71,7 @@ def other_camera(
 
     def better(found: AtZoom) -> Alternative | None:
         least = max(found.scale, found.sets.image.scales[0])
-        fitted = with_focal_length(found.sets, found.rotation, found.middle, least)
+        fitted = fit_lens(found.sets, found.rotation, found.middle, least)
         if fitted is None:
             return None
         other = fitted._replace(zoom=found.zoom * fitted.zoom)
@@ -130,7 +130,7 @@ def beside(found: AtZoom, zoom: float, scene: Scene) -> AtZoom:
     return AtZoom(zoom * found.zoom, sets, rotation, middle, float(poses.scale[0]), likelihood)
 
 
-def _alarms(sets: PointSets, other: Zoomed, rule: Evidence) -> float:
+def _alarms(sets: PointSets, other: LensFit, rule: Evidence) -> float:
     """log10 of the false alarms of a pose whose focal length is a seventh unknown."""
     zoomed = replace(at_focal_length(sets, other.zoom), focal=UnknownFocal(2 * math.log(rule.zoomed.widest)))
     translation = other.middle - other.rotation @ sets.middle

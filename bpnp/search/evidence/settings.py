@@ -100,7 +100,8 @@ class Evidence:
     focal_chance: with which another focal length may be significantly better by chance; with 0.001 a camera that is a
         tenth wrong is believed half as often again.
     contested, repetitions, zoomed: constants of these alternatives.
-    focal: share by which a focal length that is fitted may be off, once in a thousand.
+    focal: share by which a focal length that is fitted may be off, once in a thousand; with it the distance is off, and
+        by `other_shift` the pose is a different one. scale: the same of the scale of a rig's scene.
     """
 
     false_alarms: float = -2.0
@@ -117,4 +118,5 @@ class Evidence:
     contested: Contested = Contested()
     repetitions: Repetitions = Repetitions()
     zoomed: OtherFocal = OtherFocal()
-    focal: float = 0.2
+    focal: float = 0.05
+    scale: float = 0.2

@@ -10,9 +10,10 @@ from scipy.sparse import csr_array
 from scipy.special import fdtrc, fdtri, stdtrit
 
 from bpnp.geometry import turned_by
-from bpnp.search.evidence.partners import Zoomed, across, by_focal_length, facing, partners, with_focal_length
+from bpnp.search.evidence.partners import across, facing, partners
 from bpnp.search.evidence.settings import Evidence
 from bpnp.search.point_sets import PointSets
+from bpnp.search.propose.lens import LensFit, centre_columns, fit_lens, lens_columns
 from bpnp.search.settings import DEFAULT
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -35,6 +36,7 @@ STRAINS = np.array(
 )
 SLIGHT = 0.01  # share of an image point in the information below which the pose hardly moves by leaving it out
 POSE = 6  # numbers that are fitted with every pose
+BLOCKS = 4  # of image points, along each axis of the image
 FIXED = 1e-9  # least eigenvalue of the information, in units of its own size, of points that fix a pose
 
 
@@ -158,7 +160,14 @@ def local_covariance(linear: "Linearised | None") -> Array | None:
 
     Sources: T. A. Louis, Finding the observed information matrix when using the EM algorithm, J. R. Stat. Soc. B 1982;
     J. G. MacKinnon, H. White, Some heteroskedasticity-consistent covariance matrix estimators with improved finite
-    sample properties, J. Econometrics 1985.
+    sample properties, J. Econometrics 1985; B. Efron, C. Stein, The jackknife estimate of variance, Annals of
+    Statistics 1981; S. F. Schmidt, Application of state-space methods to navigation problems, 1966.
+
+    With an unknown lens, the jackknife leaves out blocks of neighbouring image points: what a lens of this model leaves
+    unexplained, and errors of a map, are alike for neighbours, and a focal length adds them up. The radial coefficient
+    is eliminated, with the standard deviation that is expected of it unless it was fitted. The principal point is a
+    considered parameter: with c its standard deviation and J_c the derivatives by it, C becomes C + c^2 S S^T,
+    S = H^-1 sum_ij p_ij J_ij^T J_c / s^2.
     """
     if linear is None:
         return None
@@ -179,6 +188,9 @@ def _of_louis(linear: "Linearised") -> Array | None:
     expected = of_point @ score
     each = linear.jacobian.transpose(0, 2, 1) @ linear.jacobian - score[:, :, None] * score[:, None]
     own = (of_point @ each.reshape(count, -1)).reshape(-1, size, size) + expected[:, :, None] * expected[:, None]
+    if sets.focal is not None:
+        block = _blocks(sets, of_point.sum(1))
+        expected, own = (np.stack([each[block == b].sum(0) for b in np.unique(block)]) for each in (expected, own))
     share = len(sets.bearings) / len(chosen)
     known = _known(linear)
     observed = share * own.sum(0) + known
@@ -198,7 +210,35 @@ def _of_louis(linear: "Linearised") -> Array | None:
     steps[matters[fixed]] = np.linalg.solve(without[fixed], steps[matters[fixed], :, None])[..., 0]
     ratio, axes = np.linalg.eigh(share * steps.T @ steps + root.T @ known @ root)
     along = root @ axes
-    return np.asarray(along * np.maximum(ratio, 1.0) @ along.T)
+    covariance = along * np.maximum(ratio, 1.0) @ along.T
+    if sets.focal is None:
+        return np.asarray(covariance)
+    considered = centre_columns(linear.seen) / linear.scale
+    moved = root @ root.T @ (share * np.einsum("k,kia,kib->ab", probability, linear.jacobian, considered))
+    covariance = covariance + sets.focal.centre_sigma**2 * moved @ moved.T
+    return np.asarray(covariance[: POSE + 1, : POSE + 1])
+
+
+def _blocks(sets: PointSets, matched: Array) -> Labels:
+    """Return the block (k,) of each chosen image point, of at most `BLOCKS`^2 with as many matched points each.
+
+    Args:
+        sets: Points.
+        matched: (k,) probability that an image point has a match.
+    """
+    x, y = ((sets.bearings[sets.image.chosen] - sets.image.centre) @ sets.image.axes).T
+    column, row = _quantile(x, matched), np.zeros(len(x), np.int64)
+    for k in range(BLOCKS):
+        row[column == k] = _quantile(y[column == k], matched[column == k])
+    return column * BLOCKS + row
+
+
+def _quantile(values: Array, weights: Array) -> Labels:
+    """Return which of `BLOCKS` intervals of equal weight each value is in."""
+    order = np.argsort(values, kind="stable")
+    below = np.empty(len(values))
+    below[order] = np.cumsum(weights[order]) - weights[order] / 2
+    return np.minimum(below * BLOCKS / max(float(weights.sum()), 1e-300), BLOCKS - 1).astype(np.int64)
 
 
 class Linearised(NamedTuple):
@@ -207,7 +247,7 @@ class Linearised(NamedTuple):
     image: (k,) places among the chosen image points. probability: (k,) of the match. seen: (k, 3) direction in which
     the pose sees the scene point. points: (k, 3) of the latter in the camera's axes, from the middle of the scene.
     residual: (k, 3) of the image point, jacobian: (k, 3, 6) of `seen` by turn and shift about that middle, (k, 3, 7) by
-    the logarithm of a focal length that is fitted too; in scales.
+    the logarithm of a focal length that is fitted too, (k, 3, 8) by a radial coefficient; in scales.
     scale: standard deviation of the residuals, radians.
     """
 
@@ -244,18 +284,20 @@ def linearised(sets: PointSets, rotation: Array, translation: Array, scale: floa
     by_shift = across(u) / depth[j, None]
     columns = [np.cross(p[:, None], by_shift, axisb=2, axisc=2), by_shift]
     if sets.focal is not None:
-        columns.append(by_focal_length(u))
+        columns.append(lens_columns(u, sets.focal.radial)[..., : 1 + (sets.focal.radial_sigma > 0)])
     jacobian = np.concatenate(columns, -1) / scale
     residual = (sets.bearings[sets.image.chosen[i]] - u) / scale
     return Linearised(sets, rotation, translation, i, density / every[i], u, p, residual, jacobian, scale)
 
 
 def _known(linear: Linearised) -> Array:
-    """The information (6, 6) that a prior has about turn and shift, (7, 7) with that about the focal length."""
+    """Return the information (p, p) of the priors about rotation, shift and the fitted parameters of the lens."""
     focal, prior = linear.sets.focal, linear.sets.prior
-    information = np.zeros((POSE, POSE) if focal is None else (POSE + 1, POSE + 1))
+    size = linear.jacobian.shape[-1]
+    information = np.zeros((size, size))
     if focal is not None:
-        information[POSE, POSE] = 1 / focal.sigma**2
+        sigmas = np.array([focal.sigma, focal.radial_sigma][: size - POSE])
+        information[POSE:, POSE:] = np.diag(1 / sigmas**2)
     if isinstance(prior, GravityPrior):
         up = np.asarray(prior.up_camera, np.float64) / np.linalg.norm(prior.up_camera)
         information[:3, :3] = (np.eye(3) - np.outer(up, up)) / math.radians(prior.sigma_deg) ** 2
@@ -292,7 +334,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
       partners. Of their principal directions, the pose eliminated, those count whose F statistic chance exceeds once in
       a thousand.
     - The same with the log of the focal length, once in a hundred (`rule.focal_chance`); with other partners too
-      (`with_focal_length`), since those of a linear fit hold it back.
+      (`fit_lens`), since those of a linear fit hold it back.
 
     >>> import numpy as np
     >>> rng = np.random.default_rng(0)
@@ -305,7 +347,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     if linear is None:
         return Misfit(0.0, 0.0)
     free = 2 * min(count, float(linear.probability.sum())) - POSE
-    zoomed = by_focal_length(linear.seen) / linear.scale
+    zoomed = lens_columns(linear.seen, 0.0)[..., :1] / linear.scale
     strained = linear.jacobian[:, :, 3:POSE] @ (linear.points @ STRAINS).transpose(1, 2, 0)
     columns = np.concatenate([linear.jacobian[:, :, :POSE], zoomed, strained, linear.residual[..., None]], -1)
     weighed = (np.sqrt(linear.probability)[:, None, None] * columns).reshape(-1, columns.shape[-1])
@@ -319,7 +361,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
         zoom = math.exp(float(step[0])) if len(step) == 1 else 1.0
         found.append(Misfit(float(np.linalg.norm(moved[:3])), float(np.linalg.norm(moved[3:])) / distance, zoom))
     pose_of = linear.sets, linear.rotation, linear.middle, linear.scale
-    other = with_focal_length(*pose_of) if found[0].zoom != 1 else None
+    other = fit_lens(*pose_of) if found[0].zoom != 1 else None
     if other is not None:
         found.append(misfit_of(linear.rotation, linear.middle, other))
     return Misfit(
@@ -329,7 +371,7 @@ def systematic_misfit(linear: Linearised | None, count: float, rule: Evidence = 
     )
 
 
-def misfit_of(rotation: Array, middle: Array, other: Zoomed) -> Misfit:
+def misfit_of(rotation: Array, middle: Array, other: LensFit) -> Misfit:
     """How far a pose with another focal length is from a pose that sees the middle of the scene at (3,)."""
     shift = float(np.linalg.norm(other.middle - middle)) / max(float(np.linalg.norm(middle)), 1e-300)
     return Misfit(turned_by(rotation, other.rotation), shift, other.zoom)

@@ -185,8 +185,8 @@ class Together:
         if result.verdict == "confident" and self.rig.unknowns == 7:
             best = self.best.rotation[0], self.best.translation[0], float(self.best.scale[0])
             covariance, free = self.rig.covariance(*best), 2 * float(self.best.matched[0]) - 7
-            if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.focal:
-                off = f"it may be more than {100 * self.rule.focal:.0f} % off"
+            if covariance is None or share_bound(covariance[6:, 6:], free) > self.rule.scale:
+                off = f"it may be more than {100 * self.rule.scale:.0f} % off"
                 reason = f"the scale of the scene cannot be told: {off}"
                 result = replace(result, verdict="ambiguous", reason=reason)
         poses = replace(result.candidates, rotation=self.best.rotation, translation=self.best.translation)
