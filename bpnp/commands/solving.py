@@ -59,7 +59,7 @@ def solve(
         image: name of the image whose camera to take, where the --camera model has several.
         image_size: WIDTH,HEIGHT of the image in pixels, where its focal length is unknown: it is found with the pose.
         focal_error: standard deviation of the focal length of --camera where that is rough, as a share of it.
-        distortion: find a radial coefficient too, with --image_size.
+        distortion: fit a radial coefficient with an unknown focal length even where it is not significantly better.
         output: write the solution as JSON.
         picture: draw it as .png, .svg or .pdf.
         photo: the photo, of the size of the --camera or smaller, under the points of --picture.

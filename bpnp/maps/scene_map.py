@@ -231,7 +231,7 @@ class SceneMap:
         image_size: (width, height) in pixels of a photo whose focal length is unknown, as for `bpnp.solve`. The focal
             length is looked for where those of the views are too.
         focal_error: relative standard deviation of the focal length of `camera`, as for `bpnp.solve`.
-        distortion: whether one radial coefficient is unknown too, as for `bpnp.solve`.
+        distortion: whether a radial coefficient is always fitted, as for `bpnp.solve`.
         views: names of views of the map that may show the same place, best first, from any image retrieval: the points
             that any of them sees are used near each; None to try the points of one view of the whole map after the
             other, those first where the density of its points is most like that of the keypoints.

@@ -73,8 +73,9 @@ def solve(
         Distortion is undone; pixels for which that cannot be done are left out and counted in `stats.dropped2d`.
     image_size: width and height of the image, pixels, where the focal length is unknown: it is found with the pose, the
         principal point taken to be in the middle. `Solution.camera` is what was found. focal_error: standard deviation
-        of the focal length of `camera` where that is rough, as a share of it, such as 0.1. distortion: whether a radial
-        coefficient is found too, where the points support one.
+        of the focal length of `camera` where that is rough, as a share of it, such as 0.1. Radial distortion
+        is then unknown too, unless `camera` has it: a coefficient is fitted where it is significantly better, with
+        distortion=True always.
     normals3d: (n, 3) outward unit normals: a point that faces away from the camera is not seen.
     labels2d, labels3d: (m,) and (n,) integers, such as colours, classes or identities: only points of one label are
         matched; -1 fits any. Or probabilities (m, c) and (n, c) of c classes, whose rows add up to 1, such as a

@@ -71,7 +71,9 @@ def test_derivatives_by_the_lens_are_finite_differences_of_undistorted_pixels(ra
     if radial == 0:
         for k, axis in enumerate(np.eye(2)):
             ends = (seen(centre=tuple(sign * step * FOCAL * axis)) for sign in (1, -1))
-            np.testing.assert_allclose(centre_columns(directions(points))[..., k], np.subtract(*ends) / (2 * step), atol=1e-5)
+            np.testing.assert_allclose(
+                centre_columns(directions(points))[..., k], np.subtract(*ends) / (2 * step), atol=1e-5
+            )
 
 
 def test_the_false_alarms_pay_for_each_unknown_of_the_lens() -> None:

@@ -89,7 +89,7 @@ NO_PRIOR = PosePrior(np.eye(3), np.zeros(3), 5.0, 1.0)
         ("pixels", {"image_size": SIZE, "focal_error": 0.1}, "`focal_error` beside a `camera`"),
         ("pixels", {"focal_error": 0.1}, "expected a `camera` whose focal length"),
         ("pixels", {"camera": K, "focal_error": 1.5}, "`focal_error` above 0 and below 1"),
-        ("pixels", {"camera": K, "distortion": True}, "`distortion=True` beside an `image_size`"),
+        ("pixels", {"camera": K, "distortion": True}, "`distortion=True` needs an `image_size`"),
         # Directions.
         ("sky", {"points3d": 2 * P}, "expected unit vectors in `points3d`, got .* or points of a scene without"),
         ("sky", {"points3d": X}, r"expected `points3d` of shape \(k, 3\)"),
