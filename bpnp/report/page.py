@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 
 from bpnp.files import write_text
 from bpnp.report.charts import CONFIG, RECALLS, chart_text, figures, look, recall_chart
+from bpnp.report.groups import differences, group_rows
 from bpnp.report.intervals import CAPTION as INTERVALS
 from bpnp.report.intervals import HEADERS, interval_cells
 from bpnp.report.points import Array, ProblemPoints, read_points, utf8
@@ -109,6 +110,8 @@ def page_html(paths: Sequence[Path | str], *, paper: Paper | None = None) -> str
         intervals=list(zip(lines, interval_cells(runs), strict=True)),
         interval_caption=INTERVALS,
         trainings=training_pictures(folders),
+        groups=group_rows(runs),
+        differences=differences(runs),
         charts=list(map(chart_text, charts)),
         causes=CAUSES,
         shares=[(line, *_shares(runs[line.run], line.estimate)) for line in lines],
