@@ -63,12 +63,19 @@ def solve_directions(
         return seen_by(lens)
     ends = list[Solution]()
     rough = replace(DEFAULT, noise=(DEFAULT.zoom_noise,), least_share=DEFAULT.zoom_share)
+    exact = replace(rough, noise=DEFAULT.noise)
     for rung in unknown.ladder(DEFAULT.zoom):
         found, camera = seen_by(rung, rough), rung
-        for _ in range(DEFAULT.zoom_rounds if found.verdict != "failed" else 0):
+        if found.verdict == "failed":  # among many directions chance fits as well at the rough noise
+            found = seen_by(rung, exact if ends else DEFAULT)
+        promising = found.log10_false_alarms <= DEFAULT.zoom_alarms
+        for _ in range(DEFAULT.zoom_rounds if promising else 0):
             before, camera = camera.focal, _fitted(camera, image, scene, found)
-            found = seen_by(camera)
-            if not found.found or abs(camera.focal / before - 1) < DEFAULT.zoom_same:
+            again = seen_by(camera)
+            if again.log10_false_alarms > found.log10_false_alarms and again.verdict == "failed":
+                break
+            found = again
+            if abs(camera.focal / before - 1) < DEFAULT.zoom_same:
                 break
         ends.append(found)
         best = min(ends, key=lambda end: end.log10_false_alarms)

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from planted import directions
 from scipy.spatial.transform import Rotation
 
-from bpnp.search.evidence.false_alarms import alarms_of, log10_cells
+from bpnp.search import point_sets
+from bpnp.search.evidence.false_alarms import alarms_of, log10_cells, point_evidence
 from bpnp.search.point_sets import PointSets
 from bpnp.search.starts import GravityPrior, PosePrior
 
@@ -121,3 +122,19 @@ def test_a_prior_leaves_less_to_chance_where_the_pose_agrees_with_it() -> None:
 def test_residuals_below_the_floor_count_as_the_floor() -> None:
     rays, points, rotation = planted(np.random.default_rng(5), 6, 0.0)
     assert evidence(rays, points, rotation, 5e-3) > evidence(rays, points, rotation, 1e-4) + 3
+
+
+@pytest.mark.parametrize("pairs", [0, 32])
+def test_an_image_point_whose_label_no_scene_point_has_is_an_outlier(
+    pairs: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its evidence is that of a point without a near partner, log(1 - w), however the density is measured."""
+    monkeypatch.setattr(point_sets, "PAIRS_A_POINT", pairs)
+    points = np.random.default_rng(3).uniform(-1, 1, (12, 3)) + [0, 0, 6]
+    labels = np.arange(12)
+    sets = PointSets(directions(points), points, labels2d=np.r_[99, labels[1:]], labels3d=labels)
+    for even in (True, False):
+        with np.errstate(all="raise"):
+            logs = point_evidence(sets, directions(points), np.array([1e-3]), np.array([0.75]), even=even)
+        assert logs[0, 0, 0] == pytest.approx(math.log(0.25))
+        assert (logs[1:] > 0).all()

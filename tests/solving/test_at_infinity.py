@@ -91,6 +91,27 @@ def test_an_unknown_focal_length_is_found_with_the_rotation(field: float, count:
     assert math.isnan(solution.centre_std)
 
 
+@pytest.mark.parametrize("error", [0.003, 0.01, 0.1])
+@pytest.mark.parametrize("factor", [1.0, 1.004])
+def test_a_rough_focal_length_decides_what_the_exact_one_decides(error: float, factor: float) -> None:
+    """Ten stars of 9,000 in 11 degrees: chance fits as well at the rough noise that a wrong focal length leaves."""
+    focal, size = 5100.0, np.array([1024, 768])
+    for seed in range(3):
+        rng = np.random.default_rng([45, seed])
+        directions = rng.standard_normal((9000, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        rotation = Rotation.random(random_state=seed).as_matrix()
+        camera = directions @ rotation.T
+        image = focal * camera[:, :2] / camera[:, 2:] + size / 2
+        image = image[(camera[:, 2] > 0) & (image > 0).all(1) & (image < size).all(1)][:10]
+        image = np.concatenate([image + 0.1 * rng.standard_normal(image.shape), rng.uniform(0, size, (25, 2))])
+        given = np.array([[factor * focal, 0, 512], [0, factor * focal, 384], [0, 0, 1]])
+        solution = look(image, directions, given, focal_error=error)
+        assert solution.verdict == "confident", solution.reason
+        assert degrees_between(solution.rotation, rotation) < 0.02
+        assert solution.focal_length == pytest.approx(focal, rel=2e-3)
+
+
 def test_an_image_of_nothing_known_but_its_size() -> None:
     image, directions, rotation, _ = sky(5, field=52.0)
     solution = look(image, directions, image_size=(SIZE, SIZE))

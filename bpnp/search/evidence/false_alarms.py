@@ -241,7 +241,8 @@ def point_evidence(sets: PointSets, seen: Array, scales: Array, shares: Array, *
     """
     image = sets.image
     predicted, smooth, inside, every = _sums(sets, seen, scales, even)
-    density = (every if even else np.maximum(inside, 1)) / image.solid_angle
+    # A point without a possible partner has no density to be compared with: it counts as one that has none near.
+    density = (np.where(every > 0, every, 1) if even else np.maximum(inside, 1)) / image.solid_angle
     ratio = predicted / (2 * math.pi * scales**2 * np.maximum(density, smooth)[:, None])
     return np.asarray(np.log1p(shares * (ratio - 1)[:, :, None]))
 

@@ -68,6 +68,11 @@ class InfinitySettings:
     strained: matches, at most, that are asked whether another camera explains them better.
     least_share: of the image points that a rotation explains, for which those that were tried have to be enough
         where chance explains all that was found.
+    zoom: factor from one focal length to the next, where it is unknown. zoom_noise: pixels, of the first search with
+        each, since points near the edge are off by the error of the focal length; where it fails, `noise` is tried,
+        since among many directions chance fits as well at the rough one. zoom_share: `least_share` of these searches.
+        zoom_alarms: log10 of the false alarms up to which the focal length is fitted to the matches; those of chance
+        are mostly above 8. zoom_rounds: of fits and searches, until the focal length changes by less than zoom_same.
     """
 
     noise: tuple[float, ...] = (0.35, 1.4)
@@ -90,6 +95,7 @@ class InfinitySettings:
     zoom: float = 1.02
     zoom_noise: float = 3.0
     zoom_share: float = 0.4
+    zoom_alarms: float = 5.0
     zoom_rounds: int = 6
     zoom_same: float = 1e-4
 
@@ -142,14 +148,18 @@ class Sight(NamedTuple):
 
 
 def log10_missed(tried: int, count: int, least: int, power: float) -> float:
-    """Of the probability that a rotation that explains `least` of `count` points was not met, which a tried one of them
-    does but with 1 - power. h of those that were tried are among them (hypergeometric)."""
-    if tried == count:
-        return -math.inf
+    """Compute log10 of the probability that a rotation which explains `least` of `count` points was not found.
+
+    Each tried point that it explains gives it with the probability `power`, so that a rotation may be missed even where
+    all points were tried. The number of tried points among the explained ones is hypergeometric.
+
+    >>> round(log10_missed(10, 10, 4, 0.9), 6)
+    -4.0
+    """
     hit = np.arange(tried + 1)
     chosen = _log_choose(least, hit) + _log_choose(count - least, tried - hit)
     unmet = chosen - _log_choose(count, np.array([tried])) + hit * math.log(1 - power)
-    return float(np.logaddexp.reduce(unmet)) / math.log(10)
+    return round(float(np.logaddexp.reduce(unmet)) / math.log(10), 9)  # exact where all were tried
 
 
 def _log_choose(n: int, k: Labels) -> Array:
