@@ -38,6 +38,7 @@ def main(args: Sequence[str] | None = None) -> None:
     try:
         if args is None and arguments and arguments[0] in LIGHTNING:
             keep_freed_memory()
+            let_threads_sleep()
         if not {"", os.getcwd()} & set(sys.path):
             sys.path.append(os.getcwd())  # class paths of a user's own; last, so that they hide no module
         _run(arguments)
@@ -108,6 +109,15 @@ def keep_freed_memory() -> None:
     if mallopt is not None:
         mallopt(M_MMAP_THRESHOLD, 1 << 30)
         mallopt(M_TRIM_THRESHOLD, -1)
+
+
+def let_threads_sleep() -> None:
+    """Let threads of torch, imported afterwards, sleep while they wait for work, unless OMP_WAIT_POLICY is set.
+
+    By default they spin. Beside two other processes on two cores a step of the quickstart takes 3.7 s with threads that
+    spin and 0.6 s with threads that sleep.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def _known(name: str, names: Sequence[str], what: str) -> str:

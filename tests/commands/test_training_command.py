@@ -216,3 +216,16 @@ def test_a_weight_without_an_epoch_is_refused(tmp_path: Path, capsys: pytest.Cap
     with pytest.raises(SystemExit):
         main(["fit", *MESHES, *SMALL_NET, "--pose_loss.weight=0.5", *folders(tmp_path)])
     assert "--pose_loss.weight needs --pose_loss.start_epoch" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("given", "policy"), [(None, "PASSIVE"), ("active", "ACTIVE")])
+def test_threads_of_the_command_sleep_while_they_wait(given: str | None, policy: str, tmp_path: Path) -> None:
+    """OpenMP prints its settings when torch loads it."""
+    environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    environment |= {"OMP_DISPLAY_ENV": "true"} | ({"OMP_WAIT_POLICY": given} if given else {})
+    line = [sys.executable, "-m", "bpnp", "fit", "--config=quickstart", "--print_config"]
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True)
+    assert f"OMP_WAIT_POLICY = '{policy}'" in done.stderr
+    program = [sys.executable, "-c", "import bpnp, os; bpnp.Batch; print('OMP_WAIT_POLICY' in os.environ)"]
+    done = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == f"{given is not None}\n"
