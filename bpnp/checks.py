@@ -16,7 +16,8 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 
 def checked_shapes(function: _F) -> _F:
-    """Raise ValueError if a tensor argument has not the shape or the kind of numbers that its annotation names.
+    """Raise ValueError if a tensor argument has not the shape or the kind of numbers that its annotation names, and
+    within a transform of `torch.func`.
 
     An annotation such as `Float[Tensor, "b m 2"]` asks for three axes, none of them empty, the last of size 2, and
     floating-point numbers; an axis name stands for one size in all arguments. Annotations of other types, arguments
@@ -37,6 +38,7 @@ def checked_shapes(function: _F) -> _F:
 
     @functools.wraps(function)
     def run(*arguments: Any, **options: Any) -> Any:
+        refuse_transforms(function.__name__)
         sizes: dict[str, tuple[int, str]] = {}
         bound = signature.bind(*arguments, **options)
         for name, value in bound.arguments.items():
@@ -45,6 +47,27 @@ def checked_shapes(function: _F) -> _F:
         return function(*bound.args, **bound.kwargs)
 
     return run  # type: ignore[return-value]
+
+
+class _Probe(torch.autograd.Function):
+    """A function without `setup_context`, which torch refuses within its transforms."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor) -> Tensor:
+        return values.view_as(values)
+
+
+def refuse_transforms(name: str) -> None:
+    """Raise ValueError within a transform of `torch.func`, or within `torch.vmap`."""
+    if torch.compiler.is_compiling():
+        return
+    try:
+        _Probe.apply(torch.zeros(()))
+    except RuntimeError as error:
+        raise ValueError(
+            f"{name} does not support torch.func and torch.vmap; call it on a batch, and use backward() or "
+            "torch.autograd.grad for its gradient"
+        ) from error
 
 
 def check_positive(**options: int | float) -> None:

@@ -60,3 +60,28 @@ def test_half_precision_is_widened_and_ransac_has_no_gradient(dtype: torch.dtype
     assert not rotation.requires_grad
     assert stats.converged.all()
     assert rotation_angle(rotation.double(), PLANTED.rotation).max() < 1e-3
+
+
+@pytest.mark.parametrize("transform", ["vmap", "grad", "jacrev", "jvp"])
+@pytest.mark.parametrize("layer", list(ARGUMENTS), ids=lambda layer: layer.__name__)
+def test_a_transform_of_torch_func_is_refused_in_one_line(layer: Callable[..., Any], transform: str) -> None:
+    (name, first), *others = ARGUMENTS[layer].items()
+
+    def run(values: torch.Tensor) -> torch.Tensor:
+        values = values.unsqueeze(0) if transform == "vmap" else values
+        rest = {key: value[:1] if transform == "vmap" else value for key, value in others}
+        return layer(**{name: values, **rest})[0].sum()
+
+    apply = {
+        "vmap": lambda: torch.vmap(run)(first),
+        "grad": lambda: torch.func.grad(run)(first),
+        "jacrev": lambda: torch.func.jacrev(run)(first),
+        "jvp": lambda: torch.func.jvp(run, (first,), (first,)),
+    }
+    with pytest.raises(ValueError, match=f"^{layer.__name__} does not support torch.func and torch.vmap; call it"):
+        apply[transform]()
+
+
+def test_layers_run_beside_a_transform() -> None:
+    assert torch.vmap(lambda x: x + 1)(torch.zeros(2)).tolist() == [1, 1]
+    assert sinkhorn(torch.rand(1, 4, 5))[1].converged.all()
