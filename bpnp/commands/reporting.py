@@ -156,13 +156,13 @@ def chosen_problems(folder: Path, names: Sequence[str]) -> list["ProblemPoints"]
     return chosen
 
 
-def wandb_results(runs: list[Path], *, project: str = "bpnp", directory: Path = Path("runs")) -> None:
+def wandb_results(runs: list[Path], *, project: str = "bpnp", directory: Path | None = None) -> None:
     """Log results to Weights & Biases: to folders for `wandb sync` unless WANDB_MODE=online.
 
     Args:
         runs: folders that `bpnp test` wrote, or their runs.
         project: name of the project.
-        directory: where the folders of offline runs go.
+        directory: where the folders of offline runs go; beside the results by default.
     """
     from bpnp.report.dashboards import log_results
     from bpnp.report.tables import named_runs

@@ -5,7 +5,7 @@ here only, when it is used.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +13,50 @@ from bpnp.report.charts import RECALLS, recall_chart
 from bpnp.report.figures import plot_problem, recall_curve
 from bpnp.report.points import ProblemPoints, read_points, utf8
 from bpnp.report.results import Results, cause_shares, read_results
+from bpnp.report.training_curves import training_folder
 
 MOST_PICTURES = 12
 
 
-def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directory: Path | str) -> Path:
-    """Log a results folder to W&B and return the folder of the run, below `directory`.
+def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directory: Path | str | None = None) -> Path:
+    """Log a results folder to W&B.
 
-    Scalars "test/<estimate>/rotation_q1_deg" and so on, the first estimate's also without its name; tables "quartiles",
-    "causes" and "problems"; recall curves as plotly charts and as a picture; pictures of the worst problems.
-    Raises ValueError if the folder cannot be read.
+    Scalars "test/<estimate>/rotation_q1_deg" and so on; tables "quartiles", "causes" and "problems"; recall curves as
+    plotly charts and as a picture; pictures of the worst problems. Where the folder lies in that of a training, the
+    configuration of the training is that of the W&B run, and both are of one group.
+
+    Args:
+        folder: what `bpnp test` wrote.
+        name: of the W&B run.
+        project: of the W&B run.
+        directory: where the W&B run is written, in `wandb`; the folder that the results lie in by default.
+
+    Returns:
+        The folder of the W&B run.
+
+    Raises:
+        ValueError: the folder cannot be read.
     """
     import wandb
 
     results, problems = read_results(folder), read_points(folder)
-    Path(directory).mkdir(parents=True, exist_ok=True)
+    directory = Path(folder).absolute().parent if directory is None else Path(directory)
+    directory.mkdir(parents=True, exist_ok=True)
+    run_folder = training_folder(folder)
+    training = None if run_folder is None else training_config(run_folder)
+    config = {"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written}
+    group = None
+    if run_folder is not None and training is not None:
+        group = training_run_id(run_folder, training) or run_folder.name
+        config |= {key: training[key] for key in ("model", "data", "trainer") if key in training} | {"training": group}
     mode: Any = os.environ.get("WANDB_MODE") or "offline"
     run = wandb.init(
         project=project,
         name=name,
         dir=str(directory),
         job_type="test",
-        config={"settings": results.settings, "bpnp_version": results.bpnp_version, "written": results.written},
+        group=group,
+        config=config,
         mode=mode,
         reinit="create_new",  # a run that is open goes on
         settings=wandb.Settings(silent=True, console="off", disable_git=True, save_code=False),
@@ -46,12 +68,30 @@ def log_results(folder: Path | str, *, name: str, project: str = "bpnp", directo
         run.finish()
 
 
+def training_config(run: Path) -> dict[str, Any] | None:
+    """Read the configuration of the last training in a run folder; None if there is none."""
+    import yaml
+
+    files = run.glob("logs/version_*/config.yaml")
+    for file in sorted(files, key=lambda file: int(file.parent.name.split("_")[1]), reverse=True):
+        config = yaml.safe_load(file.read_text(encoding="utf-8"))
+        if not {"verbose", "return_predictions"} & config.keys():  # options of validate, test and predict
+            return dict(config)
+    return None
+
+
+def training_run_id(run: Path, config: Mapping[str, Any]) -> str | None:
+    """Find the id of the W&B run of a training in its folder; None if the training was not logged to W&B."""
+    if "WandbLogger" not in str(config.get("trainer", {}).get("logger")):
+        return None
+    folders = sorted((run / "wandb").glob("*run-*-*"), key=lambda folder: folder.name.split("-")[-2])
+    return folders[0].name.rsplit("-", 1)[1] if folders else None
+
+
 def scalars(results: Results) -> dict[str, float]:
     """The numbers of `summary.json` under the names that a test logs."""
-    first = next(iter(results.estimates.values()))
-    values = {f"test/{key}": value for key, value in first.items()}
-    for estimate, numbers in results.estimates.items():
-        values |= {f"test/{estimate}/{key}": value for key, value in numbers.items()}
+    estimates = results.estimates.items()
+    values = {f"test/{estimate}/{key}": value for estimate, numbers in estimates for key, value in numbers.items()}
     loss = results.correspondence_loss
     return values if loss is None else values | {"test/correspondence_loss": loss}
 

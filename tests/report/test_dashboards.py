@@ -1,5 +1,6 @@
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import wandb
@@ -23,7 +24,7 @@ def test_scalars_are_those_of_the_summary(tmp_path: Path) -> None:
         assert {key: float(number) for key, number in numbers.items()} == {
             key: values[f"test/{estimate}/{key}"] for key in numbers
         }
-    assert values["test/rotation_q1_deg"] == summary["estimates"]["ransac"]["rotation_q1_deg"]
+    assert "test/rotation_q1_deg" not in values  # a figure has one name
     assert values["test/correspondence_loss"] == 0.25
 
 
@@ -49,3 +50,24 @@ def test_a_run_is_written_to_a_folder_with_its_tables_and_pictures(tmp_path: Pat
     assert len(list((media / "images" / "test").glob("worst_problems_*.png"))) == 2
     assert len(list((media / "images" / "test").glob("recall_*.png"))) == 1
     assert is_written(next(run.glob("*.wandb")), b"test/pnp/rotation_q2_deg")
+
+
+def test_a_test_knows_its_training(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_run(tmp_path, 20, 0)
+    logger = {"class_path": "lightning.pytorch.loggers.WandbLogger"}
+    training = {"model": {"learning_rate": 0.25}, "data": "planted", "trainer": {"logger": [logger]}, "ckpt_path": None}
+    for number, config in enumerate((training, training | {"verbose": False, "model": {}})):
+        folder = tmp_path / "logs" / f"version_{number}"
+        folder.mkdir(parents=True)
+        (folder / "config.yaml").write_text(json.dumps(config))
+    (tmp_path / "logs" / "version_0" / "metrics.csv").write_text("step,train/loss\n1,0.5\n")
+    for name in ("offline-run-20260102_000000-later", "offline-run-20260101_000000-first"):
+        (tmp_path / "wandb" / name).mkdir(parents=True)
+    started: list[dict[str, Any]] = []
+    real = wandb.init
+    monkeypatch.setattr(wandb, "init", lambda **options: started.append(options) or real(**options))
+    run = log_results(tmp_path / "test", name="planted")
+    assert run.parent == tmp_path / "wandb"
+    assert started[0]["group"] == "first"
+    assert started[0]["config"]["model"] == {"learning_rate": 0.25}
+    assert started[0]["config"]["training"] == "first"
