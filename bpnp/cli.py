@@ -6,13 +6,11 @@ import logging
 import os
 import re
 import sys
-import sysconfig
 import textwrap
 import traceback
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
-from pathlib import Path
 
 from bpnp.commands import COMMANDS
 from bpnp.commands.parser import LIGHTNING, first_line, parsed_arguments, plain, short_help
@@ -24,6 +22,10 @@ AFTER_CTRL_C = {
     "table": "; run it again to go on",
     "prepare": "; nothing was written, run it again to start anew",
 }
+LIBRARIES = sys.stdlib_module_names | {
+    "beartype", "bpnp", "cv2", "filelock", "fsspec", "h5py", "jaxtyping", "jsonargparse", "lightning", "numpy",
+    "pandas", "PIL", "pycolmap", "scipy", "torch", "torchmetrics", "trimesh", "typeshed_client", "wandb", "yaml",
+}  # fmt: skip
 LIGHTNING_MISTAKES = {
     "MisconfigurationException",
     "TrainingDivergedError",
@@ -59,15 +61,14 @@ def main(args: Sequence[str] | None = None) -> None:
 
 
 def _is_mistake(error: Exception) -> bool:
-    """Whether an exception is a message to the user: raised without a frame of code outside of Python's libraries.
+    """Whether an exception is a message to the user, raised by this package or a library that it uses.
 
     The exceptions of a user's own class, such as a callback or a data module, keep their traceback.
     """
     if not isinstance(error, (ValueError, OSError)) and type(error).__name__ not in LIGHTNING_MISTAKES:
         return False
-    libraries = {str(Path(__file__).parent), *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib"))}
-    files = [frame.f_code.co_filename for frame, _ in traceback.walk_tb(error.__traceback__)]
-    return all(file.startswith(("<", *libraries)) for file in files)
+    modules = (frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return {module.partition(".")[0] for module in modules} <= LIBRARIES
 
 
 def _run(arguments: list[str]) -> None:
