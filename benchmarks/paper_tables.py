@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from lightning import LightningDataModule
-from record import DATA, write
+from record import DATA, ROOT, write
 from torch import nn
 
 from bpnp.files import written_whole
@@ -24,11 +24,15 @@ from bpnp.layers import RansacPnP, WeightedPnP
 from bpnp.models import BPnPNet, TrainedNet
 from bpnp.models.evaluation import round_widths
 from bpnp.models.weights import read_checkpoint
+from bpnp.report.figures import line_style, save_figure
 from bpnp.report.intervals import Interval, bootstrap, paired_difference, quantile, share
 from bpnp.report.results import ProblemRow, rows_from
 from bpnp.report.tables import PRINTED
 from bpnp.report.terminal import Paper
 from bpnp.training.comparison import problem_order
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ERRORS = {
     "rotation": "rotation_error_deg",
@@ -36,6 +40,7 @@ ERRORS = {
     "reprojection": "reprojection_error_deg",
 }
 QUARTERS = (0.25, 0.5, 0.75)
+PICTURES = ROOT / "docs" / "images"
 
 
 ESTIMATES = {"pnp": "", "ransac": " R", "refined": ", refined"}
@@ -223,7 +228,38 @@ def measure(
             if before and after:
                 record["effects"][f"{name}|{options.seed}|{estimate}"] = effect(before, after, table.recall)
         write(options.output, record)
+        curves = {
+            label + ESTIMATES[estimate]: found[f"paper|{label}|{estimate}"]
+            for label in BRANCHES
+            for estimate in ("pnp", "ransac")
+            if f"paper|{label}|{estimate}" in found
+        }
+        if curves and name == table.sets[0] and not options.quick:
+            save_figure(recall_picture(curves, table), PICTURES / f"{table.name}.png")
     return record
+
+
+def recall_picture(rows: Mapping[str, Sequence[ProblemRow]], table: Table) -> "Figure":
+    """Fraction of the problems within an error, a curve per row, and the quartiles of the paper's rows as rings."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(9, 3.4), layout="constrained")
+    printed = {
+        name.strip(): values.split() for name, _, values in (line.partition("|") for line in _lines(table.paper))
+    }
+    fields = (("rotation_error_deg", "rotation error, degrees", 30.0), ("translation_error", "translation error", 1.0))
+    for k, (axes, (field, label, limit)) in enumerate(zip(figure.subplots(1, 2, sharey=True), fields, strict=True)):
+        for place, (name, found) in enumerate(rows.items()):
+            errors = np.sort([getattr(row, field) for row in found])
+            style = line_style(place, place)
+            axes.step(errors, 100 * np.arange(1, len(errors) + 1) / len(errors), where="post", label=name, **style)
+            quartiles = [float(value) for value in printed[name][3 * k : 3 * k + 3]]
+            axes.plot(quartiles, [25, 50, 75], "o", mfc="none", color=style["color"], label=f"paper: {name}")
+        axes.set(xlabel=label, xlim=(0, limit), ylim=(0, 100))
+        axes.grid(alpha=0.3)
+    figure.axes[0].set_ylabel("% of problems within")
+    figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
+    return figure
 
 
 def markdown(table: Table, record: Mapping[str, Any]) -> dict[str, str]:
@@ -356,14 +392,17 @@ def row_text(label: str, found: Mapping[str, Any]) -> str:
 
 def printed_rows(paper: Paper) -> Iterator[str]:
     """The lines of the paper's table."""
-    _, _, text = PRINTED[paper]
-    for line in text.strip().splitlines():
+    for line in _lines(paper):
         label, values = line.split("|")
         numbers = values.split()
         cells = [f"*paper: {label.strip()}*", ""]
         cells += [" / ".join(numbers[k : k + 3]) for k in (0, 3, 6)]
         cells += [numbers[10] if len(numbers) > 10 else "", numbers[9]]
         yield f"| {' | '.join(cells)} |\n"
+
+
+def _lines(paper: Paper) -> list[str]:
+    return PRINTED[paper][2].strip().splitlines()
 
 
 def head(recall: tuple[float, float]) -> str:

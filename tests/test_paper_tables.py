@@ -136,3 +136,12 @@ def test_a_record_becomes_the_tables_of_the_page() -> None:
     assert "| *paper: GOSMA* |" in tables["modelnet10-baselines"]
     assert "| seed 0 | 400 | 500 | 500 | 0.0001 |" in tables["training"]
     assert "| Lc Lp minus Lc | 10 | +0 [+0, +0]" in tables["modelnet10-effect"]
+
+
+def test_the_picture_has_a_curve_a_row_and_the_papers_quartiles() -> None:
+    rows = [row(i, rotation_error_deg=float(i + 1), translation_error=0.1 * (i + 1)) for i in range(4)]
+    rotation, translation = paper_tables.recall_picture({"Lc R": rows}, table1.TABLE).axes
+    assert rotation.lines[0].get_xdata().tolist() == [1, 2, 3, 4]
+    assert rotation.lines[0].get_ydata().tolist() == [25, 50, 75, 100]
+    assert rotation.lines[1].get_xdata().tolist() == [5.49, 11.7, 20.0]
+    assert translation.lines[1].get_xdata().tolist() == [0.04, 0.09, 0.20]
