@@ -40,6 +40,8 @@ ERRORS = {
     "reprojection": "reprojection_error_deg",
 }
 QUARTERS = (0.25, 0.5, 0.75)
+# Of 2,500 steps an epoch: 120 epochs, then 20 to 80 with the pose loss (section 3.5).
+PRINTED_STEPS = {"Lc": "300,000", "Lc Lp": "350,000 to 500,000"}
 PICTURES = ROOT / "docs" / "images"
 
 
@@ -221,7 +223,7 @@ def measure(
                 key = f"{name}|{options.seed}|{method.group}|{method.label}|{estimate}"
                 chosen = [row for row in rows if row.estimate == estimate]
                 found[f"{method.group}|{method.label}|{estimate}"] = chosen
-                record["rows"][key] = figures(chosen, table.recall)
+                record["rows"][key] = figures(chosen, table.recall) | {"steps": method.identity.get("steps")}
                 print(f"{key}: {record['rows'][key]}", flush=True)
         for estimate in ("pnp", "ransac"):
             before, after = (found.get(f"paper|{label}|{estimate}") for label in BRANCHES)
@@ -379,7 +381,8 @@ def _rounded(interval: Interval) -> list[float]:
 
 def row_text(label: str, found: Mapping[str, Any]) -> str:
     """A line of a table; the interval of the median and of the recall in brackets."""
-    cells = [label, str(found["problems"])]
+    steps = "" if found.get("steps") is None else f"{found['steps']:,}"
+    cells = [label, steps, str(found["problems"])]
     for name in ERRORS:
         low, middle, high = found[name]
         cells.append(
@@ -395,7 +398,7 @@ def printed_rows(paper: Paper) -> Iterator[str]:
     for line in _lines(paper):
         label, values = line.split("|")
         numbers = values.split()
-        cells = [f"*paper: {label.strip()}*", ""]
+        cells = [f"*paper: {label.strip()}*", PRINTED_STEPS.get(label.split(" R")[0].strip(), ""), ""]
         cells += [" / ".join(numbers[k : k + 3]) for k in (0, 3, 6)]
         cells += [numbers[10] if len(numbers) > 10 else "", numbers[9]]
         yield f"| {' | '.join(cells)} |\n"
@@ -408,6 +411,7 @@ def _lines(paper: Paper) -> list[str]:
 def head(recall: tuple[float, float]) -> str:
     names = (
         "row",
+        "steps",
         "problems",
         "rotation, deg",
         "translation",
